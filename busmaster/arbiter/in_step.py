@@ -183,6 +183,10 @@ class InStep:
             ):
                 yield debt.node
 
+    def owes_lone_byte(self) -> bool:
+        """Return whether a reply of one byte is overdue, or anything that could be one."""
+        return any(len(debt.key) < 2 for debt in self.debts)
+
     def ends(self, answers: Sequence[bytes], now: float) -> float:
         """Return when what is owed and could look so can be no other node's any more; inf if that is not known."""
         return max((d.until for d in self.debts if now < d.until and _could_be(d, answers)), default=inf)

@@ -80,7 +80,9 @@ class Trust:
             over += sum(later.timing.lateness for later in exchange.later if not later.sent)
             silence = max(QUIET, transaction.node.timings.read.byte_gap) + leg.latency + leg.byte_time
             awaited = Awaited(transaction.command, leg.timing.window, silence)
-        if heard or (awaited is not None and keys):
+        # The ACK that began a packet's leg (MSC) may have been an overdue one: this request's own is then still to come
+        ack_in_doubt = exchange.later and self._in_step.owes_lone_byte()
+        if heard or (awaited is not None and keys) or ack_in_doubt:
             keys += (ANY_BYTE,)
         if exchange.answered:
             transaction.node.unheard += not heard

@@ -474,14 +474,20 @@ def test_r15_what_a_node_owed_that_was_removed_is_not_believed_of_it_once_it_is_
     assert not owed.debts, "a node answers in the order in which it was asked"
 
 
-def with_one_overdue(bench: Bench) -> NodeRecord:
-    """A unit of MSC that has answered, and then did not answer: its ACK, or its NAK, may still come."""
+def with_one_answered(bench: Bench) -> NodeRecord:
+    """A unit of MSC that has answered."""
     node = bench.node(1, msc.PROFILE)
     bench.wait(2.0)
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
     bench.hear(f"{ACK} 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", after=0.1)
     bench.sent()
+    return node
+
+
+def with_one_overdue(bench: Bench) -> NodeRecord:
+    """A unit of MSC that has answered, and then did not answer: its ACK, or its NAK, may still come."""
+    node = with_one_answered(bench)
     bench.ask(node, msc.DataRead(2008), retries=0)
     bench.until_sent()
     bench.sent()
@@ -525,6 +531,26 @@ def test_r15_a_nak_with_nothing_overdue_is_answered_with_the_same_request() -> N
     assert bench.sent() == request
     bench.hear(ACK, after=0.010)
     assert (bench.ended(asked), asked.error) == (1, None)
+
+
+def test_r15_an_ack_that_may_be_overdue_leaves_the_one_of_its_request_to_come() -> None:
+    """The ACK of an earlier write, nearly ten seconds late, begins the packet's leg of a read. The write's ACK is no
+    longer overdue then, but the read's is: it does not confirm the next write."""
+    bench = Bench()
+    node = with_one_answered(bench)
+    bench.ask(node, msc.DataWrite(2024, 5))
+    bench.sent()
+    bench.wait(9.5)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    bench.hear(ACK, after=0.050)
+    bench.until_sent()
+    assert bench.sent() == ACK, "the exchange ends without its packet"
+    following = bench.ask(node, msc.DataWrite(2024, 6))
+    bench.until_sent()
+    bench.sent()
+    bench.hear(ACK, after=0.001)
+    assert not bench.ended(following)
 
 
 # a caller that has gone (R6)

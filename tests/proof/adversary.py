@@ -82,6 +82,8 @@ def _bytes(world: World) -> list[Action]:
                 possible += [
                     ("all", place, (at - before, bit)) for at, bit in setup.damage if before <= at < len(reply.packet)
                 ]
+            if setup.beyond:
+                possible.append(("never", place))
             if not setup.bytewise:
                 continue
         if setup.whole:

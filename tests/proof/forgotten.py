@@ -249,10 +249,13 @@ def _ordered(view: View, first: Time, second: Time) -> bool:
 
 def past_debts(view: View) -> None:
     """Of a debt that has lapsed is asked only how long it was in time, and whether it was so before the request that
-    is on the wire. Of doubts, whether they are over; of what was said, whether it is SAID_MEMORY ago."""
+    is on the wire. Of doubts, whether they are over, and only of the latest entry of each key: an entry is asked for
+    by its key, and all entries of one key are removed together. Of what was said, whether it is SAID_MEMORY ago. Of the
+    last exchanges, what would answer them, in no order: that RECENT exchanges later it is forgotten is left out."""
     world, book = view.world, view.world.arbiter._in_step
     if not world.setup.in_step:
         return
+    book.recent = deque(sorted(set(map(tuple, book.recent))), book.recent.maxlen)
     on_wire = world.arbiter._wire.transaction
     for debt in book.debts:
         if debt.until != inf and view.past(debt.until):
@@ -266,14 +269,26 @@ def past_debts(view: View) -> None:
             if type(apart) is float:
                 asked, over = past(0, 0), past(0, ticks(apart))
                 debt.asked, debt.over = asked, over
-    book._doubted = [entry for entry in book._doubted if not view.past(entry[1])]
-    book._forgiven = [entry for entry in book._forgiven if not view.past(entry[1])]
+    book._doubted = _latest_of_each(view, [entry for entry in book._doubted if not view.past(entry[1])])
+    book._forgiven = _latest_of_each(view, [entry for entry in book._forgiven if not view.past(entry[1])])
     if book.lone_bytes_until != inf and view.past(book.lone_bytes_until):
         book.lone_bytes_until = -inf
     if view.past(book._doubt_until):
         book._doubt_until = -inf
     while book._said and view.past(book._said[0][1], in_step.SAID_MEMORY, strictly=True):
         book._said.popleft()
+
+
+def _latest_of_each(view: View, entries: list[tuple[bytes, float]]) -> list[tuple[bytes, float]]:
+    """Keep of each key the entry that ends last, as far as the zone orders them. Sorted by key."""
+    kept: list[tuple[bytes, float]] = []
+    for place, (key, until) in enumerate(entries):
+        later = entries[place + 1 :]
+        if any(other == key and view.before(until, ends) for other, ends in (*kept, *later)):
+            continue
+        kept = [entry for entry in kept if entry[0] != key or not view.before(entry[1], until)]
+        kept.append((key, until))
+    return sorted(kept, key=lambda entry: entry[0])
 
 
 def past_holds_back(view: View) -> None:
@@ -383,6 +398,7 @@ def _past_words(world: World) -> None:
     for reply in world.owed:
         if reply.kind == "reply":
             reply.data = bytes(len(reply.data))
+            reply.request = b""
             reply.ticket = None
 
 

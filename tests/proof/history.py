@@ -105,22 +105,22 @@ def told(calls: Sequence[Call]) -> str:
 
 def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
     """Return a history as a test: it fails where the last thing that was said is said at that time."""
-    kind = setup.kind.split(",")[0]
     calls = [call for call in calls if call[1] not in UNSEEN]
     lines = [
         "from busmaster.arbiter.arbiter import Arbiter",
         "from busmaster.arbiter.mark import Mark",
         "from busmaster.arbiter.transaction import URGENT, Transaction",
-        f"from busmaster.protocols.{kind} import codec as {kind}",
         "from tests.proof.kinds import KINDS",
         "",
         "",
         "def test_found_by_the_proof() -> None:",
         f'    """{problem}; in the world "{setup.name}"."""',
-        f"    commands = KINDS[{setup.kind!r}]().commands",
+        f"    kind = KINDS[{setup.kind!r}]()",
+        "    profile, commands = kind.profile, kind.commands",
         f"    how = dict(echo={setup.echo}, receive_latency={setup.receive_latency}, strict={setup.strict})",
-        f"    arbiter = Arbiter({kind}.PROFILE.line.byte_time, **how)",
-        f"    nodes = [arbiter.add_node({kind}.PROFILE, address, 0.0, retries={setup.retries}) for address in (1, 2)]",
+        "    arbiter = Arbiter(profile.line.byte_time, **how)",
+        "    addresses = kind.first, kind.first + 1",
+        f"    nodes = [arbiter.add_node(profile, address, 0.0, retries={setup.retries}) for address in addresses]",
     ]
     ways = {
         "comes up": "arbiter.line_up({time}, paced={paced})",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import enum
 import io
 import pickle
+import struct
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import compress
@@ -233,6 +234,10 @@ def _reduce_shared(value: Any) -> tuple[Any, ...]:
     return _recall, (place,)
 
 
+def _reduce_struct(value: struct.Struct) -> tuple[Any, ...]:
+    return struct.Struct, (value.format,)
+
+
 def _reduce_member(member: Any) -> str:
     return str(member.name)
 
@@ -287,6 +292,7 @@ _TABLE: dict[type, Callable[[Any], Any]] = {
     Profile: _reduce_shared,
     ReplyTiming: _reduce_shared,
     Timings: _reduce_shared,
+    struct.Struct: _reduce_struct,
     LineState: _reduce_member,
     Priority: _reduce_member,
     Phase: _reduce_member,

@@ -43,6 +43,8 @@ class MscWorld(World):
         self.said_by = at
         if self.setup.echo:
             self.owed.append(Owed(said, at, at + self.setup.late_echo, 0.0, kind="echo"))
+        if self.setup.beyond:  # what a network holds may come while the host speaks
+            return
         for reply in [
             r for r in self.owed if r.kind != "echo"
         ]:  # collisions are left out: nobody begins while the host speaks
@@ -65,14 +67,15 @@ class MscWorld(World):
         exchange = self.arbiter._wire.exchange
         resent = getattr(exchange, "_resends", 0) > 0
         if not resent:
-            self._judge_msc()
+            if not self.setup.beyond:
+                self._judge_msc()
             self.begin_anew()
             self.losses = self.setup.lost_acknowledgements
         unit = request[1]
         for reply in [r for r in self.owed if r.kind == "again" and r.unit == unit and not r.begun]:
             if not choose(2):  # else it has not heard the request
                 self.owed.remove(reply)
-        if any(reply.unit == unit for reply in self.owed):
+        if any(reply.unit == unit for reply in self.owed) and not self.setup.beyond:
             if ticket is not None:
                 ticket.undenied -= 1  # it is busy, and takes none
             return
@@ -81,10 +84,12 @@ class MscWorld(World):
         if ticket is not None:
             ticket.place = place
         edge = self.byte_time if self.setup.assumptions.edge else 0.0
-        timing = self.arbiter._leg.timing
-        ack = Owed(ACK, at + self.byte_time, at + timing.lateness + edge, 0.0, kind="ack")
-        ack.packet_by = at + self.kind.profile.timings.packet.lateness + edge
+        beyond = self.setup.beyond
+        begins = beyond or self.arbiter._leg.timing.lateness
+        ack = Owed(ACK, at + self.byte_time, at + begins + edge, 0.0, kind="ack")
+        ack.packet_by = at + (beyond or self.kind.profile.timings.packet.lateness) + edge
         ack.unit, ack.packet, ack.left, ack.ticket = unit, answers[place], self.setup.retransmissions, ticket
+        ack.request = request
         self.owed.append(ack)
 
     def _judge_msc(self) -> None:
@@ -112,9 +117,11 @@ class MscWorld(World):
         request: that is assumed."""
         if reply.kind == "ack":
             if reply.packet and not refused:
-                self.owed.append(self._packet(reply, self.now))
-                if lost:
-                    self.owed[-1].hi = reply.packet_by
+                packet = self._packet(reply, self.now)
+                if lost or self.setup.beyond:  # all of a reply comes within `beyond`
+                    packet.hi = reply.packet_by
+                # behind its ACK, where the channel keeps the order of the replies
+                self.owed.insert(0 if self.setup.beyond else len(self.owed), packet)
         elif reply.left:
             self.owed.append(self._packet(reply, self.now, again=True))
 

@@ -125,6 +125,8 @@ class Setup:
     """Replies come whole, in one chunk."""
     cuts: bool = False
     """What lies in an adapter or the kernel may be read in two pieces; else all of it is read at once."""
+    lateness: float = 0.0
+    """Seconds: the lateness of every node, in place of its document's, with a window of two thirds; 0 if it is that."""
     bytewise: bool = False
     """An MSC's packets come byte by byte too, not all at once alone."""
     damage: tuple[tuple[int, int | None], ...] = ()
@@ -156,6 +158,7 @@ class Setup:
             parts.append("learned windows")
         if self.lost_acknowledgements:
             parts.append(f"lost ACKs {self.lost_acknowledgements}")
+        parts += [f"lateness {self.lateness * 1000:g} ms"] if self.lateness else []
         parts += ["cuts"] if self.cuts else []
         parts += ["bytewise"] if self.bytewise else []
         parts += ["damage"] if self.damage else []

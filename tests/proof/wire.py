@@ -57,6 +57,7 @@ class Owed:
         "own",
         "packet",
         "packet_by",
+        "request",
         "ticket",
         "turnaround",
         "unit",
@@ -75,6 +76,8 @@ class Owed:
         self.own = True
         self.turnaround = 0.0
         self.ticket: Ticket | None = None
+        self.request = b""
+        """What it replies to."""
         self.packet = b""
         """Of an MSC: the packet behind the ACK, or the whole one that may be said again."""
         self.packet_by: Time = -inf

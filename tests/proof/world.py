@@ -24,7 +24,6 @@ from tests.proof.shipped import ANY_STEP, BUDGET, NO_COUNTERS, Decided, no_jitte
 from tests.proof.wire import OLD, OWN, STRAY, Outside, Owed, Ticket, Time, Violation, choose
 
 Action: TypeAlias = tuple[Any, ...]
-NAK = b"\x15"
 LONGEST_FRAME = 256
 """Bytes."""
 MOST_TURNS = 50
@@ -47,6 +46,9 @@ class World:
         cls.setup = setup
         kind = KINDS[setup.kind]()
         timings = kind.profile.timings
+        if setup.lateness:
+            window = setup.lateness * 2 / 3
+            timings = Timings.uniform(ReplyTiming(window, window, setup.lateness, 0.02, timings.read.turnaround))
         checks = (kind.commands[READ][1], kind.check) if setup.in_step else (kind.check,)
         if not setup.in_step:  # `nominal` sorts replies that count into prompt and late ones
             read, write, packet = (replace(t, nominal=t.window) for t in (timings.read, timings.write, timings.packet))
@@ -72,7 +74,7 @@ class World:
         several = 1 + max(self.kind.commands[place][0] for place in setup.commands)
         for place in range(several):
             timings = Timings.uniform(SECOND_TIMING) if setup.second_timing and place else None
-            address = place + 1 if profile.addressed else 0
+            address = place + self.kind.first if profile.addressed else 0
             node = arbiter.add_node(profile, address, 0.0, timings=timings, retries=setup.retries)
             node.learning = Learning() if setup.learned is not None else None
             node.counters = NO_COUNTERS  # type: ignore[assignment]  # a stand-in that counts nothing
@@ -267,8 +269,8 @@ class World:
 
     def _judge_silence(self, ticket: Ticket) -> None:
         """R2, as a caller is told that no reply came: none can come in time any more. A learned window ends sooner, and
-        so does an exchange whose echo is lost."""
-        if self.setup.learned is not None or self.setup.echo:
+        so does an exchange whose echo is lost. What comes `beyond` its lateness is for R15."""
+        if self.setup.learned is not None or self.setup.echo or self.setup.beyond:
             return
         for reply in self.owed:
             if reply.own and reply.ticket is ticket and not reply.begun and reply.hi > self.now:
@@ -314,6 +316,8 @@ class World:
             assert transaction is not None
             self._judge_turn(transaction)
             self._judge_order(ticket)
+            if ticket.writes and ticket.undenied and not transaction.command.idempotent:
+                raise Violation("R7: a write that may have been carried out is sent again")
             ticket.sent = True
             ticket.undenied += 1
         if self.setup.may(setups.HELD) and choose(2):
@@ -370,7 +374,7 @@ class World:
         gap = timing.byte_gap + (byte_time if assumed.gap_edge else 0.0)
         earliest = end + byte_time if self.setup.paced or self.setup.echo else self.now
         reply = Owed(answers[place], earliest, end + begins, gap)
-        reply.ticket = ticket
+        reply.ticket, reply.request = ticket, out
         reply.turnaround = timing.turnaround
         self.owed.append(reply)
 
@@ -418,9 +422,9 @@ class World:
 
     def refuse(self, reply: Owed) -> bytes:
         """The node says NAK in place of this reply: it has carried nothing out."""
-        if reply.ticket is not None and reply.own:
+        if reply.ticket is not None and (reply.own or self.setup.beyond):
             reply.ticket.undenied -= 1
-        return NAK
+        return self.kind.refusal(reply.request)
 
     @property
     def words_are_read(self) -> bool:

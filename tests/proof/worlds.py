@@ -34,10 +34,13 @@ from tests.proof.setups import (
     Setup,
 )
 
+EVERY_KIND = ("hcp", "hcp2", "microflex", "mentor", "ct-ansi", "dc104", "modbus", "msc")
 LAPSES = {"dc104": 1.5, "mentor": 0.8, "msc": 2.5}
 """In place of LAPSE: longer than the longest lateness."""
 LEARNED = (LEAST, 0.1)
 """Seconds: the least window that is ever learned, and the document's."""
+SHORT = {"mentor": 0.018, "ct-ansi": 0.018, "msc": 0.036}
+"""Seconds: a lateness in which a whole reply has room at these lines' rates, where windows are learned."""
 DAMAGE: tuple[tuple[int, int | None], ...] = ((0, 0), (1, 1), (3, 0), (6, 5), (13, 0), (17, 0), (9, None))
 """Of an MSC's packet of 18 bytes: STX, unit, length, name, data and checksum hit, and a byte lost."""
 
@@ -47,8 +50,23 @@ def _line(kind: str = "hcp2", *adversary: str, commands: tuple[int, ...] = (READ
     return Setup(kind=kind, commands=commands, adversary=adversary, lapse=lapse)
 
 
+def _late(kind: str, *adversary: str, commands: tuple[int, ...], retries: int = 0) -> Setup:
+    """A world of R15 in which replies come up to a fifth after their lateness. That is a short one, of every node: so
+    few replies are overdue at a time."""
+    line = _line(kind, BEYOND, *adversary, commands=commands)
+    return replace(line, in_step=True, whole=True, retries=retries, lateness=0.15, beyond=0.18, lapse=0.19)
+
+
+def _learning(kind: str, *adversary: str, commands: tuple[int, ...] = (READ,), lateness: float) -> Setup:
+    """A world of R15 in which the line goes on after a learned window, and replies come within their lateness."""
+    line = replace(_line(kind, *adversary, commands=commands), in_step=True, whole=True, retries=1)
+    lapse, learned = lateness * 4 / 3, (LEAST, lateness * 2 / 3)
+    return replace(line, lateness=lateness, beyond=lateness, lapse=lapse, learned=learned)
+
+
 def quick() -> Iterator[Setup]:
-    """What continuous integration explores: each kind of line, and each feature that breaks a wire, alone."""
+    """What continuous integration explores: each kind of line, and each feature that breaks a wire, alone; and R15 for
+    each protocol, where replies come late and refuse, and where windows are learned."""
     for kind in ("hcp", "mentor", "dc104", "msc"):
         yield _line(kind)
     for feature in (LOST, MARKS, CANCELS, STRAYS, FLIPS, HELD):
@@ -63,6 +81,11 @@ def quick() -> Iterator[Setup]:
     yield replace(_line("msc"), lost_acknowledgements=1)
     yield replace(_line(commands=(WRITE,)), clients=1, depth=1)
     yield replace(_line("hcp2", LOST, commands=(WRITE,)), clients=1, depth=1, retries=1)
+    for kind in ("hcp", "microflex", "mentor", "ct-ansi", "dc104"):
+        yield _late(kind, commands=(READ,))
+    for kind in ("hcp2", "modbus", "msc"):  # with refusals: a NAK, an exception, and a resend within the exchange
+        yield _late(kind, NAKS, commands=(WRITE,))
+    yield _learning("hcp2", lateness=0.015)
 
 
 def lines() -> Iterator[Setup]:
@@ -140,6 +163,16 @@ def in_step() -> Iterator[Setup]:
         yield one
         if READ in commands:  # where nothing is repeated, nothing is awaited for a learned time
             yield replace(one, adversary=(), retries=1, learned=LEARNED, lapse=0.2, beyond=0.15)
+    for kind in EVERY_KIND:
+        for commands in ((READ,), (WRITE,)):
+            yield _late(kind, NAKS, commands=commands)
+        yield _learning(kind, lateness=SHORT.get(kind, 0.012))
+    for kind in ("hcp2", "msc"):  # replies that say whose element they answer, and phases
+        yield _late(kind, commands=(READ, WRITE))
+        yield _late(kind, commands=(WRITE, WRITE_THERE))
+        yield _late(kind, NAKS, commands=(WRITE,), retries=1)
+        yield replace(_late(kind, NAKS, commands=(WRITE,)), strict=True)
+        yield _learning(kind, NAKS, lateness=SHORT.get(kind, 0.012))
 
 
 GROUPS = {
