@@ -45,6 +45,18 @@ def test_r15_a_read_never_overtakes_a_write_to_its_node() -> None:
     assert (asked.error, beside.value, behind.value) == (None, 5.0, 5.0)
 
 
+def test_r15_a_read_never_overtakes_a_write_to_its_node_that_waits_behind_others() -> None:
+    bench = Bench()
+    node, first, other = up(bench), up(bench, 2), up(bench, 3)
+    lost(bench, node)
+    bench.hear("FF")
+    bench.ask(first)
+    bench.ask(other, write())
+    bench.ask(other, hcp2.Read(3))
+    bench.until_sent()
+    assert bench.sent() != request_of(3, 3), "the write to its node was asked for first"
+
+
 def test_r15_a_write_overtakes_nothing() -> None:
     bench = Bench()
     node, other, third = up(bench), up(bench, 2), up(bench, 3)

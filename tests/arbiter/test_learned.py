@@ -91,6 +91,18 @@ def test_nothing_is_learned_unless_it_is_asked_for() -> None:
     assert node.timings is own
 
 
+def test_r15_a_last_attempt_is_not_sent_while_an_overdue_reply_may_meet_its_own() -> None:
+    bench = Bench()
+    node = trained(bench)
+    other = bench.node(2)
+    gone = bench.ask(node)
+    assert bench.sent() == request_of(1)
+    bench.ask(other, hcp2.Read(5), retries=0)
+    bench.arbiter.cancel(gone, bench.now)
+    assert bench.until_sent() == pytest.approx(REQUEST + WINDOW)
+    assert bench.sent() != request_of(5, 2)
+
+
 # what is lost costs the learned window
 
 

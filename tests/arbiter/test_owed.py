@@ -152,3 +152,11 @@ def test_r15_of_several_who_pay_at_once_the_first_is_told(behind: str) -> None:
     payer = in_step.heard(bytes.fromhex(ACK + reply_of(2, 5) + behind), 1.0)
     assert payer is not None
     assert payer.node is first
+
+
+def test_r15_what_came_around_a_reply_that_was_sent_twice_may_have_been_a_part_of_an_ack() -> None:
+    owed = InStep()
+    owed.recent.append((b"\x02reply",))
+    owed.heard(b"\xff\x02reply", 1.0)
+    assert owed.doubts(1.0)
+    assert owed.clashes((b"\x06",), 1.0), "a single byte may still come"

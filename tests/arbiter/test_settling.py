@@ -365,3 +365,14 @@ def test_r2_a_reply_is_late_by_the_time_from_the_end_of_its_echo() -> None:
     bench.hear(request, after=0.030)
     bench.hear("02 30 31 35 03 37", after=0.049)
     assert (prompt.value, prompt.late) == (5.0, False)
+
+
+def test_r3_a_line_that_comes_up_waits_for_the_slowest_of_its_nodes() -> None:
+    """An earlier master may have asked that one, whichever was added first."""
+    bench = Bench()
+    first = bench.node(1)
+    bench.node(2, timings=hcp2.PROFILE.timings.with_lateness(0.4))
+    bench.arbiter.line_down("lost", bench.now)
+    bench.arbiter.line_up(bench.now)
+    bench.ask(first)
+    assert bench.until_sent() >= 0.4
