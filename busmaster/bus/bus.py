@@ -19,13 +19,14 @@ from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
-from busmaster.arbiter.transaction import Priority
+from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
 from busmaster.bus.condition import LineCondition
 from busmaster.bus.node import Node
 from busmaster.bus.outlook import Outlook
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Sample, Stream
+from busmaster.bus.reads_after_writes import ReadsAfterWrites
 from busmaster.bus.requester import checked_priority, checked_retries
 from busmaster.bus.shared_line import SharedLine, running_loop
 from busmaster.bus.suitability import check_company, check_settings
@@ -95,7 +96,7 @@ class Bus:
             on_sample=lambda poll, transaction: poll.group.sampled(transaction),
             on_cycle=lambda poll: poll.group.cycle_finished(),
             on_event=self._on_event,
-            on_written=line.touched,
+            on_written=self._on_written,
             paced=lambda transport: is_paced(endpoint, transport),
             name=endpoint.name,
         )
@@ -104,6 +105,9 @@ class Bus:
         self._profiles: dict[str, Profile] = {}
         """Of the protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
+        self.reads_after_writes = ReadsAfterWrites(line, self._groups, self._start)
+        """Counts of the reads of points with `read_after_write`."""
+        line.on_touched.append(self._on_touched)
         self._outlook = Outlook(line, endpoint, self._nodes, self._groups)
         self._streams: list[Stream[BusEvent]] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -365,6 +369,7 @@ class Bus:
         self.check_loop()
         self._arbiter.reset_statistics(self.now())
         self.pump.reset_driver_errors()
+        self.reads_after_writes.reset()
         for group in self._groups.values():
             group.reset_statistics()
 
@@ -434,6 +439,14 @@ class Bus:
     def _forget(self, group: PollGroup) -> None:
         if self._groups.get(group.name) is group:
             del self._groups[group.name]
+
+    def _on_written(self, write: Transaction, when: float) -> None:
+        self._line.touched(write, when)
+        self.reads_after_writes.note(write, when)
+
+    def _on_touched(self, record: NodeRecord, when: float) -> None:
+        for group in self._groups.values():
+            group.report_outdated(record, when)
 
     def _on_event(self, event: BusEvent) -> None:
         match event:

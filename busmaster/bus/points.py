@@ -24,7 +24,8 @@ class Point(Generic[T]):
     `item` names it as the command line does ("axis0.position", "1.17"); `command` is the exchange behind it;
     `decode` makes its value of what the command returns (a number into an IntFlag, a scaled integer into a
     float); `encode` builds the write command of a value and raises InvalidCommand for one out of range.
-    `meaning` says what the value means to people, outputs and alarms.
+    `meaning` says what the value means to people, outputs and alarms. With `read_after_write`, a poll
+    group that has the point reads it when a write to it is confirmed, ahead of its next cycle.
     Two points are equal if node, item and command are, so a point may be made anew each time it is asked for.
     """
 
@@ -35,6 +36,7 @@ class Point(Generic[T]):
     decode: Callable[[Any], T] | None = field(default=None, compare=False, repr=False)
     encode: Callable[[T], Command[None]] | None = field(default=None, compare=False, repr=False)
     meaning: Meaning = field(default=PLAIN, compare=False, repr=False)
+    read_after_write: bool = field(default=False, compare=False, repr=False)
 
     @property
     def key(self) -> str:

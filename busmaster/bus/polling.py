@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from math import inf
+from math import inf, nextafter
 from typing import Any, NamedTuple
 
 from busmaster.arbiter.health import NodeRecord
@@ -17,7 +17,16 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
 from busmaster.bus.shared_line import SharedLine
-from busmaster.bus.snapshots import NO_SAMPLES, Cycles, GroupStatistics, Snapshot, Stream, Tally
+from busmaster.bus.snapshots import (
+    NO_SAMPLES,
+    Cycles,
+    GroupStatistics,
+    Outdated,
+    ReadAfterWrite,
+    Snapshot,
+    Stream,
+    Tally,
+)
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Batch
 from busmaster.errors import GarbledReply, InvalidCommand, Refused
@@ -79,6 +88,12 @@ class PollGroup(Cycles):
         self._poll.group = self
         self._points: dict[Point[Any], Node] = {}
         self._watched: tuple[Point[Any], ...] = ()
+        self.read_after_write: tuple[Point[Any], ...] = ()
+        """Those of its points that are read when a write to them is confirmed."""
+        self._between: dict[Point[Any], Sample[Any]] = {}
+        """What was read since the last cycle ended: the one that runs may have read before the write."""
+        self._told_outdated: dict[Point[Any], Sample[Any]] = {}
+        """The sample of each point that was reported as stale last."""
         self._tally = Tally(self._poll)
         self._good_at: dict[Point[Any], float] = {}
         """When each point that cannot be read was last read, in seconds since 1970."""
@@ -142,6 +157,7 @@ class PollGroup(Cycles):
         for point in points:
             self._points.pop(point, None)
             self._good_at.pop(point, None)
+            self._told_outdated.pop(point, None)
         self._points_changed()
 
     def pause(self) -> None:
@@ -169,10 +185,13 @@ class PollGroup(Cycles):
             self._line.remove_poll(self._poll)
         self._end()
 
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+    def subscribe(self, buffer: int = 16, *, changes: bool = False) -> Stream[Snapshot]:
+        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more.
+
+        With `changes` it also gets what becomes of values between two cycles, each as a snapshot of these values alone.
+        """
         self._line.check_loop()
-        return super().subscribe(buffer)
+        return super().subscribe(buffer, changes=changes)
 
     def statistics(self) -> GroupStatistics:
         """Return an immutable snapshot of its counts."""
@@ -231,6 +250,7 @@ class PollGroup(Cycles):
             self._fall_back()  # no snapshot yet: the single reads follow in the same period
             return
         self._age()
+        self._use_readings()
         self._tally.note(poll, self._qualities)
         started = poll.started if poll.started > -inf else None
         wall = poll.finished + self._wall_offset
@@ -298,10 +318,67 @@ class PollGroup(Cycles):
                     self._qualities[Quality.STALE] += 1
                     self._samples[point] = sample._replace(quality=Quality.STALE)
 
+    # between two cycles
+
+    def take_reading(self, read: Point[Any], reading: Transaction) -> None:
+        """Take the value that a read of one of its quantities brought, if it is younger than what the group has."""
+        latest = self.latest
+        if latest is None or not self._poll.active:
+            return
+        fresh: dict[Point[Any], Sample[Any]] = {}
+        for point in self._points:
+            before = latest.samples.get(point)
+            if point.quantity == read.quantity and before is not None and _is_older(before, reading.started):
+                fresh[point] = self._sample(point, None, reading)
+        if not fresh:
+            return
+        self._between |= fresh
+        self._line.latest_of[self.name] = self.latest = replace(latest, samples={**latest.samples, **fresh})
+        answer = Answer(read.node, read.command, [(point, None) for point in fresh], reading.value, reading.started)
+        self._line.answers_of[self.name] = [*self._line.answers_of.get(self.name, ()), answer]
+        finished = reading.ended_at
+        wall = finished + self._wall_offset
+        times = (latest.due, reading.started, finished)
+        self._tell_change(ReadAfterWrite(self.name, latest.cycle, *times, self._poll.missed, wall, fresh))
+        self._line.alarms.look([point for point in self._watched if point in fresh], fresh)
+
+    def report_outdated(self, record: NodeRecord, when: float) -> None:
+        """Report to consumers of changes which values a write that ended just now has made stale."""
+        latest = self.latest
+        if latest is None or not self._consumers_of_changes:
+            return
+        to_all, before = record.address == record.profile.broadcast, nextafter(when, -inf)
+        wall = when + self._wall_offset
+        outdated = {}
+        for point in self._points if to_all else self.points_of(record):
+            sample = latest.samples.get(point)
+            if sample is None or not sample.quality.is_current or self._told_outdated.get(point) is sample:
+                continue
+            if self._line.is_stale(point, before):
+                self._told_outdated[point] = sample
+                outdated[point] = sample._replace(quality=Quality.STALE, wall=wall)
+        if outdated:
+            times = (latest.due, latest.started, when)
+            self._tell_change(Outdated(self.name, latest.cycle, *times, self._poll.missed, wall, outdated))
+
+    def _use_readings(self) -> None:
+        """Let no value of the cycle that ends now replace a younger one that was read after a write."""
+        for point, reading in self._between.items():
+            sample = self._samples.get(point)
+            if sample is None or reading.started is None or not _is_older(sample, reading.started):
+                continue
+            if self._line.is_stale(point, reading.started):
+                reading = reading._replace(quality=Quality.STALE)
+            self._qualities[sample.quality] -= 1
+            self._qualities[reading.quality] += 1
+            self._samples[point] = reading
+        self._between = {}
+
     # which exchanges bring the values
 
     def _points_changed(self) -> None:
         self._watch(tuple(point for point in self._points if point.meaning.watched))
+        self.read_after_write = tuple(point for point in self._points if point.read_after_write)
         self._choose()
 
     def _watch(self, points: tuple[Point[Any], ...]) -> None:
@@ -388,6 +465,11 @@ class PollGroup(Cycles):
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
         self._line.demand(self._poll)
+
+
+def _is_older(sample: Sample[Any], started: float) -> bool:
+    """Return whether a sample was read, or given up, before a read that began then."""
+    return (sample.finished if sample.started is None else sample.started) < started
 
 
 def _measure(transaction: Transaction, read: _Read) -> None:

@@ -56,6 +56,18 @@ class Snapshot(Mapping[Point[Any], Sample[Any]]):
         return len(self.samples)
 
 
+class Outdated(Snapshot):
+    """The values of a group that a write has made stale between two cycles: with the time of the write."""
+
+    __slots__ = ()
+
+
+class ReadAfterWrite(Snapshot):
+    """The values of a group that were read after a write, between two cycles. `latest` of the group has them too."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, slots=True)
 class GroupStatistics:
     """Of a group since it was made, or its statistics were reset; times in seconds.
@@ -190,13 +202,18 @@ class Cycles:
         self.latest: Snapshot | None = None
         """That of its last cycle."""
         self._consumers: list[Stream[Snapshot]] = []
+        self._consumers_of_changes: list[Stream[Snapshot]] = []
         self._over = False
 
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+    def subscribe(self, buffer: int = 16, *, changes: bool = False) -> Stream[Snapshot]:
+        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more.
+
+        With `changes` it also gets what becomes of values between two cycles, each as a snapshot of these values alone:
+        `Outdated` and `ReadAfterWrite`.
+        """
         if self._over:
             raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
+        return Stream(self._consumers_of_changes if changes else self._consumers, buffer)
 
     async def __aiter__(self) -> AsyncIterator[Snapshot]:
         consumer = self.subscribe()
@@ -208,11 +225,16 @@ class Cycles:
 
     def _tell(self, snapshot: Snapshot) -> None:
         self.latest = snapshot
+        self._tell_change(snapshot)  # first: outputs must have a cycle before a program acts on it
         for consumer in self._consumers:
+            consumer.put(snapshot)
+
+    def _tell_change(self, snapshot: Snapshot) -> None:
+        for consumer in self._consumers_of_changes:
             consumer.put(snapshot)
 
     def _end(self) -> None:
         """End those who read it, after what they hold."""
         self._over = True
-        for consumer in list(self._consumers):
+        for consumer in (*self._consumers, *self._consumers_of_changes):
             consumer.close()

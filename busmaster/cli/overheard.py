@@ -74,8 +74,8 @@ class HeardGroup:
         self._heard: dict[Point[Any], Sample[Any]] = {}
         self._consumers: list[Stream[Snapshot]] = []
 
-    def subscribe(self, buffer: int) -> Stream[Snapshot]:
-        """Return a stream of the snapshots from now on, which holds `buffer` of them."""
+    def subscribe(self, buffer: int, *, changes: bool = False) -> Stream[Snapshot]:
+        """Return a stream of the snapshots from now on, which holds `buffer` of them. Nothing changes in between."""
         return Stream(self._consumers, buffer)
 
     def take(self, point: Point[Any], sample: Sample[Any]) -> None:

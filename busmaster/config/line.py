@@ -326,6 +326,7 @@ class ConfiguredLine:
             scale=scale,
             declared=section.writable,
             meaning=section.meaning,
+            read_after_write=section.read_after_write,
         )
 
     def _safe_writes(self) -> Iterator[SafeWrite]:

@@ -39,6 +39,7 @@ class PointSection:
     maximum: float | None = None
     max_step: float | None = None
     writable: bool = True
+    read_after_write: bool = False
     meaning: Meaning
     template: str = field(default="", compare=False)
     table: Table = field(compare=False, repr=False)

@@ -107,6 +107,7 @@ class NamedPoint(Point[Any]):
         scale: Scale,
         declared: bool = True,
         meaning: Meaning = PLAIN,
+        read_after_write: bool = False,
     ) -> NamedPoint:
         """Return the point under the file's names, with its unit, scale and meaning."""
         decode, encode = source.decode, source.encode if declared else None
@@ -121,6 +122,7 @@ class NamedPoint(Point[Any]):
             decode=decode,
             encode=encode,
             meaning=meaning,
+            read_after_write=read_after_write,
             where=where,
             source=source,
             scale=scale,

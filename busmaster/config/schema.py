@@ -53,6 +53,7 @@ POINT = {
     "maximum": "The most that may be written, likewise.",
     "max_step": "How far a write may be from the last value that was confirmed; more than 0.",
     "writable": "Whether it may be written at all.",
+    "read_after_write": "Whether a polled point is read as soon as a write to it is confirmed, ahead of its next poll.",
     "precision": "Digits behind the point that people are shown. Nothing else is rounded.",
     "bits": "Names of the word's bits, 0 the lowest, each a point of its own: `bits = { READY = 0, FAULT = 3 }`.",
     "labels": 'Names of whole numbers: `labels = { 0 = "off", 1 = "run" }`.',

@@ -105,6 +105,8 @@ class Output(ABC):
     """One output. `say` is called from any thread with what happens to the output."""
 
     what: ClassVar[str] = "written"
+    finds_outdated: ClassVar[bool] = False
+    """It finds out by itself which values a write has made stale."""
 
     def __init__(
         self,

@@ -15,6 +15,7 @@ from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Snapshot, Stream
+from busmaster.bus.snapshots import Outdated
 from busmaster.gate.gate import Gate
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Output, OutputStatistics
@@ -39,7 +40,7 @@ class Source(Protocol):
     @property
     def points(self) -> tuple[Point[Any], ...]: ...
 
-    def subscribe(self, buffer: int, /) -> Stream[Snapshot]: ...
+    def subscribe(self, buffer: int, /, *, changes: bool = False) -> Stream[Snapshot]: ...
 
 
 class Wanted(NamedTuple):
@@ -194,7 +195,9 @@ class Distributor:
             return
         for group in groups:
             if group not in self._feeding:
-                self._feeding[group] = task = asyncio.ensure_future(self._feed(group.subscribe(WAITING), group))
+                self._feeding[group] = task = asyncio.ensure_future(
+                    self._feed(group.subscribe(WAITING, changes=True), group)
+                )
                 task.add_done_callback(partial(self._fed, group))
         if self._watching is None:
             self._watching = asyncio.ensure_future(self._watch())
@@ -209,6 +212,8 @@ class Distributor:
         async for snapshot in cycles:
             told = news.of(snapshot)
             for output in self._outputs:
+                if isinstance(snapshot, Outdated) and output.finds_outdated:
+                    continue
                 if not output.groups or group.name in output.groups:
                     output.suppress(len(snapshot) - len(told))
                     if told:

@@ -172,6 +172,14 @@ class MetricsOutput(Output):
             yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
         for name, text in DRIVER_COUNTS.items() if line.driver is not None else ():
             yield CounterMetricFamily(f"busmaster_driver_{name}", text, value=getattr(line.driver, name))
+        reads = CounterMetricFamily(
+            "busmaster_reads_after_writes",
+            "Reads of points with read_after_write; shared: writes that the read of another served too",
+            labels=["outcome"],
+        )
+        for outcome, count in self._ask(self._counts_of_reads).items():
+            reads.add_metric([outcome], count)
+        yield reads
         waits = GaugeMetricFamily(
             "busmaster_line_wait_p99_seconds", "From being queued to being sent, 99 of 100", labels=["priority"]
         )
@@ -182,6 +190,10 @@ class MetricsOutput(Output):
     def _line_and_utilisation(self) -> tuple[LineStatistics, float]:
         line = self._bus.statistics()
         return line, self._utilisation.note(self._bus.now(), line)
+
+    def _counts_of_reads(self) -> dict[str, int]:
+        counts = self._bus.reads_after_writes
+        return {"read": counts.read, "failed": counts.failed, "shared": counts.shared}
 
     def _lost_seconds(self) -> float:
         return self._bus.lost_seconds

@@ -34,7 +34,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import anyio
 from anyio.abc import TaskStatus
@@ -95,6 +95,8 @@ class MqttOutput(SpillingOutput):
     Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there. Without `asks` it
     says that it is there, and what it heard; how line and nodes are, nobody knows who does not ask them.
     """
+
+    finds_outdated: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -314,8 +316,7 @@ class MqttOutput(SpillingOutput):
                 yield self._value(point, self._bus.as_of_now(point, sample) if current else sample)
 
     def _value(self, point: Point[Any], sample: Sample[Any]) -> Outgoing:
-        said = {"unit": point.unit, "quality": sample.quality.value, **sample_fields(sample)}
-        payload = json_line(time=micros(sample.wall), **said)
+        payload = json_line(time=micros(sample.wall), unit=point.unit, **sample_fields(sample))
         return Outgoing(self._topic("values", topic_part(point.key)), payload, self._settings.retain)
 
     def _outdated(self) -> Iterator[Outgoing]:

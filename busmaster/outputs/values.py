@@ -136,11 +136,12 @@ def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[
 
 
 def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
-    """Return a value, or what went wrong, and whether it is late.
+    """Return a value, or what went wrong, with its quality and whether it is late.
 
     With it are what the value is called and what to try, where there is something to say.
     """
     fields: dict[str, Any] = {
+        "quality": sample.quality.value,
         "value": json_value(sample.value),
         "error": None if sample.error is None else sample.error.what,
         "late": sample.quality is Quality.LATE,

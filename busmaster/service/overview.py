@@ -22,6 +22,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.samples import Sample
+from busmaster.bus.snapshots import Snapshot
 from busmaster.contract.places import Placed
 from busmaster.gate.gate import Gate
 from busmaster.outputs.values import event_text, value_text
@@ -86,6 +87,7 @@ class Part:
         self._points = points
         self._seen: object = None
         """What its values were worked out of: the cycle, the last write, and whether the line was there."""
+        self._snapshot: Snapshot | None = None
         self.rows = ""
         self.values = ""
 
@@ -105,6 +107,7 @@ class Part:
         if seen == self._seen:
             return False
         self._seen = seen
+        self._snapshot = snapshot  # kept: no other can have its id then, as one with a value read after a write could
         alarms = bus.alarms
         values = [_said_value(bus, point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
         before, self.values = self.values, encoded({"set": number, "first": self.first, "values": values})

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.bus.snapshots import Snapshot
+from busmaster.bus.snapshots import Outdated, ReadAfterWrite, Snapshot
 from busmaster.service.messages import encoded
 from busmaster.service.telling import said_event, said_points, said_sample, said_snapshot
 
@@ -100,9 +100,13 @@ class GroupBroadcast(Broadcast):
             reader.tell_surely(stream, "points", body)
 
     async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
-        stream = self.group.subscribe()
+        stream = self.group.subscribe(changes=True)
         try:
             async for snapshot in stream:
+                if isinstance(snapshot, Outdated):
+                    continue  # `touched` says so, sooner
+                if isinstance(snapshot, ReadAfterWrite) and self.group.latest is not None:
+                    snapshot = self.group.latest  # the wire has whole cycles: the last one, with the new value
                 points = tuple(snapshot)
                 if points != self._points:
                     self._points = points

@@ -44,7 +44,7 @@ d = { item = "13", low = 1, high = 2, hysteresis = 0.1, precision = 1, unit = "=
 "@f" = { item = "15", unit = "1.20" }
 g = { item = "16", unit = "" }
 "4-8" = { item = "17", unit = "two\\nlines" }
-20 = {}
+20 = { read_after_write = true }
 "a\\"b" = { item = "18", unit = " , ; " }
 """
 

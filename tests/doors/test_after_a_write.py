@@ -56,6 +56,27 @@ async def test_none_of_60_reads_after_60_writes_reports_the_old_value_as_good(tm
 
 
 @pytest.mark.asyncio
+async def test_with_read_after_write_none_of_60_reads_reports_an_old_value_as_good_and_the_new_one_comes_by_itself(
+    tmp_path: Path,
+) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        point = replace(Hcp2Controller(line.bus, 5).point("10"), read_after_write=True)
+        line.bus.poll_group("axes", period=SLOW, points=[point])
+        await shows(of.line)
+        seen = []
+        for number in range(1, 61):
+            assert (await of.client.put(ONE, json={"value": number})).status_code == 200
+            value, quality = await shown(of, ONE)
+            assert quality in ("good", "stale")
+            assert quality == "stale" or value == number
+            if number % 20 == 0:
+                await until(lambda: of.line.picture.rows[0].quality == "good")
+                seen.append(await shown(of, ONE))
+        assert seen == [(20, "good"), (40, "good"), (60, "good")]
+        assert line.bus.groups[0].statistics().cycles == 1
+
+
+@pytest.mark.asyncio
 async def test_a_write_of_another_program_makes_values_stale_and_an_interface_that_comes_then_is_told(
     tmp_path: Path,
 ) -> None:

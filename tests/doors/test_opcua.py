@@ -127,6 +127,20 @@ async def test_none_of_60_reads_after_60_writes_is_the_old_value_as_good(opened:
         assert (await opened.is_("5/10", "Good")).value == 60.0
 
 
+async def test_with_read_after_write_none_of_60_reads_is_the_old_value_as_good(opened: Opened) -> None:
+    async with opened.owned() as line:
+        point = replace(Hcp2Controller(line.bus, 5).point("10"), read_after_write=True)
+        group = line.bus.poll_group("axes", period=1000, points=[point])
+        await opened.is_("5/10", "Good")
+        for number in range(1, 61):
+            assert await opened.write("5/10", float(number)) == "Good"
+            told = await asyncio.to_thread(opened.client.read, "5/10")
+            assert told.status in ("UncertainLastUsableValue", "Good")
+            assert told.status != "Good" or told.value == number
+        assert (await opened.is_("5/10", "Good")).value == 60.0  # without another cycle
+        assert group.statistics().cycles == 1
+
+
 async def test_a_point_has_its_unit_range_status_and_time(opened: Opened) -> None:
     async with opened.owned() as line:
         began = time.time()

@@ -79,8 +79,8 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
     output.close(PATIENCE)
     first, second = map(json.loads, written(path))
     assert first["samples"] == {
-        "5/1": {"value": 12, "error": None, "late": False},
-        "5/2": {"value": None, "error": "no reply", "late": False, "hint": NoReply.hint},
+        "5/1": {"quality": "good", "value": 12, "error": None, "late": False},
+        "5/2": {"quality": "bad", "value": None, "error": "no reply", "late": False, "hint": NoReply.hint},
     }
     assert (first["group"], first["cycle"], first["missed"]) == ("axes", 1, 0)
     assert abs(first["started"] - time.time()) < PATIENCE

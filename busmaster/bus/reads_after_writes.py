@@ -1,0 +1,93 @@
+"""Reads of points after confirmed writes to them: what `read_after_write` of a point asks for."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine, Mapping
+from math import nextafter
+from typing import Any
+
+from busmaster.arbiter.transaction import ENDED, Priority, Transaction
+from busmaster.bus.node import Node
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup
+from busmaster.bus.requester import RequestOptions
+from busmaster.bus.shared_line import SharedLine
+from busmaster.errors import BusError, InvalidCommand
+
+
+class ReadsAfterWrites:
+    """The reads of one line after writes: they are reads of the line's owner, in the class of its polls.
+
+    The confirmation of a write never waits for its read, and commands go before it as they go before polls. Where
+    more writes to the same quantity are confirmed before its read is sent, that one read serves all of them. A read
+    that cannot be sent within the period of the group is given up: the next poll brings the value.
+    """
+
+    def __init__(
+        self,
+        line: SharedLine,
+        groups: Mapping[str, PollGroup],
+        start: Callable[[Coroutine[Any, Any, None]], None],
+    ) -> None:
+        self._line = line
+        self._groups = groups
+        self._start = start
+        self._waiting: set[object] = set()
+        """The quantities that are being read, or wait to be."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Start the counts again."""
+        self.read = 0
+        """Reads that brought a value."""
+        self.failed = 0
+        """Reads that were not sent in time, or not answered."""
+        self.shared = 0
+        """Writes that needed no read of their own, because one that waited served them too."""
+
+    def note(self, write: Transaction, when: float) -> None:
+        """Read what a write has changed that ended just now: if it is confirmed, and a polled point asks for it."""
+        if write.error is not None or write.phase is not ENDED:
+            return  # unconfirmed: its points are stale until they are polled
+        before = nextafter(when, float("-inf"))
+        for group in self._groups.values():
+            for point in group.read_after_write:
+                node = Node.of(point)
+                # not after a write to all: no node confirms that, and a read of each would hold up the line
+                if node.record is write.node and self._line.is_stale(point, before):
+                    self._want(point, node, group.period)
+
+    def _want(self, point: Point[Any], node: Node, within: float) -> None:
+        if point.quantity in self._waiting:
+            self.shared += 1
+            return
+        self._waiting.add(point.quantity)
+        self._start(self._read(point, node, within))
+
+    async def _read(self, point: Point[Any], node: Node, within: float) -> None:
+        """Read a point until its value is younger than the last write to it."""
+        options = RequestOptions(priority=Priority.POLL, start_within=within)
+        try:
+            while True:
+                future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+                reading = node.begin_reading(point.command, future, options)
+                try:
+                    await future
+                except asyncio.CancelledError:
+                    node.give_up(reading)
+                    raise
+                self.read += 1
+                for group in self._groups.values():
+                    group.take_reading(point, reading)
+                if not self._line.is_stale(point, reading.started):
+                    return  # a write that was confirmed before this task woke relied on this read
+        except (BusError, InvalidCommand):  # InvalidCommand: the bus was closed, or the node given back, meanwhile
+            self.failed += 1
+        finally:
+            self._waiting.discard(point.quantity)
+
+
+__all__ = [
+    "ReadsAfterWrites",
+]
