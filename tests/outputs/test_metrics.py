@@ -5,13 +5,16 @@ from __future__ import annotations
 import asyncio
 import importlib
 import os
+import re
 import socket
 import threading
 import time
 import urllib.request
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,6 +22,7 @@ import pytest
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.health import Health
 from busmaster.bus.bus import Bus
+from busmaster.bus.meaning import Meaning
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.errors import LineDown, NoReply
@@ -232,6 +236,50 @@ async def test_a_stale_value_is_told_as_such_and_a_lost_one_keeps_its_time(monke
     assert of(metrics, "value_good", **labels) == 0
     assert of(metrics, "value_time_seconds", **labels) == read_at
     assert ("busmaster_value", frozenset(labels.items())) not in metrics
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "howto" / "mqtt-and-grafana.md").read_text()
+"""What users are told to put into panels and alerts."""
+
+
+def firing(metrics: Metrics) -> set[str]:
+    """Which alerts of the page, `METRIC == 0` or `METRIC != 0`, fire on these samples, as Prometheus computes them."""
+    alerts = re.findall(r"`(busmaster_\w+) (==|!=) 0`", PAGE)
+    assert len(alerts) >= 5
+    return {
+        name
+        for name, sign in alerts
+        if any(sample == name and (value == 0) == (sign == "==") for (sample, _), value in metrics.items())
+    }
+
+
+@pytest.mark.asyncio
+async def test_the_alerts_of_the_page_fire_when_the_line_is_lost_and_not_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    counts = OutputStatistics("sqlite", "written", 10, 0, 0, "")
+    output = MetricsOutput("metrics", MetricsSettings(port=0, groups=("axes",)), bus, outputs=lambda: (counts,))
+    async with bus:
+        point = replace(Hcp2Controller(bus, 5).point("10"), meaning=Meaning(high=5.0))
+        group = bus.poll_group("axes", period=0.05, points=[point])
+        async for _ in group:
+            break
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        calm = await asyncio.to_thread(scraped, output.port)
+        monkeypatch.setattr(MemoryPort, "open", never_opens)
+        transport = bus.pump._transport
+        assert isinstance(transport, MemoryTransport)
+        transport.lose(OSError("unplugged"))
+        while not bus.condition.is_lost:  # noqa: ASYNC110  nobody tells it
+            await asyncio.sleep(0)
+        lost = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert firing(calm) == set()
+    assert firing(lost) == {"busmaster_line_up", "busmaster_node_up", "busmaster_value_good"}
+    named = set(re.findall(r"busmaster_(?!group)\w+|busmaster_group_missed_total", PAGE))
+    assert named <= {name for name, _ in calm}
 
 
 async def never_opens(*_: object, **__: object) -> None:
