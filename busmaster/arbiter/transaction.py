@@ -191,6 +191,8 @@ class Transaction:
         # A check is made as a probe is, but nobody waits for it: a learned window will do.
         if node.failures or node.health is UNKNOWN or node.health is DOWN or self.probe != self.check:
             hurry = NEVER
+        elif self.writes and node.profile.acks_are_commands:
+            hurry = NEVER  # a late ACK would make whichever drive is asked meanwhile say something more
         elif self.check or (self.retried < self.retries and not self.writes and self.retried < 2):
             hurry = AGAIN if self.retried else AT_FIRST
         return node.learning.timings(self.command, node.timings, hurry)

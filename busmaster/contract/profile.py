@@ -72,6 +72,8 @@ class Profile:
     devices are met with, the likeliest first, for whoever looks for one on an unknown line.
     `checked_requests`: a node notices a flipped bit in any request. Without that a damaged read is answered with
     another item, which is taken for that item if the line goes on meanwhile: reply windows cannot be learned.
+    `acks_are_commands`: a node that has just replied takes an ACK or a NAK for the host's wish for the next value or
+    the same one again, also where another node says it. So the line never goes on before the reply to a write is over.
     """
 
     name: str
@@ -92,6 +94,7 @@ class Profile:
     other_lines: Sequence[LineSettings] = ()
     exchange_limit: float | None = None
     checked_requests: bool = True
+    acks_are_commands: bool = False
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
     kind: str = field(default="", compare=False)
     """What this kind of device is called as a protocol, where that is not `name`: "microflex" speaks hcp2."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -15,13 +16,16 @@ from busmaster.arbiter.learned import (
     SLOWER,
     TRUSTED_AFTER,
     TRUSTED_AGAIN_AFTER,
+    LearnedTimes,
     Learning,
 )
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.learning import LEARNED, Learned
 from busmaster.errors import InvalidCommand, NoReply, WriteUnconfirmed
+from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import ACK, FIVE, LATENESS, TAU, Bench, reply_of, request_of, up
 
@@ -485,6 +489,30 @@ def test_r3_a_straggler_near_its_lateness_raises_it_though_the_line_had_gone_on(
     bench.until_ready()
     raised = [event for event in bench.events if isinstance(event, LatenessRaised)]
     assert [event.node for event in raised] == [node]
+
+
+@pytest.mark.parametrize("codec", [mentor, ct_ansi], ids=["mentor", "ct-ansi"])
+def test_the_line_waits_for_a_late_ack_where_it_would_be_a_command_to_another_node(codec: Any) -> None:
+    """A drive that has just replied says the next parameter when it hears an ACK, whoever says that."""
+    bench = Bench()
+    profile = codec.PROFILE
+    node = bench.arbiter.add_node(profile, 14, bench.now, LEARNED)
+    other = bench.arbiter.add_node(profile, 25, bench.now)
+    learning(node).begin_with([LearnedTimes("Write", False, 0.004, 0.004, 0.0, 0.020, True)])
+    for _ in range(TRUSTED_AGAIN_AFTER + 1):
+        written = bench.ask(node, codec.Write(1, 17, 5))
+        bench.until_sent()
+        bench.hear(ACK, after=REQUEST + TOOK)
+        bench.until_ready()
+        assert written.error is None
+    assert trusted(node)
+    bench.ask(node, codec.Write(1, 17, 6))
+    bench.ask(other, codec.Read(1, 18))
+    bench.until_sent()
+    out = bench.now
+    bench.sent()
+    bench.until_sent()
+    assert bench.now - out > profile.timings.write.lateness
 
 
 def test_windows_are_not_learned_where_a_damaged_request_is_answered_with_another_element() -> None:

@@ -137,5 +137,6 @@ PROFILE = Profile(
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
     checks=tuple(Read(1, number) for number in range(17, 22)),
+    acks_are_commands=True,
     shares_line_with=frozenset({"mentor"}),
 )

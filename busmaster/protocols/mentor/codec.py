@@ -348,6 +348,7 @@ PROFILE = Profile(
     probe=Read(1, 17),
     # a reply names its parameter, which tells these apart (R15)
     checks=tuple(Read(1, number) for number in range(17, 22)),
+    acks_are_commands=True,
     shares_line_with=frozenset({"ct-ansi"}),  # with addresses that are drives to both: 11 to 99 without the tens
 )
 CHAINED = replace(PROFILE, merge=merge_runs)
