@@ -151,7 +151,7 @@ def test_a_file_that_is_wrong_is_one_line_that_names_line_and_key_and_status_2(
         (
             "period = 0.02",
             "period = 0",
-            "12: groups.fast.period: poll group 'fast': a period is at least 0.001 s, not 0",
+            "12: groups.fast.period: poll group 'fast': a period is 0.001 to 86400 s 0.001 s, not 0",
         ),
         (
             "[groups.slow]",
