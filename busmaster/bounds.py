@@ -141,5 +141,33 @@ MOST_CONNECTIONS = 100
 """Connections at a time."""
 MOST_SUBSCRIPTIONS = 500
 """Subscriptions at a time, of all clients together."""
+MOST_SESSION_SUBSCRIPTIONS = 50
+"""Subscriptions of one session."""
+MOST_ITEMS = 20_000
+"""Monitored items at a time, of all clients together."""
+MOST_SESSION_ITEMS = 5_000
+"""Monitored items of one session."""
+MOST_OPERATIONS = 5_000
+"""Nodes or items of one request."""
+LONGEST_ITEM_QUEUE = 10
+"""Values of one monitored item that wait to be published: the oldest is dropped."""
+MOST_UNACKNOWLEDGED = 10
+"""Messages of a subscription that are kept until the client acknowledges them."""
+SHORTEST_PUBLISHING = 0.05
+"""Seconds from one message of a subscription to the next, at least."""
+LONGEST_PUBLISHING = 60.0
+"""Seconds from one message of a subscription to the next, at most."""
+LONGEST_OPCUA_CHUNK = 65_535
+"""Bytes of one chunk of a message: a connection that announces more is closed."""
+LONGEST_OPCUA_HELLO = 8_192
+"""Bytes of the first message of a connection."""
+LONGEST_OPCUA_REQUEST = 1 << 20
+"""Bytes of one message of a client with a session; of one without a session, `LONGEST_OPCUA_CHUNK`."""
+LONGEST_SESSION_PAUSE = 120.0
+"""Seconds without a request after which a session is closed, at most."""
+SESSION_WITHIN = 10.0
+"""Seconds after which a connection without a session is closed, and at most twice as many."""
+MOST_WAITING_WRITES = 100
+"""Write requests of one connection that have not been answered."""
 MOST_SHOWN_POINTS = 20_000
 """Points that are shown, with those that the line no longer has: clients may have subscribed to them."""

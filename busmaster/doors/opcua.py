@@ -8,6 +8,8 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,16 @@ from busmaster.doors.opcua_access import Rules, guard
 from busmaster.doors.opcua_connections import OpcuaServer
 from busmaster.doors.opcua_health import Health
 from busmaster.doors.opcua_space import Space, Variable
-from busmaster.doors.opcua_terms import CODES, DOUBTFUL, GOOD, range_of, status_of_sample, status_of_write, type_of
+from busmaster.doors.opcua_terms import (
+    CODES,
+    DOUBTFUL,
+    GOOD,
+    is_beyond,
+    range_of,
+    status_of_sample,
+    status_of_write,
+    type_of,
+)
 from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.files import read_file
 from busmaster.gate.record import cut
@@ -44,9 +55,13 @@ LISTEN_AFTER = 2.0
 AT_ONCE = 50
 """Values that are put before clients have their turn."""
 URI = "urn:busmaster:opcua"
+PRODUCT_URI = "urn:busmaster"
+BUILT = datetime.fromtimestamp(0, UTC)
+"""A version has no date of its build."""
 NOT_WRITABLE: int = CODES.BadNotWritable
 NO_SUCH_WRITE: int = CODES.BadWriteNotSupported
 ACCESS_DENIED: int = CODES.BadUserAccessDenied
+OUT_OF_RANGE: int = CODES.BadOutOfRange
 TYPE_MISMATCH: int = CODES.BadTypeMismatch
 Identity = tuple[str, int, str]
 """Protocol and address of a node, and item of a point."""
@@ -277,8 +292,9 @@ class LineServer:
         if shown is None or wanted.AttributeId != ua.AttributeIds.Value:
             return NOT_WRITABLE
         told, row = wanted.Value, shown.row
-        if wanted.IndexRange or (told.StatusCode is not None and told.StatusCode.value != GOOD):
-            return NO_SUCH_WRITE
+        is_stamped = told.SourceTimestamp is not None or told.ServerTimestamp is not None
+        if wanted.IndexRange or is_stamped or (told.StatusCode is not None and told.StatusCode.value != GOOD):
+            return NO_SUCH_WRITE  # the time of a value is that of its reply
         if not shown.writable or self._line.read_only:
             return NOT_WRITABLE
         who = f"user {user.name}" if user.name else "an anonymous user"
@@ -294,10 +310,20 @@ class LineServer:
         except (BusError, InvalidCommand) as error:
             self._tell(f"{who}: {row.key} = {said}: {cut(str(error))}")
             await self._doubt_touched()
+            if isinstance(error, InvalidCommand) and await self._is_beyond_limits(row, value):
+                return OUT_OF_RANGE
             return status_of_write(error)
         await self._doubt_touched()  # before the client is told, so that it never reads the old value as good
         self._tell(f"{who}: {row.key} = {said}: written")
         return status_of_write(None)
+
+    async def _is_beyond_limits(self, row: Row, value: Any) -> bool:
+        """Return whether a value that was refused is outside of what the line's owner lets be written."""
+        try:
+            details = await self._line.details(row.group, row.key)
+        except (BusError, InvalidCommand):
+            return False
+        return is_beyond(details, row.item, value)
 
 
 def _value(variant: ua.Variant | None) -> Any:
@@ -318,11 +344,16 @@ def _fits(variant: ua.Variant | None, value: Any, kind: ua.VariantType | None) -
     return True
 
 
+def _format_of(path: str) -> str:
+    return "pem" if b"-----BEGIN" in Path(path).read_bytes() else "der"
+
+
 async def load_certificate(server: Server, certificate: str, key: str) -> None:
     """Give a server its certificate and key. Raises OSError, and InvalidCommand for files that are something else."""
     try:
-        await server.load_certificate(certificate)
-        await server.load_private_key(key)
+        # by what is in the file: the library goes by the end of its name, and takes server.key for DER
+        await server.load_certificate(certificate, _format_of(certificate))
+        await server.load_private_key(key, format=_format_of(key))
     except (ValueError, TypeError) as error:
         raise InvalidCommand(f"{certificate} and {key} are no certificate and its key: {error}") from None
     with suppress(x509.ExtensionNotFound):  # clients hold the name that it says against the server's
@@ -348,6 +379,9 @@ async def serving(
     server = OpcuaServer()
     await server.init()
     server.set_server_name("busmaster")
+    server.product_uri, server.manufacturer_name = PRODUCT_URI, "busmaster"
+    server.application_type = ua.ApplicationType.Server
+    await server.set_build_info(PRODUCT_URI, "busmaster", "busmaster", version("busmaster"), "0", BUILT)
     await server.set_application_uri(URI)
     if certificate is not None:
         await load_certificate(server, *certificate)

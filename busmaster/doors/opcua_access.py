@@ -113,7 +113,7 @@ def guard(server: Server, rules: Rules, write: Write) -> None:
     """Have a server let in and through what the rules say, with encryption where it has a certificate."""
     iserver = server.iserver
     iserver.user_manager = Users(rules)
-    use_sessions(iserver)
+    use_sessions(iserver, rules.refusal)
     iserver.attribute_service = Writes(iserver.aspace, write)
     iserver.max_connections = MOST_CONNECTIONS
     iserver.max_subscriptions = MOST_SUBSCRIPTIONS

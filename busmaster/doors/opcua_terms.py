@@ -16,6 +16,8 @@ from busmaster.gate.record import Outcome
 CODES = ua.StatusCodes
 GOOD: int = CODES.Good
 DOUBTFUL: int = CODES.UncertainLastUsableValue
+NUMBERS = (ua.VariantType.Int64, ua.VariantType.Double)
+"""The types of points that are numbers."""
 NO_COMMUNICATION: int = CODES.BadNoCommunication
 OF_READS: tuple[tuple[type[Exception], int], ...] = (
     (NoReply, CODES.BadNoCommunication),
@@ -137,6 +139,18 @@ def range_of(details: Any, item: str) -> ua.Range | None:
             found.Low, found.High = float(low), float(high)
             return found
     return None
+
+
+def is_beyond(details: Any, item: str, value: Any) -> bool:
+    """Return whether a value is outside of what may be written to a point. `details` is as in `range_of`."""
+    values = value if isinstance(value, tuple) else (value,)
+    bounds = [(limit["minimum"], limit["maximum"]) for limit in details["limits"] if limit["name"] == item]
+    return any(
+        (low is not None and number < low) or (high is not None and number > high)
+        for low, high in bounds
+        for number in values
+        if isinstance(number, int | float)
+    )
 
 
 def time_of(moment: float) -> datetime:

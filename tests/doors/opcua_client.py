@@ -46,6 +46,10 @@ class OtherClient:
     def property(self, name: str, property_: str) -> Any:
         return self.node(name).get_child(f"0:{property_}").get_value()
 
+    def user_access(self, name: str) -> int:
+        """Return what this user may do with a point: a mask of bits."""
+        return int(self.node(name).get_attribute(ua.AttributeIds.UserAccessLevel).Value.Value)
+
     def write(self, name: str, value: Any, kind: Any = ua.VariantType.Double) -> str:
         """Write a value, and return the name of the status."""
         wanted = ua.WriteValue()

@@ -22,6 +22,7 @@ from busmaster.doors import opcua as door
 from busmaster.doors.following import Following
 from busmaster.doors.opcua import serving
 from busmaster.doors.opcua_access import Rules
+from busmaster.doors.opcua_connections import OpcuaServer
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_tcp
@@ -62,6 +63,8 @@ class Opened:
     client: OtherClient
     folder: Path
     said: list[str]
+    line: Following
+    server: OpcuaServer
 
     @contextlib.asynccontextmanager
     async def owned(self, port: Any = None) -> AsyncIterator[Owned]:
@@ -104,12 +107,19 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
         patch.setattr(following, "FIRST_PAUSE", 0.001)
         patch.setattr(following, "LONGEST_PAUSE", 0.001)
         patch.setattr(door, "LEAST_AGE", PATIENCE)  # a machine that stands still makes no value old
+        servers: list[OpcuaServer] = []
+
+        def made() -> OpcuaServer:
+            servers.append(OpcuaServer())
+            return servers[-1]
+
+        patch.setattr(door, "OpcuaServer", made)
         folder, said = tmp_path_factory.mktemp("opcua"), list[str]()
         line = Following(lambda: f"unix:{folder}/line.sock")
         async with serving(line, Rules(allow=("5/1*",)), ("127.0.0.1", 0), said.append) as url:
             entered = other_client(url)
             client = await asyncio.to_thread(entered.__enter__)
-            yield Opened(url, client, folder, said)
+            yield Opened(url, client, folder, said, line, servers[0])
             await asyncio.to_thread(entered.__exit__, None, None, None)
 
 
@@ -175,7 +185,7 @@ async def test_a_write_passes_the_owners_gate_and_is_good_only_when_it_is_confir
         await opened.is_("5/20", "Good")
         assert await opened.write("5/10", 12.5) == "Good"
         await opened.shows("5/10", lambda told: told.value == 12.5)
-        assert await opened.write("5/10", 251.0) == "BadRequestNotAllowed"
+        assert await opened.write("5/10", 251.0) == "BadOutOfRange"
         assert "above its maximum of 250" in opened.said[-1]
         assert await opened.write("5/10", 3, ua.VariantType.Int64) == "BadTypeMismatch"
         assert await opened.write("5/20", 1.0) == "BadNotWritable"  # it is not on the list
