@@ -166,6 +166,12 @@ def test_without_a_recorded_value_the_replys_own_numbers_are_compared() -> None:
     assert str(only(packets).recorded) == "ok: 4096"
 
 
+def test_a_reply_of_zero_is_a_number_as_any_other() -> None:
+    one = only(overheard(*exchange(hcp2.Read(105), 255, HCP2, "02 36 39 30 03 3C")))
+    assert one.now.values == one.recorded.values == [0.0]
+    assert not one.changed
+
+
 WRITE = Attempt("hcp2", 1, hcp2.Write(1, (5.0,)), HCP2.timings)
 
 

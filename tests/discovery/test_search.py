@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import count
 
 import pytest
@@ -184,7 +185,7 @@ def test_an_adapter_that_echoes_is_noticed() -> None:
     discovery = looked(line, steps(usual_kinds(), None, None), told)
     assert discovery.echo
     assert told[0] == "the adapter hears what it sends"
-    assert [node.address for node in discovery.found] == [3]
+    assert [(node.address, node.label) for node in discovery.found] == [(3, "node 3")]
 
 
 def test_a_node_that_answers_after_the_window_is_found_under_its_own_address() -> None:
@@ -193,6 +194,25 @@ def test_a_node_that_answers_after_the_window_is_found_under_its_own_address() -
     discovery = looked(line, steps(usual_kinds(), None, None))
     assert [node.address for node in discovery.found] == [2, 5]
     assert discovery.found[0].starts[0] == pytest.approx(0.13, abs=0.01)
+
+
+def test_the_time_to_a_reply_counts_from_the_requests_end_whatever_the_rate() -> None:
+    """At 9600 baud a request takes 7 ms longer than at 57600 baud, the usual rate of these nodes."""
+    settings = LineSettings(9600)
+    line = line_of(settings, make_device("hcp2", 3, delay=Delay(0.02)))
+    discovery = looked(line, steps([find("hcp2")], (3,), settings))
+    [node] = discovery.found
+    assert node.starts[0] == pytest.approx(0.02, abs=0.002)
+
+
+def test_a_protocol_is_tried_though_another_ones_probe_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = find("hcp2").protocol
+    other = replace(known, kinds=tuple(map(replace, known.kinds)))
+    monkeypatch.setattr("busmaster.discovery.steps.protocols", lambda: (known, other))
+    assert {kind.protocol is other for kind in usual_kinds() if kind.profile.probe == known.profile.probe} == {
+        False,
+        True,
+    }
 
 
 class Fading(Device):

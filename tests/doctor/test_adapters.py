@@ -126,12 +126,16 @@ def test_only_a_group_that_opens_the_port_and_is_not_roots_is_to_be_joined(
     assert ('MODE="0660"' in advice) is not joins
 
 
-def test_a_group_without_a_name_goes_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_group_without_a_name_goes_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
     def nameless(gid: int) -> None:
         raise KeyError(gid)
 
-    monkeypatch.setattr(grp, "getgrgid", nameless)
-    assert owning_group(str(tmp_path)) == str(tmp_path.stat().st_gid)
+    status = os.stat_result((stat.S_IFCHR | 0o660, 0, 0, 1, 4711, 4712, 0, 0, 0, 0))  # owner 4711, group 4712
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", lambda *_: status)
+        patch.setattr(grp, "getgrgid", nameless)
+        group = owning_group("/dev/ttyS0")
+    assert group == "4712"
 
 
 def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path, pty_master: PtyMaster) -> None:
@@ -156,7 +160,8 @@ def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(pty_master: PtyM
 def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, pty_master: PtyMaster) -> None:
     inode = os.stat(pty_master.path)
     place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
-    for pid, owner in ((4711, Holder(4711, "another program")), (-1, None)):
+    in_another_container = (0, -1)
+    for pid, owner in ((4711, Holder(4711, "another program")), *((number, None) for number in in_another_container)):
         (tmp_path / "locks").write_text(
             f"1: POSIX ADVISORY WRITE 1 00:01:2 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
         )

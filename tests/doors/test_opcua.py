@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from busmaster.emulator.serve import serve_tcp
 from busmaster.gate.gate import Gate
 from busmaster.gate.record import WriteRecord
 from busmaster.registry import make_device
+from busmaster.service.remote_group import RemoteGroup
 from busmaster.transport.endpoints import endpoint
 from tests.cli.conftest import serve
 from tests.doors.opcua_client import OtherClient, Told, other_client
@@ -166,6 +167,20 @@ async def test_a_point_has_its_unit_range_status_and_time(opened: Opened) -> Non
         assert (await opened.shows("Nodes/hcp2 5 Health", lambda told: told.value == "up")).status == "Good"
         assert (await opened.is_("Groups/axes Period", "Good")).value == 0.02
         assert (await opened.is_("Line Connected", "Good")).value is True
+
+
+async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really = RemoteGroup.hear
+
+    def hear(group: RemoteGroup, method: str, params: Mapping[str, Any]) -> None:
+        really(group, method, {**params, "dropped": 3})  # as the owner counts them
+
+    monkeypatch.setattr(RemoteGroup, "hear", hear)
+    async with opened.owned() as line:
+        line.poll("10", name="counted")
+        await opened.shows("Groups/counted Dropped", lambda told: told.value == 3)
 
 
 async def test_a_unit_that_its_owner_has_changed_is_told(opened: Opened) -> None:

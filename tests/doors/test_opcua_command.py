@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import NameOID
 from opcua import ua
 
+from busmaster.doors.opcua import read_trusted
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import Command, busmaster, owner, serve, started
 from tests.doors.opcua_client import other_client
@@ -140,6 +141,13 @@ def test_with_a_certificate_only_trusted_clients_come_and_users_with_a_token_wri
                 pass
         with pytest.raises(ua.UaError), other_client(url):  # nobody is let in who says things openly
             pass
+
+
+def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:
+    folder = tmp_path / "trusted"
+    for name in ("first", "second"):
+        certificate(folder, name)
+    assert len(read_trusted(str(folder))) == 2
 
 
 @pytest.mark.parametrize(

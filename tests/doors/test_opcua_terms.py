@@ -133,11 +133,15 @@ def test_who_may_write_is_who_shows_a_token_where_there_are_tokens_or_others_may
     assert "anonymous" in Rules(secrets=secrets).refusal(anonymous)
     assert Rules().refusal(anonymous) == ""
     assert "without a token" in Rules(is_local=False).refusal(anonymous)
+    assert Rules(secrets=secrets, is_local=False).refusal(known) == ""
 
 
 def test_who_says_things_openly_or_is_not_trusted_is_not_let_in() -> None:
     assert Users(Rules(is_signed=True)).get_user(None) is None
     assert Users(Rules(is_signed=True)).get_user(None, certificate=b"own") is not None
+    with_tokens = Users(Rules(is_signed=True, secrets={"scada": digest_of(TOKEN)}))
+    assert with_tokens.get_user(None, "scada", TOKEN) is None
+    assert with_tokens.get_user(None, "scada", TOKEN, b"own") is not None
     trusting = Users(Rules(is_signed=True, trusted=[b"own"]))
     assert trusting.get_user(None, certificate=b"another") is None
     assert trusting.get_user(None, certificate=b"own") is not None

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from busmaster import Hcp2Controller, MicroFlexDrive
 from busmaster.bounds import LONGEST_COMMAND
 from busmaster.bus.limits import Limit
-from busmaster.doors import following
+from busmaster.doors import audience, following
 from busmaster.doors.audience import MOST_EXCHANGES, Seat
 from busmaster.doors.web import PAGE, serving
 from busmaster.errors import InvalidCommand
@@ -304,6 +304,39 @@ async def test_a_page_that_comes_late_is_told_all_and_then_what_changes(tmp_path
             await put(of, 7)
             while (await hear(stream, "values"))["values"]["values"][0][0] != 7:
                 pass
+
+
+@pytest.mark.asyncio
+async def test_a_page_is_told_the_latest_of_the_past_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audience, "PAST_VALUES", 2)
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        await until(lambda: len(of.line.picture.rows[0].past) > 3)
+        known = [time for time, _ in of.line.picture.rows[0].past]
+        async with stream_of(of) as stream:
+            past = (await hear(stream, "past"))["past"]["past"][0]
+        assert len(past) == 2
+        assert past[0][0] >= known[-2]
+
+
+@pytest.mark.asyncio
+async def test_past_values_are_those_of_the_owner_that_came_last(tmp_path: Path) -> None:
+    """The numbers of the sets of points begin again with each owner; a page shows a past of the set it has alone."""
+    async with page(tmp_path) as of:
+        for sets in (3, 1):
+            async with served(tmp_path) as line:
+                poll(line)
+                for number in range(1, sets):
+                    controller = Hcp2Controller(line.bus, 5)
+                    await shows(of.line)
+                    line.bus.poll_group(f"more {number}", period=0.02, points=[controller.point(str(20 + number))])
+                    await until(lambda: len(of.line.picture.rows) == 1 + len(line.bus.groups))
+                await shows(of.line)
+                async with stream_of(of) as stream:
+                    told = await hear(stream, "rows", "past")
+                assert told["past"]["set"] == told["rows"]["set"]
+            await until(lambda: not of.line.is_connected)
 
 
 @pytest.mark.asyncio

@@ -49,6 +49,16 @@ def test_a_node_that_is_not_there_fails_after_its_attempts() -> None:
     assert world.now < SETTLED + (3 + 1) * 0.16  # a check behind the first (R15)
 
 
+def test_a_reply_that_lies_in_an_adapter_is_waited_for_as_long_as_the_line_holds_bytes_back() -> None:
+    """It begins within its window of 100 ms on the wire, and reaches the host behind it."""
+    mint = EmulatedMint(2, delay=Delay(0.08))
+    mint.comms[1] = 123.456
+    world = world_of(mint, latency=0.05)
+    read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
+    world.run(2.0)
+    assert (read.value, read.attempts) == (123.456, 1)
+
+
 def test_run_until_gives_up_at_its_limit() -> None:
     world = world_of()
     assert not world.run_until(lambda: False, 2.0)
@@ -130,6 +140,19 @@ def test_the_same_seed_gives_the_same_transcript_and_another_another() -> None:
     assert len(first) > 200
     assert transcript(1) == first
     assert transcript(2) != first
+
+
+def test_a_write_whose_value_is_far_from_its_turn_is_counted_as_foreign() -> None:
+    memory = TraceableMemory(2)
+    for count in range(100):
+        memory.write(5, traceable_value(2, 5, count))
+    memory.write(5, traceable_value(2, 5, 100 - 64))
+    memory.write(5, traceable_value(2, 5, 101 + 64))
+    assert memory.foreign_writes == 0
+    memory.write(5, traceable_value(2, 5, 102 - 65))
+    assert memory.foreign_writes == 1
+    memory.write(5, traceable_value(2, 5, 103 + 65))
+    assert memory.foreign_writes == 2
 
 
 def element_of(read: Transaction) -> int:

@@ -131,6 +131,40 @@ async def test_a_limit_is_named_and_nothing_is_sent(broker: Broker) -> None:
         assert await there.controller.read(1) == 0
 
 
+def test_a_command_that_is_refused_is_answered_though_the_lines_loop_has_ended(broker: Broker) -> None:
+    import aiomqtt
+
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)))
+    settings = MqttSettings(port=broker.port, prefix="line")
+    commands = {"5/1": Hcp2Controller(bus, 5).point("1")}
+    output = MqttOutput("mqtt", settings, bus, commands=commands, gate=Gate(bus))
+
+    async def start() -> None:
+        output.start()
+
+    async def ask() -> dict[str, Any]:
+        async with (
+            asyncio.timeout(PATIENCE),
+            aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client,
+        ):
+            await client.subscribe("line/status", qos=1)
+            await client.subscribe("line/result/#", qos=1)
+            async for message in client.messages:
+                if message.payload == b"online":
+                    await client.publish("line/set/5/1", "not a number", qos=1)
+                elif str(message.topic) == "line/result/5/1":
+                    return dict(json.loads(bytes(message.payload)))
+        raise AssertionError("the connection ended")
+
+    asyncio.run(start())
+    try:
+        answer = asyncio.run(ask())
+    finally:
+        output.close(PATIENCE)
+    assert not answer["ok"]
+    assert "number" in answer["error"]
+
+
 @pytest.mark.asyncio
 async def test_an_old_command_is_not_executed_late(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt_commands, "LOOK", 3600.0)

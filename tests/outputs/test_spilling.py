@@ -284,3 +284,28 @@ def test_a_full_disk_costs_nothing_where_what_waits_is_on_another(tmp_path: Path
     assert output.dropped == output.lost == 0
     assert "full" in said[0] or "No space left" in said[0]
     assert said[-1] == f"{kind} is up again"
+
+
+def test_a_disk_that_is_full_again_after_it_took_values_is_told_again(tmp_path: Path) -> None:
+    said: list[str] = []
+    with small_disk(tmp_path, 1000) as disk:
+        (tmp_path / "x").mkdir()  # which keeps the output down
+        output = csv(tmp_path, said.append)
+        output.start()
+
+        def times_full() -> int:
+            return sum("disk is full" in text for text in said)
+
+        number = 1
+        output.offer(cycle(number, number))
+        until(lambda: output.spilled == 1)
+        for times in (1, 2):
+            disk.fill()
+            while times_full() < times:  # until the space that the spool had is used up
+                number += 1
+                output.offer(cycle(number, number))
+                until(lambda: output.spilled == output.statistics().waiting or times_full() == times)  # noqa: B023
+            disk.clear()
+            until(lambda: output.spilled == output.statistics().waiting)
+        output.close(PATIENCE)
+    assert output.statistics().spilled > 0

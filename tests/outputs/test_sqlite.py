@@ -333,6 +333,23 @@ def test_a_database_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
     assert query(path, "pragma integrity_check") == [("ok",)]
 
 
+def test_the_log_of_a_damaged_database_that_a_reader_has_open_goes_with_it(tmp_path: Path) -> None:
+    """SQLite deletes the log when the last connection closes: with a reader it stays, and belongs to the old file."""
+    path = tmp_path / "x.db"
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+    with closing(sqlite3.connect(path)) as reader:
+        assert reader.execute("select value from samples").fetchall() == [(1.0,)]
+        assert (tmp_path / "x.db-wal").exists()
+        with path.open("r+b") as file:
+            file.write(bytes(4096))
+        with recording(path) as output:
+            output.offer(cycle(2, 2.0))
+            until(lambda: settled(output))
+            assert (tmp_path / "x.db.damaged-wal").exists()
+            assert query(path, "select value from samples") == [(2.0,)]
+
+
 def test_a_damaged_database_is_moved_aside_and_a_new_one_begun(tmp_path: Path) -> None:
     """First where its header is not one, at the start; then in its midst, while it is written."""
     path = tmp_path / "x.db"

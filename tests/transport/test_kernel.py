@@ -19,6 +19,7 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.transport import kernel
 from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_port
 from busmaster.transport.tcp import TcpPort
+from tests.outputs.cycles import until as outside_until
 from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged, standing_still
 from tests.transport.test_marks import set_input_flags
@@ -77,6 +78,19 @@ async def test_what_a_stopped_tty_does_not_take_has_not_left(pty_master: PtyMast
     await recorder.until(lambda r: r.flow == ["pause", "resume"])
     assert port.unsent(0.0) == 0
     assert pty_master.read() == b"05\x05"
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_bytes_that_have_come_and_were_not_handed_over_are_seen(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
+    port = open_port(transport)
+    assert not port.unread()
+    pty_master.write(b"late")
+    outside_until(port.unread)  # the loop does not turn meanwhile
+    assert recorder.received == b""
+    await recorder.until(lambda r: r.received == b"late")
+    assert not port.unread()
     await closed(transport, recorder)
 
 

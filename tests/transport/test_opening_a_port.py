@@ -73,6 +73,30 @@ async def test_an_opening_that_does_not_come_back_is_given_up_and_its_port_relea
     await _is_released_in_the_end(pty_master.path, slow_driver)
 
 
+def test_a_program_ends_while_a_driver_still_keeps_an_opening_blocked(pty_master: PtyMaster) -> None:
+    program = """
+import asyncio, sys, threading
+import serial
+from busmaster.errors import LineDown
+from busmaster.transport import serial_port
+
+serial_port.OPEN_DEADLINE = 0.02
+serial.Serial.open = lambda device: threading.Event().wait()
+
+async def main():
+    try:
+        await serial_port.SerialPort(sys.argv[1], baudrate=57600).open(asyncio.Protocol)
+    except LineDown as error:
+        print(error.what)
+
+asyncio.run(main())
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", program, pty_master.path], capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
+    assert "did not open within" in ended.stdout
+
+
 @pytest.mark.asyncio
 async def test_a_cancelled_opening_releases_its_port(pty_master: PtyMaster, slow_driver: threading.Event) -> None:
     opening = asyncio.ensure_future(opened(pty_master.path))

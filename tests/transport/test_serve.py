@@ -1,5 +1,7 @@
 """A line served in real time. These tests use the wall clock, and ask of it only what a busy machine can keep."""
 
+import errno
+import fcntl
 import os
 import select
 import socket
@@ -8,10 +10,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from busmaster.contract.profile import LineSettings
+from busmaster.emulator import port_settings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
@@ -52,6 +56,21 @@ def test_a_pty_answers_as_the_device_does_and_is_raw() -> None:
         assert ask(port, WRITE, 1) == b"\x06"
         assert ask(port, READ, len(REPLY)) == REPLY
         assert not termios.tcgetattr(port)[3] & (termios.ECHO | termios.ICANON | termios.ISIG)
+        os.close(port)
+
+
+def test_a_pty_answers_where_the_kernel_does_not_tell_how_it_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    really = fcntl.ioctl
+
+    def ioctl(port: int, request: int, *rest: Any) -> Any:
+        if request in (port_settings.GET, port_settings.SET):
+            raise OSError(errno.ENOTTY, "not supported")
+        return really(port, request, *rest)
+
+    monkeypatch.setattr(fcntl, "ioctl", ioctl)
+    with serve_pty(mint_line()) as server:
+        port = opened(server.path)
+        assert ask(port, WRITE, 1) == b"\x06"
         os.close(port)
 
 
