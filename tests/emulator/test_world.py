@@ -50,10 +50,10 @@ def test_a_node_that_is_not_there_fails_after_its_attempts() -> None:
 
 
 def test_a_reply_that_lies_in_an_adapter_is_waited_for_as_long_as_the_line_holds_bytes_back() -> None:
-    """It begins within its window of 100 ms on the wire, and reaches the host behind it."""
+    """It begins within its window of 100 ms on the wire, and reaches the host behind its lateness of 150 ms."""
     mint = EmulatedMint(2, delay=Delay(0.08))
     mint.comms[1] = 123.456
-    world = world_of(mint, latency=0.05)
+    world = world_of(mint, latency=0.2)
     read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
     world.run(2.0)
     assert (read.value, read.attempts) == (123.456, 1)
