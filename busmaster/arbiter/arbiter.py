@@ -12,7 +12,7 @@ from __future__ import annotations
 from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
-from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.health import DOWN, NodeRecord
 from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.state import EXCHANGE, READY
@@ -99,6 +99,11 @@ class Arbiter(LineMachine):
         self.dispatcher.writes.forget_empty()
         self.dispatcher.probes.plan()
 
+    def ask_within_budget(self, node: NodeRecord, now: float) -> None:
+        """Treat a new node as down until its first reply: it is asked within the budget of probes only (R11)."""
+        node.health, node.budgeted, node.probe_at = DOWN, True, now
+        self.dispatcher.probes.plan()
+
     def name_node(self, node: NodeRecord, label: str) -> None:
         """Have messages call the node by this label."""
         node.label = label
@@ -120,10 +125,15 @@ class Arbiter(LineMachine):
         # A loop that stood still may look at its timers before it reads: what lies unread came in time.
         return self.state is EXCHANGE and now >= self._deadlines.expiry
 
-    def add_client(self, share: float = 1.0) -> LineClient:
+    def add_client(self, share: float = 1.0, owner_time: float = 0.0) -> LineClient:
         """Return a client with whom the line's owner and other clients take turns from now on (R9)."""
-        self.dispatcher.share()
-        return LineClient(share)
+        client = LineClient(share)
+        self.dispatcher.share().admit(client, owner_time)
+        return client
+
+    def change_client(self, client: LineClient, owner_time: float) -> None:
+        """Give a client another `owner_time`, as its role has changed."""
+        self.dispatcher.share().admit(client, owner_time)
 
     def remove_client(self, client: LineClient) -> None:
         """Forget a client, who has nothing waiting; what it may still have on the wire runs out."""

@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
+from math import inf
+
 from busmaster.arbiter.health import NodeRecord
 
 LEAST_SHARE, MOST_SHARE = 0.1, 10.0
 
 
+class Account:
+    """What a client has used of its part of the line.
+
+    `used_until`: until when it has used that part; until then the owner goes first.
+    """
+
+    __slots__ = ("used_until",)
+
+    def __init__(self) -> None:
+        self.used_until = -inf
+
+
 class LineClient:
-    """One program, as the line knows it. `share` weighs its line time against that of the others, who have 1 each."""
+    """One program, as the line knows it. `share` weighs its line time against that of the others, who have 1 each.
 
-    __slots__ = ("over", "share")
+    `owner_time`: seconds of the line that the owner may use, while it waits, for each second of all clients with the
+    same number together. 0: the client takes turns with the owner.
+    """
 
-    def __init__(self, share: float = 1.0) -> None:
+    __slots__ = ("account", "over", "owner_time", "share")
+
+    def __init__(self, share: float = 1.0, owner_time: float = 0.0) -> None:
         self.share = share
+        self.owner_time = owner_time
+        self.account = Account()
         self.over = False
         """Whether nothing of it is sent any more."""
 

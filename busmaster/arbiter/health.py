@@ -70,6 +70,7 @@ class NodeRecord:
         "_refused",
         "address",
         "answered",
+        "budgeted",
         "counters",
         "failed_at",
         "failures",
@@ -109,6 +110,8 @@ class NodeRecord:
         self.learning: Learning | None = None
         """What is learned of its reply times, where that is wished for."""
         self.health = UNKNOWN
+        self.budgeted = False
+        """Whether it counts as down only because a client named it, and it has never replied."""
         self.failures = 0
         """Transactions in a row that failed without a valid reply."""
         self.failed_at = -inf

@@ -34,7 +34,11 @@ class NodeWatch:
         before = node.health
         flaps = health.flaps(node, now)
         health.note_success(node, now)
-        if before is DOWN and not flaps:  # the others may be back too; a flapping node tells nothing about them
+        new, node.budgeted = node.budgeted, False
+        # That a new node replies says nothing of the others: else a client that names one again and again would have
+        # the budget filled faster for ever.
+        if before is DOWN and not (flaps or new):
+            # the others may be back too; a flapping node tells nothing about them
             self._probes.budget.node_returned(now)
             for other in self._nodes:
                 if other.health is DOWN:

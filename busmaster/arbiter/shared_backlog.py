@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from math import inf
+from operator import attrgetter
 
 from busmaster.arbiter.backlog import SHARE, Backlog, new_queues
-from busmaster.arbiter.clients import OWN, Hold, LineClient, turn_of
+from busmaster.arbiter.clients import OWN, Account, Hold, LineClient, turn_of
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
 from busmaster.arbiter.transaction import COMMAND, FAILING, QUEUED, URGENT, Priority, Transaction
@@ -18,15 +19,42 @@ URGENT_RUN = 16
 such limit."""
 
 
+MOST_USED = 1.0
+"""Seconds for which a client lets the owner go first at most, unless its last exchange alone costs more."""
+MOST_LEFT = 64
+"""Accounts of clients that have gone which are kept."""
+
+_used_until: Callable[[Account], float] = attrgetter("used_until")
+
+
 class SharedBacklog(Backlog):
     """A backlog in each of whose classes clients take turns. `hold` is for whom the line is held."""
 
-    __slots__ = ("_attempts", "_deadlines", "_last", "_payer", "_since", "_turns", "_writes", "hold")
+    __slots__ = (
+        "_attempts",
+        "_deadlines",
+        "_last",
+        "_left_accounts",
+        "_members",
+        "_payer",
+        "_since",
+        "_turns",
+        "_writes",
+        "_yielded",
+        "hold",
+    )
 
     def __init__(self, before: Backlog, writes: Writes, deadlines: Deadlines) -> None:
         """Take over what waits in the backlog that a line had as long as it was its owner's alone."""
         super().__init__()
         self.hold: Hold | None = None
+        self._members: dict[float, int] = {}
+        """How many clients there are of each `owner_time` but 0."""
+        self._left_accounts: dict[float, list[Account]] = {}
+        """The accounts of clients that have gone, by `owner_time`; a new client takes one of those over. Else a program
+        that connects anew for each request would always be entitled. The last exchange is charged when it is over."""
+        self._yielded = False
+        """Whether an urgent request let another go first: the next one passes."""
         self._writes = writes
         self._deadlines = deadlines
         self._streak, self._rotated = before._streak, before._rotated
@@ -41,7 +69,7 @@ class SharedBacklog(Backlog):
     def _begin(self, before: Backlog) -> None:
         urgent, command, poll, background = before.queues
         self._turns = (
-            Turns(urgent, Fifo),
+            Turns(urgent, Fifo, owner_first=True),
             Turns(command, Fifo),
             Turns(poll, EarliestDeadlineFirst),
             Turns(background, EarliestDeadlineFirst),
@@ -60,11 +88,32 @@ class SharedBacklog(Backlog):
         urgent = self._turns[URGENT]
         self._urgent_yields = urgent.live > 0 and len(self) > urgent.live and urgent.shortest_run() >= URGENT_RUN
         transaction = super().pop(now) if self.hold is None else self._pop_within(self.hold, now)
+        if self._members and transaction is not None and self.hold is None:
+            transaction = self._entitled(transaction, now)
         while transaction is not None and (write := self._write_before(transaction)) is not None:
             self.restore(transaction)
             self.promote(write, transaction.priority)
             transaction = super().pop(now)
         return self._taken(transaction, now)
+
+    def _entitled(self, transaction: Transaction, now: float) -> Transaction:
+        """Return the same, or what goes first because the client of this one has used up its part of the line.
+
+        An urgent request lets one other go first and passes then: a stop of a client that asked too much waits for one
+        exchange more, and urgent requests without end leave the owner every second exchange.
+        """
+        if turn_of(transaction.client).account.used_until <= now:
+            return transaction
+        if transaction.priority is URGENT and self._yielded:
+            self._yielded = False
+            return transaction
+        for turns in self._turns:
+            other = turns.pop_entitled(now)
+            if other is not None:
+                self._turns[transaction.priority].put_back(transaction)
+                self._yielded = True
+                return other
+        return transaction
 
     def _pop_within(self, hold: Hold, now: float) -> Transaction | None:
         urgent, *lower = self._turns
@@ -139,8 +188,19 @@ class SharedBacklog(Backlog):
         if self._payer is not None:
             turns, client = self._payer
             turns.charge(client, now - self._since)
+            if client.owner_time:
+                self._use(client, now)
         self._begin_hold()
         self._since = now
+
+    def _use(self, client: LineClient, now: float) -> None:
+        """Note until when a client has used its part of the line: all of its `owner_time` have equal parts."""
+        parts = (1 + client.owner_time) * self._members.get(client.owner_time, 1)
+        used = (now - self._since) * parts
+        # Bounded, since what it used while the line was idle took nothing from the others; but more than one exchange
+        # costs, or a client would be entitled again as soon as all others had their turns.
+        account = client.account
+        account.used_until = min(max(account.used_until, self._since) + used, now + max(2 * used, MOST_USED))
 
     def _begin_hold(self) -> None:
         last = self._last
@@ -190,8 +250,33 @@ class SharedBacklog(Backlog):
             yield from (transaction for transaction in turns if transaction.client is hold)
         yield from self._writes.parked_of(hold.node, hold)
 
+    def admit(self, client: LineClient, owner_time: float) -> None:
+        """Count a client among those of this `owner_time` from now on."""
+        self._dismiss(client)
+        client.owner_time, client.account = owner_time, Account()
+        if owner_time:
+            self._members[owner_time] = self._members.get(owner_time, 0) + 1
+            left = self._left_accounts.get(owner_time)
+            if left:
+                client.account = max(left, key=_used_until)
+                left.remove(client.account)
+
+    def _dismiss(self, client: LineClient) -> None:
+        owner_time = client.owner_time
+        if not owner_time:
+            return
+        self._members[owner_time] -= 1
+        if not self._members[owner_time]:
+            del self._members[owner_time]
+
     def forget(self, client: LineClient) -> None:
         """Keep nothing of a client that has gone, and has nothing waiting."""
+        self._dismiss(client)
+        if client.owner_time:
+            left = self._left_accounts.setdefault(client.owner_time, [])
+            left.append(client.account)
+            if len(left) > MOST_LEFT:
+                left.remove(min(left, key=_used_until))
         for turns in self._turns:
             turns.forget(client)
 

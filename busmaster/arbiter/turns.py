@@ -40,11 +40,16 @@ _Order: TypeAlias = "OrderedDict[LineClient, _Turn]"
 
 
 class Turns:
-    """A class whose clients take turns; `new_queue` makes the queue of each, and `own` is that of the line's owner."""
+    """A class whose clients take turns; `new_queue` makes the queue of each, and `own` is that of the line's owner.
 
-    __slots__ = ("_had", "_new_queue", "_next", "_turns", "live")
+    `owner_first`: the owner takes no turns but goes first, so that no number of programs delays its safe state.
+    """
 
-    def __init__(self, own: Queue, new_queue: Callable[[], Queue]) -> None:
+    __slots__ = ("_had", "_new_queue", "_next", "_own", "_owner_first", "_turns", "live")
+
+    def __init__(self, own: Queue, new_queue: Callable[[], Queue], *, owner_first: bool = False) -> None:
+        self._owner_first = owner_first
+        self._own = own
         self._new_queue = new_queue
         self._turns: _Order = OrderedDict()
         """In the order in which they had their last turns."""
@@ -85,6 +90,22 @@ class Turns:
             return None
         self.live -= 1
         return turn.queue.pop()
+
+    def pop_entitled(self, now: float) -> Transaction | None:
+        """Take out the first of a client that has not used up its part of the line, or return None."""
+        entitled = [turn for turn in self._waiting() if turn.client.account.used_until <= now]
+        if not entitled:
+            return None
+        turn = min(entitled, key=_had)
+        self.live -= 1
+        turn.passed = 0
+        self._turns.move_to_end(turn.client)
+        return turn.queue.pop()
+
+    def put_back(self, transaction: Transaction) -> None:
+        """Put back what was popped last, at the front of its client's queue; another client may go first."""
+        self._of(turn_of(transaction.client)).queue.push_front(transaction)
+        self.live += 1
 
     def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
         """Take out the first of the first few that suits, or return None; of the client whose turn it is, if it can."""
@@ -176,6 +197,8 @@ class Turns:
         return turn
 
     def _chosen(self) -> _Turn:
+        if self._owner_first and self._own.live:
+            return self._turns[OWN]
         given_back, self._next = self._next, None
         if given_back is not None and given_back.queue.live:
             return given_back

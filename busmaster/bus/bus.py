@@ -13,6 +13,7 @@ import anyio
 import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health, NodeRecord
@@ -209,15 +210,28 @@ class Bus:
         return node
 
     def lend_node(
-        self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
+        self,
+        profile: Profile,
+        address: int,
+        *,
+        timings: Timings | Learned | None = None,
+        retries: int | None = None,
+        budgeted: bool = False,
     ) -> Node:
         """Return the node as `node` does, for somebody who will give it back.
 
-        One that was only ever lent leaves the bus when all who borrowed it have given it back.
+        One that was only ever lent leaves the bus when all who borrowed it have given it back. `budgeted`: if the node
+        is new, until its first reply it is asked within the budget of probes only (R11), as a node that is down is.
         """
         node = self._find_or_add(profile, address, timings, retries)
+        if budgeted and not (node.kept or node.borrowers):
+            self._arbiter.ask_within_budget(node.record, self.now())
         node.borrowers += 1
         return node
+
+    def has_node(self, profile: Profile, address: int) -> bool:
+        """Return whether the node at this address is on the line."""
+        return (profile.name, address) in self._nodes
 
     def give_back(self, node: Node) -> None:
         """Take back a node that was lent: nothing of it is polled or asked any more by whoever gives it back."""
@@ -289,6 +303,7 @@ class Bus:
         phase: float | None = None,
         priority: Priority = Priority.POLL,
         merge: Sequence[Merge] = (),
+        client: LineClient | None = None,
     ) -> PollGroup:
         """Read `points` every `period` seconds, on a fixed grid, from now on (R10).
 
@@ -296,6 +311,7 @@ class Bus:
         other groups least. `merge`: cheaper exchanges to opt in to, such as `protocols.mentor.merge_runs`, beside
         those that the nodes' profiles have; they are taken where they save line time, and no longer once refused.
         Hundreds of points or groups are worked out in slices while the line goes on, and start some milliseconds later.
+        `client`, of `SharedLine.add_client`, is the program that pays for the line time; without it, this one does.
         Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
         self.check_loop()
@@ -308,7 +324,15 @@ class Bus:
         if name in self._groups:
             raise InvalidCommand(f"there is a poll group {name!r} already")
         group = PollGroup(
-            self._line, name, period, points, phase=phase, priority=priority, merge=merge, on_close=self._forget
+            self._line,
+            name,
+            period,
+            points,
+            phase=phase,
+            priority=priority,
+            merge=merge,
+            on_close=self._forget,
+            client=client,
         )
         self._arbiter.add_poll(group.poll, self.now())
         self._groups[name] = group

@@ -8,6 +8,7 @@ from functools import partial
 from math import inf, nextafter
 from typing import Any, NamedTuple
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import line_time, set_members
@@ -77,11 +78,14 @@ class PollGroup(Cycles):
         priority: Priority,
         merge: Sequence[Merge],
         on_close: Callable[[PollGroup], None],
+        client: LineClient | None = None,
     ) -> None:
         super().__init__(name)
         self._line = line
         self._on_close = on_close
         self._priority = priority
+        self._client = client
+        """Who pays for the line time; None: the line's owner."""
         self._merge = tuple(merge)
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
@@ -409,7 +413,7 @@ class PollGroup(Cycles):
             return
         fresh = []
         for read in reads:
-            fresh.append(Transaction(read.node.record, read.served.command, tag=read))
+            fresh.append(Transaction(read.node.record, read.served.command, tag=read, client=self._client))
             read.blank.update((point, None) for point, _ in read.points)
             yield 5
         set_members(poll, fresh, self._priority)

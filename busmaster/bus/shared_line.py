@@ -196,10 +196,10 @@ class SharedLine:
         for touched in [what for what in self._touched if node in (what if isinstance(what, tuple) else (what,))]:
             del self._touched[touched]
 
-    def add_client(self, share: float) -> LineClient:
-        """Return a client, a program with which this one takes turns from now on; `share` weighs its line time."""
+    def add_client(self, share: float, owner_time: float = 0.0) -> LineClient:
+        """Return a client, a program with which this one takes turns from now on; see `LineClient`."""
         self.clients += 1
-        return self.arbiter.add_client(share)
+        return self.arbiter.add_client(share, owner_time)
 
     def remove_client(self, client: LineClient) -> None:
         """Forget a client: nothing is asked for it any more."""

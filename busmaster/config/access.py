@@ -39,14 +39,14 @@ def access_of(section: ServiceSection, names: Names, secrets: Mapping[str, bytes
 
 def _permission(role: RoleSection, names: Names) -> Permission:
     if role.only is None:
-        return Permission(role.who, role.writes)
+        return Permission(role.who, role.role)
     only: dict[tuple[str, int], frozenset[Hashable] | None] = {}
     for number, text in enumerate(role.only):
         with role.table.at("allow_writes", number):
             for (protocol, address), places in _places(text, names):
                 before = only.get((protocol, address), frozenset())
                 only[protocol, address] = None if before is None or places is None else before | places
-    return Permission(role.who, role.writes, only)
+    return Permission(role.who, role.role, only)
 
 
 def _places(text: str, names: Names) -> Iterator[tuple[tuple[str, int], frozenset[Hashable] | None]]:

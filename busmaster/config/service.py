@@ -18,10 +18,11 @@ from busmaster.contract.arguments import host_and_port
 from busmaster.errors import InvalidCommand
 from busmaster.files import check_regular
 from busmaster.gate.permission import digest_of
+from busmaster.gate.rights import RIGHTS, Role
 from busmaster.service.tcp import check_listening
 
 MODE = 0o600
-ROLES = ("read", "write")
+ROLES = tuple(role.value for role in Role)
 KEYS = (
     Key("enabled", "flag", "Whether other programs may come at all.", "true"),
     Key("group", "text", "The group of this machine whose members may come to the socket, beside this user."),
@@ -51,7 +52,13 @@ KEYS = (
 )
 """Of `[service]`."""
 ROLE_KEYS = (
-    Key("role", "text", "What who has it may do. Whoever writes may read.", REQUIRED, choices=ROLES),
+    Key(
+        "role",
+        "text",
+        "What a program may do: `write` may read too, and `admin` may use line time as the owner does.",
+        REQUIRED,
+        choices=ROLES,
+    ),
     Key(
         "allow_writes",
         "texts",
@@ -69,7 +76,7 @@ class RoleSection:
     """
 
     who: str
-    writes: bool
+    role: Role
     only: tuple[str, ...] | None
     table: Table = field(compare=False, repr=False)
 
@@ -142,11 +149,13 @@ def read_service(table: Table) -> ServiceSection:
 
 def _role(table: Table, kind: str) -> RoleSection:
     table.only(*names_of(ROLE_KEYS))
-    writes = table.choice("role", ROLES) == "write"
+    role = Role(table.choice("role", ROLES))
     only = table.texts("allow_writes", None)
-    if only is not None and not (writes and only):
-        raise table.error('names what a role = "write" may write: leave it out for all of the line', "allow_writes")
-    return RoleSection(f"{kind} {table.name}", writes, only, table)
+    if only is not None and not (RIGHTS[role].writes and only):
+        raise table.error(
+            'names what a role = "write" or "admin" may write: leave it out for all of the line', "allow_writes"
+        )
+    return RoleSection(f"{kind} {table.name}", role, only, table)
 
 
 def _of_group(table: Table, mode: int) -> RoleSection:

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 from busmaster.bus.requester import Requester
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing
+from busmaster.gate.rights import ADMIN, READ, RIGHTS, Rights, Role
 
 Allowed: TypeAlias = Mapping[tuple[str, int], frozenset[Hashable] | None]
 """By protocol and address of a node, the places there that may be written; None stands for all that the node has."""
@@ -19,14 +20,24 @@ Allowed: TypeAlias = Mapping[tuple[str, int], frozenset[Hashable] | None]
 
 @dataclass(frozen=True, slots=True)
 class Permission:
-    """What somebody may do; everybody may read. `who` is what messages call whom it is for: "token hmi".
+    """What a program may do, by its role. `who` names the program in messages: "token hmi".
 
     `only` says where a writer may write, whatever names it and however it is written; None stands for everywhere.
     """
 
     who: str
-    writes: bool
+    role: Role
     only: Allowed | None = None
+
+    @property
+    def rights(self) -> Rights:
+        """Return what its role may have of the line."""
+        return RIGHTS[self.role]
+
+    @property
+    def writes(self) -> bool:
+        """Return whether it may write anything."""
+        return self.rights.writes
 
     def reaches(self, node: Requester) -> bool:
         """Return whether anything of a node may be written."""
@@ -51,15 +62,15 @@ class Permission:
         return f"{self.who} may not write this: see allow_writes in the line's file"
 
 
-EVERYTHING = Permission("the owner", True)
+EVERYTHING = Permission("the owner", ADMIN)
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
     """Who may use a line: by the numbers of users and groups, and by the names of tokens.
 
-    A user's own entry goes before the groups', and those in their order. Whom nothing is said of may read, but for the
-    user whose process owns the line, and root: they may write.
+    A user's own entry goes before the groups', and those in their order. Without an entry the user
+    whose process owns the line, and root, are ADMIN, and others READ.
     """
 
     users: Mapping[int, Permission] = field(default_factory=dict)
@@ -77,11 +88,11 @@ class Access:
         for gid, permission in self.groups.items():
             if gid in gids:
                 return permission
-        return Permission("this user", False)
+        return Permission("this user", READ)
 
     def of_token(self, name: str) -> Permission:
         """Return what whoever has a token may do; "" is the name of none."""
-        return self.tokens.get(name) or Permission(f"token {name}" if name else "a program without a token", False)
+        return self.tokens.get(name) or Permission(f"token {name}" if name else "a program without a token", READ)
 
     def token_name(self, secret: str) -> str | None:
         """Return the name of a token, None for what is none: in the same time, whichever it is."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from busmaster.arbiter.clients import Hold, LineClient
@@ -12,14 +13,15 @@ from busmaster.bounds import MOST_CHECKED, MOST_HOLDS, MOST_NODES, MOST_POLLED, 
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.bus.requester import Requester, checked_priority
+from busmaster.bus.requester import ORDINARY, Requester, RequestOptions, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Permission
+from busmaster.gate.rights import RIGHTS, Rights, Role
 from busmaster.service.errands import Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of, said_error
 from busmaster.service.line import ServedLine
-from busmaster.service.messages import NO_METHOD, Malformed, answered, timings_of, written
+from busmaster.service.messages import NO_METHOD, Malformed, answered, check_within, timings_of, written
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
@@ -28,6 +30,10 @@ from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, profile_of, protocol_of, said_statistics
 
 NodeKey = tuple[str, int]
+
+
+def _reads_of(role: Role) -> RequestOptions:
+    return replace(ORDINARY, priority=max(ORDINARY.priority, RIGHTS[role].reads))
 
 
 class Client:
@@ -52,7 +58,10 @@ class Client:
         """What it has asked of the line."""
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
-        self.turn = line.bus.shared.add_client(line.share)
+        self._role = self.permission.role
+        self.reads = _reads_of(self._role)
+        """The options of its reads that say none."""
+        self.turn = line.bus.shared.add_client(line.share, self.rights.owner_time)
         """What its requests take turns by, with those of the others."""
         self._holds: dict[int, Hold | str] = {}
         """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
@@ -63,6 +72,11 @@ class Client:
     def permission(self) -> Permission:
         """Return what it may do, as it is now."""
         return self.peer.permission(self._line.gate.access)
+
+    @property
+    def rights(self) -> Rights:
+        """Return what its role may have of the line. `tell_access` changes it: it is not found for every request."""
+        return RIGHTS[self._role]
 
     @property
     def read_only(self) -> bool:
@@ -90,7 +104,11 @@ class Client:
         return f"{head}{body}}}}}"
 
     def tell_access(self) -> None:
-        """Say what it may do now."""
+        """Have another role hold at once, and say what the program may do now."""
+        role = self.permission.role
+        if role is not self._role:
+            self._role, self.reads = role, _reads_of(role)
+            self._line.bus.shared.arbiter.change_client(self.turn, self.rights.owner_time)
         self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
 
     def tell_stops(self, node: NodeRecord) -> None:
@@ -205,7 +223,7 @@ class Client:
         else:
             group = self._line.group(params["group"])
             if method == "demand":
-                group.demand()
+                self._line.demand(group, self._role)
                 return
             self._check_steering(*(point.node for point in group.points))
             group.pause() if params["paused"] is True else group.resume()
@@ -249,9 +267,18 @@ class Client:
         protocol = protocol_of(name)
         if known is None and len(self._nodes) >= MOST_NODES:
             raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
-        bus = self._line.bus
+        bus, rights = self._line.bus, self.rights
         profile = profile_of(protocol, *sync_reads)
-        node = bus.lend_node(profile, address, timings=timings_of(timings), retries=retries)
+        times = timings_of(timings)
+        if known is None and not bus.has_node(profile, address):
+            if sum(not node.kept for node in self._nodes.values()) >= rights.new_nodes:
+                raise InvalidCommand(
+                    f"{profile.label(address)}: a program with the role {self._role.value} names {rights.new_nodes} "
+                    "nodes at most that the line's owner does not have: add the node to the line's file"
+                )
+            if not rights.own_times:
+                check_within(times, profile, address)
+        node = bus.lend_node(profile, address, timings=times, retries=retries, budgeted=rights.budgeted)
         if known is not None:
             bus.give_back(node)  # it was asked for its complaint alone
         self._nodes[name, address] = node
@@ -338,8 +365,8 @@ class Client:
         return {}
 
     def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        if len(self._groups) >= MOST_POLLED:
-            raise InvalidCommand(f"one program has {MOST_POLLED} poll groups at most")
+        if len(self._groups) >= self.rights.groups:
+            raise InvalidCommand(f"one program has {self.rights.groups} poll groups at most")
         self._gather(params)
         read = self._gathered.pop(params["stream"])
         phase = params.get("phase")
@@ -348,7 +375,8 @@ class Client:
             period=seconds(params["period"], "a period"),
             points=read,
             phase=None if phase is None else seconds(phase, "a phase"),
-            priority=checked_priority(max(Priority.POLL, params.get("priority", Priority.POLL))),
+            priority=checked_priority(max(self.rights.polls, params.get("priority", Priority.POLL))),
+            client=self.turn,
         )
         try:
             answer = self._follow(params, self._line.broadcast_of(group))

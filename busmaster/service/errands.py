@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster.arbiter.clients import LineClient
@@ -18,6 +19,7 @@ from busmaster.contract.places import Changing, Placed
 from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, NEVER_SENT, Wish, outcome_of
 from busmaster.gate.permission import Permission
+from busmaster.gate.rights import Rights
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import value_of
 from busmaster.service.peers import Peer
@@ -39,6 +41,15 @@ class Asker(Protocol):
 
     @property
     def permission(self) -> Permission: ...
+
+    @property
+    def reads(self) -> RequestOptions:
+        """Return the options of its reads that say none: their class is the highest that its role has for reads, but
+        for URGENT."""
+        ...
+
+    @property
+    def rights(self) -> Rights: ...
 
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
@@ -318,7 +329,7 @@ Errand: TypeAlias = Reading | Writing
 def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
     """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
     if isinstance(said, PlainRead):
-        return Reading(asker.node(said.protocol, said.address), said.command, asker.turn)
+        return Reading(asker.node(said.protocol, said.address), said.command, asker.turn, None, asker.reads)
     task = Task.of_point(said, asker, line) if "key" in said else Task.of_node(said, asker)
     node, command = task.node, task.command
     given = cast("CommandOptions", said.get("options") or {})
@@ -331,7 +342,9 @@ def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLin
     stop = said.get("stop") is True and _check_stop(node, command)
     asked = min(now, seconds(said.get("asked", now), "asked"))
     if not command.writes:
-        return Reading(node, command, client, stops_seen, RequestOptions.of(_left(given, now - asked), node.label))
+        options = RequestOptions.of(_left(given, now - asked), node.label)
+        options = replace(options, priority=max(options.priority, asker.rights.reads))
+        return Reading(node, command, client, stops_seen, options)
     return Writing(task, given, line=line, asker=asker, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
 
 

@@ -15,6 +15,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
+from busmaster.gate.rights import RIGHTS, Role
 from busmaster.service.exchanges import ExchangesBroadcast
 from busmaster.service.overview import Journal, Overview
 from busmaster.service.safe import SafeWishes
@@ -36,6 +37,8 @@ class ServedLine:
         self.safe_wishes = SafeWishes(gate)
         self.journal = Journal(bus)
         """What happens from now on, also before it is served."""
+        self._demanded: dict[tuple[str, Role], float] = {}
+        """When a role's programs last had a group polled off its grid."""
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._overview: Overview | None = None
@@ -83,6 +86,14 @@ class ServedLine:
                 return found, point
         raise InvalidCommand(f"poll group {group!r} has no point {key!r}")
 
+    def demand(self, group: PollGroup, role: Role) -> None:
+        """Poll a group now, unless the programs of this role have had that lately: then the next cycle serves."""
+        every, now = RIGHTS[role].demand_every, self.bus.now()
+        if now < self._demanded.get((group.name, role), -inf) + every * group.period:
+            return
+        self._demanded[group.name, role] = now
+        group.demand()
+
     def node(self, protocol: str, address: int) -> Node:
         """Return a node that is on the line. Raises InvalidCommand if there is none."""
         for node in self.bus.nodes:
@@ -115,6 +126,8 @@ class ServedLine:
 
     def _forget_group(self, group: PollGroup) -> None:
         self._groups.pop(group, None)
+        for role in Role:
+            self._demanded.pop((group.name, role), None)
 
     def _end_events(self) -> None:
         self._events = None

@@ -9,7 +9,8 @@ from math import inf, isnan
 from typing import Any
 
 from busmaster.bounds import LONGEST_REPLY, MOST_PARTS
-from busmaster.contract.learning import Learned
+from busmaster.contract.learning import Learned, documented
+from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 
@@ -132,6 +133,22 @@ def timings_of(said: Any) -> Timings | Learned | None:
         if max(leg.lateness, leg.byte_gap, leg.turnaround, leg.silence or 0.0) > LONGEST_REPLY:
             raise InvalidCommand(f"a program may have the line wait {LONGEST_REPLY:g} s for a reply, and no longer")
     return times
+
+
+def check_within(times: Timings | Learned | None, profile: Profile, address: int) -> None:
+    """Raise InvalidCommand for reply times that keep the line for longer than those of the protocol's document.
+
+    The line sends nothing else while it waits for a reply.
+    """
+    times, limits = documented(times), profile.timings
+    for leg in () if times is None else ("read", "write", "packet"):
+        for name in ("lateness", "byte_gap", "turnaround", "silence"):
+            asked, limit = getattr(getattr(times, leg), name), getattr(getattr(limits, leg), name)
+            if asked is not None and asked > (getattr(limits, leg).lateness if limit is None else limit):
+                raise InvalidCommand(
+                    f"{profile.label(address)}: {name} of {asked:g} s is longer than that of {profile.name}: "
+                    "set it for the node in the line's file, or use a program with the role admin"
+                )
 
 
 def _said_timing(timing: ReplyTiming) -> dict[str, float]:

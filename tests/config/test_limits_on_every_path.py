@@ -14,7 +14,7 @@ import pytest
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.node import Node
-from busmaster.bus.requester import Priority
+from busmaster.bus.requester import ORDINARY, Priority
 from busmaster.cli.write import pass_on, prepare
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
@@ -178,6 +178,8 @@ class Person:
 
     peer = Process(1, 0, (), "busmaster")
     permission = EVERYTHING
+    rights = EVERYTHING.rights
+    reads = ORDINARY
 
     def node(self, name: str, address: int, /) -> Node:
         raise AssertionError("a person names points")

@@ -15,6 +15,7 @@ from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Permission, digest_of
+from busmaster.gate.rights import Role
 
 USER, GROUP = pwd.getpwuid(0).pw_name, grp.getgrgid(0).gr_name
 TEXT = """
@@ -62,9 +63,9 @@ groups.{GROUP}.role = "write"
 tokens.hmi = {{ role = "write", allow_writes = "winder/force" }}
 """)
     access = ConfiguredLine(file, outputs=False).gate.access
-    assert access.users == {0: Permission(f"user {USER}", False)}
-    assert access.groups == {0: Permission(f"group {GROUP}", True)}
-    assert access.tokens == {"hmi": Permission("token hmi", True, {("hcp2", 5): frozenset({10})})}
+    assert access.users == {0: Permission(f"user {USER}", Role.READ)}
+    assert access.groups == {0: Permission(f"group {GROUP}", Role.WRITE)}
+    assert access.tokens == {"hmi": Permission("token hmi", Role.WRITE, {("hcp2", 5): frozenset({10})})}
     assert access.secrets == {}  # until the line is served
     assert file.service.listen == ("0.0.0.0", 7420)
     assert file.service.secrets() == {"hmi": digest_of("a-token-of-the-hmi-0001")}
@@ -110,9 +111,12 @@ def test_what_is_no_point_that_could_be_written_is_refused_with_its_place(said: 
         ('users.nobody-at-all.role = "read"', "there is no user 'nobody-at-all' on this machine"),
         ('groups.nobody-at-all.role = "read"', "there is no group 'nobody-at-all' on this machine"),
         (f'groups.{GROUP}.role = "read"', "no group comes to a socket of mode 0600: say whose it is, as group = "),
-        (f'users.{USER}.role = "admin"', "no such role 'admin'; there are read, write"),
+        (f'users.{USER}.role = "owner"', "no such role 'owner'; there are read, write, admin"),
         (f"users.{USER} = {{}}", "'role' is missing"),
-        (f'users.{USER} = {{ role = "read", allow_writes = "winder/force" }}', 'names what a role = "write" may'),
+        (
+            f'users.{USER} = {{ role = "read", allow_writes = "winder/force" }}',
+            'names what a role = "write" or',
+        ),
     ],
 )
 def test_what_is_wrong_in_the_section_is_refused_with_its_place(said: str, complaint: str) -> None:

@@ -18,12 +18,13 @@ from busmaster.doors.following import Following
 from busmaster.doors.guard import Guard
 from busmaster.doors.web import application, serving
 from busmaster.gate.permission import Access, Permission
+from busmaster.gate.rights import Role
 from tests.patience import PATIENCE
 from tests.service.lines import Served, until
 
 ONE = "/api/points/axes/5/10"
 HERE = ("127.0.0.1", 0)
-READS = Access(users={os.getuid(): Permission("this user", False)})
+READS = Access(users={os.getuid(): Permission("this user", Role.READ)})
 """What an owner's file says where this user may only read."""
 
 

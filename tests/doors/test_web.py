@@ -22,6 +22,7 @@ from busmaster.doors.audience import MOST_EXCHANGES, Seat
 from busmaster.doors.web import PAGE, serving
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Access, Permission, digest_of
+from busmaster.gate.rights import Role
 from busmaster.registry import kinds
 from tests.doors.lines import HERE, ONE, READS, Page, assert_goes_on_alone, page, poll, shows
 from tests.patience import PATIENCE
@@ -457,7 +458,7 @@ async def test_a_port_that_is_taken_is_one_sentence() -> None:
 
 @pytest.mark.asyncio
 async def test_a_role_of_the_line_holds_for_its_page(tmp_path: Path) -> None:
-    access = Access(users={os.getuid(): Permission("this user", False)})
+    access = Access(users={os.getuid(): Permission("this user", Role.READ)})
     async with served(tmp_path, access=access) as line, page(tmp_path) as of:
         poll(line)
         await shows(of.line)

@@ -21,6 +21,7 @@ from busmaster import Bus, Hcp2Controller, MemoryPort, MicroFlexDrive, Service, 
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.gate.permission import Access, Permission, digest_of
+from busmaster.gate.rights import Role
 from busmaster.service import peers
 from busmaster.service.frames import NO_MASK, text_frame
 from tests.patience import PATIENCE
@@ -30,8 +31,8 @@ LOOPBACK = ("127.0.0.1", 0)
 SECRETS = {"hmi": "a-token-of-the-hmi-0001", "logger": "a-token-of-the-logger-2"}
 TOKENS = Access(
     tokens={
-        "hmi": Permission("token hmi", True, {("hcp2", 5): frozenset({1}), ("hcp2", 7): None}),
-        "logger": Permission("token logger", False),
+        "hmi": Permission("token hmi", Role.WRITE, {("hcp2", 5): frozenset({1}), ("hcp2", 7): None}),
+        "logger": Permission("token logger", Role.READ),
     },
     secrets={name: digest_of(secret) for name, secret in SECRETS.items()},
 )
@@ -291,14 +292,14 @@ def test_whom_the_socket_lets_in_may_read_and_its_owner_may_write(
 def test_a_users_own_role_goes_before_those_of_groups_and_those_in_their_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    groups = {GUESTS: Permission("group guests", False), OPERATORS: Permission("group operators", True)}
+    groups = {GUESTS: Permission("group guests", Role.READ), OPERATORS: Permission("group operators", Role.WRITE)}
     posing_as(monkeypatch, NOBODY, 1, OPERATORS)
     on_a_socket(tmp_path, Access(groups=groups), writes)
     posing_as(monkeypatch, NOBODY, OPERATORS, GUESTS)
     on_a_socket(tmp_path, Access(groups=groups), reads)
-    on_a_socket(tmp_path, Access(groups=groups, users={NOBODY: Permission("user nobody", True)}), writes)
+    on_a_socket(tmp_path, Access(groups=groups, users={NOBODY: Permission("user nobody", Role.WRITE)}), writes)
     posing_as(monkeypatch, os.getuid())
-    on_a_socket(tmp_path, Access(users={os.getuid(): Permission("user me", False)}), reads)
+    on_a_socket(tmp_path, Access(users={os.getuid(): Permission("user me", Role.READ)}), reads)
 
 
 def test_the_kernel_says_which_groups_a_process_has() -> None:
@@ -315,7 +316,7 @@ def test_the_kernel_says_which_groups_a_process_has() -> None:
 def test_other_roles_hold_at_once_for_who_is_there(tmp_path: Path) -> None:
     async def story(line: Served, controller: Hcp2Controller) -> None:
         await controller.write(1, 1)
-        line.gate.access = Access(users={os.getuid(): Permission("user me", False)})
+        line.gate.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
         with pytest.raises(InvalidCommand, match="user me may read this line"):
             await controller.write(1, 2)
 
@@ -328,7 +329,7 @@ def test_other_roles_are_told_to_who_is_there(tmp_path: Path) -> None:
             told: list[bool] = []
             remote.on_access.append(lambda: told.append(remote.about["read_only"]))
             assert not remote.about["read_only"]
-            line.gate.access = Access(users={os.getuid(): Permission("user me", False)})
+            line.gate.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
             await until(lambda: told == [True])
             line.gate.access = Access()
             await until(lambda: told == [True, False])
@@ -343,9 +344,9 @@ def test_what_a_command_does_not_say_it_changes_is_allowed_with_its_whole_node_a
 
     node: Any = type("Node", (), {"profile": Hcp2Controller.profile, "address": 5})()
     odd: Any = Odd()
-    assert Permission("x", True, {("hcp2", 5): frozenset({1})}).refusal(node, odd)
-    assert not Permission("x", True, {("hcp2", 5): None}).refusal(node, odd)
-    assert Permission("x", True, {("hcp2", 6): None}).refusal(node, odd)
+    assert Permission("x", Role.WRITE, {("hcp2", 5): frozenset({1})}).refusal(node, odd)
+    assert not Permission("x", Role.WRITE, {("hcp2", 5): None}).refusal(node, odd)
+    assert Permission("x", Role.WRITE, {("hcp2", 6): None}).refusal(node, odd)
 
 
 @pytest.mark.parametrize("ahead", [-50_000.0, 50_000.0])

@@ -16,6 +16,7 @@ from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, Service, con
 from busmaster.emulator.line import Line
 from busmaster.errors import LineDown, NoReply, WriteUnconfirmed
 from busmaster.gate.permission import Access, Permission
+from busmaster.gate.rights import Role
 from busmaster.registry import make_device
 from tests.patience import PATIENCE
 from tests.service.lines import Served, on_a_line, served, until
@@ -164,7 +165,7 @@ def test_points_that_a_group_gets_are_told_to_who_reads_it(tmp_path: Path) -> No
 
 
 def test_who_came_by_tcp_without_a_token_goes_when_tokens_are_introduced(tmp_path: Path) -> None:
-    access = Access(tokens={"web": Permission("token web", True)})
+    access = Access(tokens={"web": Permission("token web", Role.WRITE)})
 
     async def run() -> None:
         async with (

@@ -21,6 +21,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.emulator.line import Line
 from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.gate.permission import Access, Permission
+from busmaster.gate.rights import Role
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.service import overview
@@ -190,12 +191,12 @@ def test_a_read_only_line_says_so_and_writes_nothing(tmp_path: Path) -> None:
 
 def test_who_may_only_read_looks_and_neither_pauses_nor_suspends_nor_writes(tmp_path: Path) -> None:
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
-        line.gate.access = Access(users={os.getuid(): Permission("user me", False)})
+        line.gate.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
         for wish in (view.pause("axes", True), view.suspend("hcp2", 5, 60.0), view.write("axes", "5/outputs", 5)):
             with pytest.raises(InvalidCommand, match="user me may"):
                 await wish
         await view.demand("axes")
-        line.gate.access = Access(users={os.getuid(): Permission("user me", True, {("hcp2", 6): None})})
+        line.gate.access = Access(users={os.getuid(): Permission("user me", Role.WRITE, {("hcp2", 6): None})})
         with pytest.raises(InvalidCommand, match="user me may not have this rest"):
             await view.pause("axes", True)
         await view.suspend("hcp2", 6, 60.0)

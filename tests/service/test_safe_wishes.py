@@ -19,6 +19,7 @@ from busmaster.errors import BacklogFull, BusError, InvalidCommand, NoReply, Sup
 from busmaster.gate.gate import SafeWrites
 from busmaster.gate.permission import Access, Permission
 from busmaster.gate.record import WriteRecord
+from busmaster.gate.rights import Role
 from busmaster.registry import make_device
 from busmaster.service.safe import SafeWishes
 from tests.patience import PATIENCE
@@ -148,8 +149,8 @@ def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -
         with pytest.raises(InvalidCommand, match="has the safe state winder/speed = 0, and not winder/speed = 1"):
             await remote.enter_safe_state({"winder/speed": 1})
         for permission, complaint in (
-            (Permission("user me", False), "user me may read this line"),
-            (Permission("user me", True, {("hcp2", 9): None}), "user me may not write this"),
+            (Permission("user me", Role.READ), "user me may read this line"),
+            (Permission("user me", Role.WRITE, {("hcp2", 9): None}), "user me may not write this"),
         ):
             line.gate.access = Access(users={os.getuid(): permission})
             with pytest.raises(InvalidCommand, match=complaint):

@@ -1,0 +1,138 @@
+"""The owner of a shared line keeps its part of the line, whatever its clients ask (R9)."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.shared_backlog import MOST_LEFT
+from busmaster.arbiter.transaction import Priority
+from tests.arbiter.test_turns import Desk
+
+URGENT, COMMAND, POLL, BACKGROUND = Priority
+GUEST, WRITER = 7.0, 1.0
+"""`owner_time` of two kinds of clients."""
+
+
+def client(desk: Desk, owner_time: float, takes: float = 0.01) -> LineClient:
+    made = desk.arbiter.add_client(owner_time=owner_time)
+    desk.takes[made] = takes
+    return made
+
+
+def owners_part(desk: Desk, count: int) -> float:
+    """The part of the line time that the owner has of so many exchanges; it always has something to poll."""
+    begun = len(desk.served)
+    for _ in range(count):
+        desk.ask(None, 1 - desk.backlog.waiting_of(POLL, None), POLL)
+        desk.serve()
+    spent = Counter[bool]()
+    for who in desk.served[begun:]:
+        spent[who is None] += round(1000 * desk.takes.get(who, 0.01))
+    return spent[True] / spent.total()
+
+
+@pytest.mark.parametrize("takes", [0.002, 0.01, 0.1])
+@pytest.mark.parametrize("count", [1, 5, 64])
+def test_r9_the_owner_keeps_its_part_whatever_the_exchanges_of_guests_take(count: int, takes: float) -> None:
+    desk = Desk()
+    for _ in range(count):
+        desk.ask(client(desk, GUEST, takes), 500, BACKGROUND)
+    owners_part(desk, 100 * count)  # each has its first exchange
+    assert owners_part(desk, 3000) >= 0.85
+
+
+@pytest.mark.parametrize("priority", [COMMAND, POLL, BACKGROUND])
+@pytest.mark.parametrize("count", [1, 64])
+def test_r9_the_owner_keeps_half_of_the_line_against_writers(count: int, priority: Priority) -> None:
+    desk = Desk()
+    for _ in range(count):
+        desk.ask(client(desk, WRITER), 500, priority)
+    assert owners_part(desk, 2000) >= 0.45
+
+
+@pytest.mark.parametrize("count", [1, 64])
+def test_r9_the_owner_keeps_its_part_against_urgent_requests_without_end(count: int) -> None:
+    desk = Desk()
+    for _ in range(count):
+        desk.ask(client(desk, WRITER), 500, URGENT)
+    owners_part(desk, 2 * count)
+    assert owners_part(desk, 2000) >= 0.45
+
+
+def test_r9_an_urgent_request_goes_at_once_if_its_client_asked_for_little() -> None:
+    desk = Desk()
+    for _ in range(63):
+        desk.ask(client(desk, WRITER), 500, URGENT)
+    owners_part(desk, 500)
+    operator = client(desk, WRITER)
+    for _ in range(5):
+        desk.ask(None, 1, POLL)
+        desk.ask(operator, 1, URGENT)
+        assert operator in desk.serve(2)
+        owners_part(desk, 500)
+
+
+def test_r9_an_urgent_request_of_a_client_that_asked_too_much_waits_for_one_exchange_more() -> None:
+    desk = Desk()
+    flood = client(desk, WRITER)
+    desk.ask(flood, 500, COMMAND)
+    owners_part(desk, 100)
+    for _ in range(20):
+        desk.ask(None, 3, POLL)
+        desk.ask(flood, 1, URGENT)
+        waiting = desk.backlog.waiting(URGENT)
+        desk.serve(2)
+        assert desk.backlog.waiting(URGENT) < waiting
+
+
+def test_r9_the_owners_urgent_requests_go_before_those_of_all_others() -> None:
+    desk = Desk()
+    for _ in range(64):
+        desk.ask(client(desk, WRITER), 10, URGENT)
+    desk.serve(100)
+    desk.ask(None, 5, URGENT)
+    assert desk.serve(5) == [None] * 5
+
+
+def test_r9_guests_have_all_that_the_owner_leaves() -> None:
+    desk = Desk()
+    first, second = client(desk, GUEST), client(desk, GUEST)
+    desk.ask(first, 50, BACKGROUND)
+    desk.ask(second, 50, BACKGROUND)
+    assert Counter(desk.serve(100)) == {first: 50, second: 50}
+
+
+def test_r9_a_guest_is_not_starved() -> None:
+    desk = Desk()
+    guest = client(desk, GUEST)
+    desk.ask(guest, 100, BACKGROUND)
+    owners_part(desk, 1100)
+    assert desk.served.count(guest) == 100
+
+
+def test_r9_a_program_that_connects_anew_for_each_request_has_no_more_of_the_line() -> None:
+    desk = Desk()
+    served = 0
+    for _ in range(2000):
+        guest = client(desk, WRITER)
+        desk.ask(guest, 1, COMMAND)
+        while desk.backlog.waiting_of(COMMAND, guest):
+            desk.ask(None, 1 - desk.backlog.waiting_of(POLL, None), POLL)
+            desk.serve()
+            served += 1
+        desk.arbiter.remove_client(guest)
+    assert desk.served.count(None) / served >= 0.45
+    assert all(len(left) <= MOST_LEFT for left in desk.backlog._left_accounts.values())
+
+
+def test_r9_a_client_whose_role_changes_has_the_part_of_the_new_one() -> None:
+    desk = Desk()
+    changed = client(desk, GUEST)
+    desk.arbiter.change_client(changed, 0.0)
+    desk.ask(changed, 100, COMMAND)
+    owners_part(desk, 100)
+    assert desk.served.count(changed) > 80
+    assert not desk.backlog._members
