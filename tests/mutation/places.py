@@ -49,9 +49,23 @@ class Mutant:
 
 def places(root: Path) -> Iterator[Mutant]:
     """All mutants of all rooms, in a fixed order."""
-    for room, patterns in ROOMS.items():
-        for path in sorted({path for pattern in patterns for path in root.glob(pattern)}):
+    for room in ROOMS:
+        for path in files_of(room, root):
             yield from mutants_of(room, path, root)
+
+
+def files_of(room: str, root: Path) -> list[Path]:
+    """Return the files of a room.
+
+    Raises FileNotFoundError for a pattern that matches none: what moved away would not be mutated, without a word.
+    """
+    found: set[Path] = set()
+    for pattern in ROOMS[room]:
+        paths = set(root.glob(pattern))
+        if not paths:
+            raise FileNotFoundError(f"no file is {pattern}: say in ROOMS where the room {room} is now")
+        found |= paths
+    return sorted(found)
 
 
 def mutants_of(room: str, path: Path, root: Path) -> Iterator[Mutant]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.proof import runs
 from tests.proof.runs import is_done, known, to_explore
 from tests.proof.worlds import worlds
 
@@ -53,3 +54,9 @@ def test_what_was_never_begun_is_explored_before_what_was_left_open() -> None:
     one, other, third = worlds(["quick"])[:3]
     before = {one.name: OPEN, third.name: CLOSED}
     assert to_explore([one, other, third], before, 60.0) == [other, one]
+
+
+def test_a_folder_without_code_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "EXPLORED", ("busmaster/arbiter", "busmaster/nothing"))
+    with pytest.raises(FileNotFoundError, match=r"there is no code in busmaster/nothing: say in EXPLORED"):
+        runs.fingerprint()
