@@ -195,10 +195,10 @@ def test_poll_in_json_has_a_line_a_cycle_with_times_since_the_start(controllers:
     assert list(last) == ["group", "cycle", "due", "started", "finished", "missed", "samples", "time"]
     assert abs(datetime.now(UTC) - datetime.fromisoformat(last["time"])).days == 0
     assert 0 <= last["due"] <= last["started"] <= last["finished"] < time.monotonic() - began
-    assert last["samples"]["1/outputs"] == {"value": 0, "error": None, "late": False}
+    assert last["samples"]["1/outputs"] == {"value": 0, "quality": "good", "error": None, "late": False}
     silent = last["samples"]["99/outputs"]
-    assert list(silent) == ["value", "error", "late", "hint"]
-    assert silent["value"] is None
+    assert sorted(silent) == ["error", "hint", "late", "quality", "value"]
+    assert (silent["value"], silent["quality"]) == (None, "bad")
     assert silent["error"]
     assert silent["hint"]
 

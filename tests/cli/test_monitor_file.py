@@ -122,7 +122,12 @@ def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> No
             _, said = process.communicate(timeout=PATIENCE)
         assert line.heard == b""
     assert cycle["group"] == "fast"
-    assert cycle["samples"]["winder/tension"] == {"value": 0.5, "error": None, "late": False}
+    assert cycle["samples"]["winder/tension"] == {
+        "value": 0.5,
+        "quality": "overheard",
+        "error": None,
+        "late": False,
+    }
     assert set(rows(tmp_path / "line.sqlite")) == {("winder", "tension", 0.5, "N")}
     assert "sqlite: " in said
     assert "0 dropped" in said

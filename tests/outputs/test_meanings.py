@@ -84,8 +84,8 @@ def test_files_have_the_number_and_what_it_is_called(tmp_path: Path) -> None:
     assert [row[5] for row in rows] == ["value", "1 on", "7"]
     samples = [json.loads(line)["samples"]["5/1"] for line in (tmp_path / "JsonlOutput").read_text().splitlines()]
     assert samples == [
-        {"value": 1, "error": None, "late": False, "label": "on"},
-        {"value": 7, "error": None, "late": False},
+        {"value": 1, "quality": "good", "error": None, "late": False, "label": "on"},
+        {"value": 7, "quality": "good", "error": None, "late": False},
     ]
 
 
