@@ -96,12 +96,13 @@ class Trust:
         if ours:
             self._in_step.owe((ANY_BYTE,), None, now, now)
             return None
+        owed = [(debt.node, debt.key) for debt in self._in_step.debts]
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is None or node is None or len(paid.key) < 2:
             return node  # a lone byte may be noise, and makes no node slower
         if node.learning is None or paid.awaited is None:
-            unasked.blame_straggler(node, paid.asked)
+            unasked.blame_straggler([one for one, key in owed if key == paid.key])
         else:
             node.unheard = 0  # heard, if late: whatever else it owes, it is asked for itself
             first_byte = unasked.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency

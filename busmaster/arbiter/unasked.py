@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from math import inf
 
 from busmaster.arbiter.counters import LineCounters
@@ -116,11 +117,11 @@ class UnaskedBytes:
             self._straggler = (self.unanswered_one, now, self._looked, self._look_at)
             self.unanswered_one = None
 
-    def blame_straggler(self, node: NodeRecord, asked: float) -> None:
-        """Blame the node whose reply to the unanswered request was found in what came. Bytes that nobody is known to
-        have sent raise nothing: noise would make healthy nodes slow."""
+    def blame_straggler(self, owing: Sequence[NodeRecord | None]) -> None:
+        """Blame the node that did not answer last, if it is one of those who owed the reply that was found.
+        Bytes that are no such reply raise nothing: noise would make healthy nodes slow."""
         straggler, self._straggler = self._straggler, None
-        if straggler is not None and straggler[0][:2] == (node, asked):
+        if straggler is not None and straggler[0][0] in owing:
             self.unanswered_one, first_byte, self._looked, self._look_at = straggler
             self.blame(first_byte)
 

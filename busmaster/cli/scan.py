@@ -22,6 +22,8 @@ from busmaster.outputs.values import utc
 from busmaster.registry import protocols
 from busmaster.service.remote import RemoteBus
 
+SILENCE = 0.1
+"""Seconds behind the last bytes after which the line knows whose they were, with time to spare."""
 STRANGERS = 16
 """How many nodes that do not answer are asked in another protocol."""
 
@@ -60,7 +62,8 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
                         emit(found if as_json else f"{node.address} {outcome}")
                 bar.advance()
         if silent:
-            await anyio.sleep(connection.lateness)  # so long the last one's answer may still take
+            # so long the last one's answer may still take, and the silence behind it shows whose it was
+            await anyio.sleep(connection.lateness + SILENCE)
         late.tell()
         for line in [line async for line in in_other_protocols(bus, connection.profile, silent)]:
             note(line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,7 +35,9 @@ def test_what_it_finds_is_a_file_that_runs(busmaster: Command, unknown: PtyServe
     file = load(path)
     assert file.port.settings == LineSettings(9600)
     assert {name: node.address for name, node in file.nodes.items()} == {"node1": 1, "node3": 3}
-    run = ended_once(lambda lines: '"node1/1": {"value": 0' in lines[-1], "run", str(path), "--json")
+    run = ended_once(
+        lambda lines: json.loads(lines[-1])["samples"]["node1/1"]["value"] == 0, "run", str(path), "--json"
+    )
     assert run.status == 130, run.err
 
 

@@ -93,7 +93,7 @@ def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None
     cycles = [cycle for cycle in map(json.loads, ran.lines) if cycle["group"] == "fast"]
     assert [cycle["cycle"] for cycle in cycles] == list(range(1, len(cycles) + 1))
     assert cycles[0]["samples"].keys() == {"winder/force", "drive2/1", "drive3/1"}
-    assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "error", "late"}
+    assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "quality", "error", "late"}
 
 
 def test_run_takes_another_port_and_records_the_line(line: Path, controllers: TcpServer) -> None:
@@ -151,7 +151,7 @@ def test_a_file_that_is_wrong_is_one_line_that_names_line_and_key_and_status_2(
         (
             "period = 0.02",
             "period = 0",
-            "12: groups.fast.period: poll group 'fast': a period is 0.001 to 86400 s 0.001 s, not 0",
+            "12: groups.fast.period: poll group 'fast': a period is 0.001 to 86400 s, not 0",
         ),
         (
             "[groups.slow]",

@@ -20,6 +20,7 @@ PICTURE = re.compile(r"!\[[^\]]*\]\(([^)\s]+)\)|\bsrc(?:set)?=\"([^\"]+)\"")
 REASONS = (
     "needs root",
     "needs hardware",
+    "needs openssl",
     "needs the network",
     "needs another machine",
     "needs a browser",

@@ -36,7 +36,10 @@ class Holding:
     samples: dict[tuple[str, Any], Any] = field(default_factory=dict)
     """What each held, by key and by what tells it from the others of its point: its time, say."""
 
-    def add(self, key: str, mark: Any, value: Any, error: object) -> None:
+    def add(self, key: str, mark: Any, value: Any, error: object, quality: str = "") -> None:
+        """Take a sample. A stale row that only says again what a write has made old is none."""
+        if quality == "stale" and (key, value) in self.values:
+            return
         if (key, mark) in self.samples:
             self.twice += 1
             return
@@ -52,7 +55,8 @@ def of_csv(texts: Iterable[str]) -> Holding:
     for text in texts:
         for row in csv.DictReader(io.StringIO(text)):
             if row["error"] is not None:  # else a half line of a crash
-                held.add(f"{row['node']}/{row['item']}", row["time"], number(row["value"]), row["error"])
+                name = f"{row['node']}/{row['item']}"
+                held.add(name, row["time"], number(row["value"]), row["error"], row["quality"])
     return held
 
 
@@ -65,7 +69,7 @@ def of_jsonl(texts: Iterable[str]) -> Holding:
             held.events.append(fields["event"])
         else:
             for key, sample in fields["samples"].items():
-                held.add(key, fields["due"], sample["value"], sample["error"])
+                held.add(key, fields["due"], sample["value"], sample["error"], sample["quality"])
     return held
 
 
@@ -73,11 +77,11 @@ def of_sqlite(paths: Iterable[Path]) -> Holding:
     held = Holding()
     for path in paths:
         with closing(sqlite3.connect(path, timeout=30.0)) as database:
-            for node, item, moment, value, error in database.execute(
-                "select node, item, time, value, error from samples join points on points.id = samples.point"
+            for node, item, moment, value, error, quality in database.execute(
+                "select node, item, time, value, error, quality from samples join points on points.id = samples.point"
                 " order by samples.rowid"
             ):
-                held.add(f"{node}/{item}", moment, value, error)
+                held.add(f"{node}/{item}", moment, value, error, quality)
             held.events += [text for [text] in database.execute("select text from events order by rowid")]
             held.writes += [(str(mark), out) for mark, out in database.execute("select id, outcome from audit")]
     return held
