@@ -183,6 +183,10 @@ class InStep:
             ):
                 yield debt.node
 
+    def owed(self) -> list[tuple[NodeRecord | None, bytes]]:
+        """Return the node and the key of each debt."""
+        return [(debt.node, debt.key) for debt in self.debts]
+
     def owes_lone_byte(self) -> bool:
         """Return whether a reply of one byte is overdue, or anything that could be one."""
         return any(len(debt.key) < 2 for debt in self.debts)
@@ -235,13 +239,11 @@ class InStep:
             self._forgiven = [entry for entry in self._forgiven if not _is(run, entry[0])]
             return None
         recent = {key for answers in self.recent for key in answers}
-        if any(len(key) > 1 and key in rest for key in recent):
+        contained = any(len(key) > 1 and key in rest for key in recent)
+        alike = any(_is(rest, key) for key in recent)
+        if contained or (alike and not payers):
             self.said_twice(now)
-            if payers or not any(_is(rest, key) for key in recent):
-                self.owe((ANY_BYTE,), None, now, now)
-        elif not payers and any(_is(rest, key) for key in recent):
-            self.said_twice(now)
-        else:
+        if payers or not alike:
             self.owe((ANY_BYTE,), None, now, now)
         return payers[0] if payers else None
 

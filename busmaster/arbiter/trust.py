@@ -96,7 +96,7 @@ class Trust:
         if ours:
             self._in_step.owe((ANY_BYTE,), None, now, now)
             return None
-        owed = [(debt.node, debt.key) for debt in self._in_step.debts]
+        owed = self._in_step.owed()
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is None or node is None or len(paid.key) < 2:

@@ -123,6 +123,9 @@ class AnyStep:
     def debts(self) -> Sequence[str]:
         return ("a debt",) if choose(2) else ()
 
+    def owed(self) -> list[Any]:
+        return []
+
     def nothing(self, *arguments: Any) -> None:
         pass
 
