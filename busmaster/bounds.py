@@ -60,9 +60,17 @@ HELLO_WITHIN = 10.0
 SEND_WITHIN = 20.0
 """Seconds in which the other end must take a message: a connection that does not is closed."""
 MOST_CLIENTS = 64
-"""Clients at a time."""
+"""Clients of all roles at a time, without those in reserved places."""
+RESERVED_FOR_WRITERS = 8
+"""Further places for clients of role `write`: no client of another role can take them."""
+RESERVED_FOR_ADMINS = 8
+"""Further places for clients of role `admin`: the owner's user and root, unless the line's file has another role."""
+RESERVED_FOR_SAFE = 2
+"""Further places for clients that only send the safe state (`busmaster safe`). One more closes the oldest of them that
+has not requested it."""
 MOST_STRANGERS = 64
-"""Connections from which no first message has arrived: one more closes the oldest of them."""
+"""Connections from which no first message has arrived: one more closes the oldest of the user or the address that has
+most of them."""
 MOST_REQUESTS = 256
 """Requests of one client that have not been answered."""
 MOST_URGENT = 16
@@ -94,6 +102,21 @@ LONGEST_REPLY = 5.0
 """Seconds for which a client may have the line wait for a reply: nothing else is sent meanwhile."""
 LONGEST_SUSPENSION = 86_400.0
 """Seconds for which a node can be suspended: a day. A suspension does not end with the program that asked for it."""
+
+# Logins by token or password, at whatever interface
+
+FREE_LOGINS = 5
+"""Failed logins of a peer after which nothing happens."""
+SHORTEST_LOGIN_PAUSE = 1.0
+"""Seconds after the next failed login in which the peer's logins are not checked; twice as long after each more."""
+LONGEST_LOGIN_PAUSE = 30.0
+"""Seconds of that pause, at most."""
+LOGINS_FORGOTTEN = 600.0
+"""Seconds without a failed login after which those before are forgotten."""
+MOST_LOGIN_PEERS = 1024
+"""Peers whose logins are remembered: one more has the one forgotten whose last login is oldest."""
+MOST_REPORTED = 100
+"""Peers that are counted apart between two reports of failed logins."""
 
 # Commands, by whatever interface
 

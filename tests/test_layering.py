@@ -89,7 +89,7 @@ OPEN: dict[str, set[str]] = {
     "bounds": {""},
     "errors": {""},
     "files": {""},
-    "gate": {"gate", "payload", "permission", "record", "rights"},
+    "gate": {"gate", "payload", "permission", "record", "refusals", "rights"},
     "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},

@@ -105,6 +105,8 @@ class Running:
         entered = False
         self.line.outputs.tell = self._tell_of_output
         service = service_of(self.line)  # now: it keeps what happens as the line is opened
+        if service is not None:
+            service.tell = self._tell_of_refusals
         try:
             async with self.line:
                 entered = True
@@ -184,6 +186,11 @@ class Running:
     def _tell_of_output(self, text: str) -> None:
         down = any(counts.error for counts in self.line.outputs.statistics())
         self.watch.announce(text, Level.WARNING if down else Level.NOTICE)
+
+    def _tell_of_refusals(self, text: str) -> None:
+        """Report what the service refused, unless the screen shows it among the events of the line."""
+        if self.watch.may_print():
+            note(text, Level.WARNING)
 
     def _why(self) -> str:
         """Return what ends the run."""

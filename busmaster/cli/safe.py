@@ -52,7 +52,7 @@ def command(path: str, port: str | None, capture: str | None) -> int:
         if capture is not None:
             note(f"{owner.port} is a line of another program: it is recorded there, not by --capture", Level.WARNING)
         tell_owner(owner)
-        return until_ended(leave_through, connect(owner.address), line.safe_state.values)
+        return until_ended(leave_through, connect(owner.address, safe_only=True), line.safe_state.values)
 
 
 @contextmanager

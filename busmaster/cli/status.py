@@ -11,7 +11,7 @@ import click
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import json_option
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import columns, emit, emit_all, json_line, note
+from busmaster.cli.output import Level, columns, emit, emit_all, json_line, note
 from busmaster.errors import BusError
 from busmaster.outputs.values import utc
 from busmaster.service.folder import Owner, owners
@@ -27,7 +27,8 @@ NOT_FOR_US = "not for this user"
 def command(as_json: bool) -> int:
     """List the lines that programs of this user serve, and those of the system in /run/busmaster: name, port, process,
     programs that use it, how busy it is, or that it is offline, and how many of its nodes are up. The exit status is 1
-    if one does not answer; one that is not for this user is listed as such.
+    if one does not answer; one that is not for this user is listed as such. Connections that were refused because no
+    place was free, and logins that failed, are named on standard error.
     """
     return until_ended(status, as_json)
 
@@ -41,6 +42,9 @@ async def status(as_json: bool) -> int:
         note("no line of this user is served: start busmaster run LINE.toml")
     else:
         emit(*columns([("NAME", "PORT", "PROCESS", "PROGRAMS", "BUSY", "NODES UP"), *map(cells, lines)], {2, 3, 4, 5}))
+    for line in () if as_json else lines:
+        if text := refused_text(line):
+            note(f"{line['name']}: {text}", Level.WARNING)
     return FAILED if any(line["error"] not in (None, NOT_FOR_US) for line in lines) else OK
 
 
@@ -48,12 +52,15 @@ async def ask(owner: Owner) -> dict[str, Any]:
     """Return how a line is, or why its owner does not say so."""
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
     line |= {"tcp": None, "programs": None, "utilisation": None, "state": None}
+    line |= {"refused_connections": None, "failed_logins": None}
     line |= {"up": None, "nodes": None, "error": None}
     line["time"] = utc(time.time())
     try:
         async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
             nodes, line["tcp"] = remote.about["nodes"], remote.about["tcp"]
             line["programs"] = remote.about["clients"] - 1  # without this one
+            for count in ("refused_connections", "failed_logins"):
+                line[count] = remote.about.get(count)
             line["state"] = remote.about.get("state", "ready")
             line["up"] = 0 if line["state"] == "offline" else sum(node["health"] == "up" for node in nodes)
             line["nodes"] = len(nodes)
@@ -64,6 +71,12 @@ async def ask(owner: Owner) -> dict[str, Any]:
         else:
             line["error"] = error.what if isinstance(error, BusError) else "it does not answer"
     return line
+
+
+def refused_text(line: dict[str, Any]) -> str:
+    """Return what the owner of a line has refused since it runs, "" for nothing."""
+    names = {"refused_connections": "connections refused, as no place was free", "failed_logins": "logins failed"}
+    return ", ".join(f"{line[count]} {name}" for count, name in names.items() if line[count])
 
 
 def cells(line: dict[str, Any]) -> tuple[str, ...]:

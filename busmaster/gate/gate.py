@@ -28,6 +28,7 @@ from busmaster.errors import (
 )
 from busmaster.gate.permission import EVERYTHING, Access, Permission
 from busmaster.gate.record import Outcome, WriteRecord, cut, this_user
+from busmaster.gate.refusals import Refusals
 
 FRESH = 1.0
 """Seconds for which a command may wait that does not say until when it is meant."""
@@ -151,6 +152,8 @@ class Gate:
         self.on_access: list[Callable[[], None]] = []
         """Called when other roles or tokens hold."""
         self.record: Callable[[WriteRecord], Durable] = lambda _: None
+        self.refusals = Refusals()
+        """Connections and logins that were refused, at whatever interface."""
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
         self._log.addHandler(logging.NullHandler())

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from busmaster.arbiter.transaction import BACKGROUND, COMMAND, POLL, URGENT, Priority
+from busmaster.bounds import RESERVED_FOR_ADMINS, RESERVED_FOR_WRITERS
 
 
 class Role(enum.Enum):
@@ -34,7 +35,8 @@ class Rights:
     file does not have. `budgeted`: a node that only such programs name, and that has never replied, is asked within the
     budget of probes (R11). `own_times`: reply times may exceed those of the protocol's document.
     `demand_every`: periods of a group between two cycles that programs of the role demand; 0: no limit.
-    `groups`: how many poll groups it may have. `writes`: it may write, pause a group, suspend a node and hold the line
+    `groups`: how many poll groups it may have. `reserved`: connections that only programs of the role can have, beyond
+    those that all roles share. `writes`: it may write, pause a group, suspend a node and hold the line
     for a sequence, where `allow_writes` lets it write.
     """
 
@@ -46,6 +48,7 @@ class Rights:
     own_times: bool
     demand_every: int
     groups: int
+    reserved: int
     writes: bool
 
 
@@ -61,6 +64,7 @@ RIGHTS = {
         own_times=False,
         demand_every=8,
         groups=8,
+        reserved=0,
         writes=False,
     ),
     WRITE: Rights(
@@ -72,6 +76,7 @@ RIGHTS = {
         own_times=False,
         demand_every=2,
         groups=32,
+        reserved=RESERVED_FOR_WRITERS,
         writes=True,
     ),
     ADMIN: Rights(
@@ -83,6 +88,7 @@ RIGHTS = {
         own_times=True,
         demand_every=0,
         groups=32,
+        reserved=RESERVED_FOR_ADMINS,
         writes=True,
     ),
 }
@@ -100,6 +106,7 @@ def table() -> list[str]:
         "reply times of a new node": lambda r: "any, up to 5 s" if r.own_times else "at most the protocol's",
         "`demand`": lambda r: f"one cycle in {r.demand_every} periods, for all" if r.demand_every else "yes",
         "own poll groups": lambda r: f"{r.groups}, in {r.polls.name}",
+        "reserved connections": lambda r: f"{r.reserved}" if r.reserved else "none",
         "pause, suspend": lambda r: "where it may write" if r.writes else "no",
         "write": lambda r: "yes, or `allow_writes`" if r.writes else "no",
         "exclusive": lambda r: "where it may write" if r.writes else "no",

@@ -259,7 +259,7 @@ class Distributor:
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput
 
-                return MetricsOutput(kind, settings, self._bus, self._say, self.statistics)
+                return MetricsOutput(kind, settings, self._bus, self._say, self.statistics, self.gate.refusals)
             case _:
                 raise AssertionError(settings)
 

@@ -19,6 +19,8 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
+from busmaster.gate.refusals import INTERFACES, Refusals
+from busmaster.gate.rights import Role
 from busmaster.outputs.base import Output, OutputStatistics, check_extra
 from busmaster.outputs.scrapes import listening, page, serve
 from busmaster.outputs.settings import MetricsSettings
@@ -83,6 +85,7 @@ class MetricsOutput(Output):
         bus: Bus,
         say: Callable[[str], None] = lambda _: None,
         outputs: Callable[[], Sequence[OutputStatistics]] = tuple,
+        refusals: Refusals | None = None,
     ) -> None:
         check_extra("prometheus_client", "metrics")
         super().__init__(kind, settings, say)
@@ -91,6 +94,7 @@ class MetricsOutput(Output):
         self._host = settings.host
         self._bus = bus
         self._others = outputs
+        self._refusals = refusals or Refusals()
         self._owner: asyncio.AbstractEventLoop | None = None
         self._utilisation = RecentUtilisation(UTILISATION_WINDOW)
 
@@ -139,6 +143,7 @@ class MetricsOutput(Output):
         yield from self._of_groups()
         yield from self._of_points()
         yield from self._of_outputs()
+        yield from self._of_refusals()
         self.offered += 1
         self.written = self.offered
 
@@ -294,6 +299,22 @@ class MetricsOutput(Output):
             suppressed.add_metric([counts.kind], counts.suppressed)
             up.add_metric([counts.kind], float(not counts.error))
         yield from (written, dropped, waiting, spilled, suppressed, up)
+
+    def _of_refusals(self) -> Iterator[Metric]:
+        from prometheus_client.core import CounterMetricFamily
+
+        connections = CounterMetricFamily(
+            "busmaster_connections_refused", "Connections for which no place was free, by role", labels=["role"]
+        )
+        logins = CounterMetricFamily(
+            "busmaster_logins_failed", "Logins that failed, by interface: service, web, opcua", labels=["interface"]
+        )
+        refused, failed = self._ask(lambda: (dict(self._refusals.connections), dict(self._refusals.logins)))
+        for role in (*(role.value for role in Role), "safe"):
+            connections.add_metric([role], refused.get(role, 0))
+        for interface in INTERFACES:
+            logins.add_metric([interface], failed.get(interface, 0))
+        yield from (connections, logins)
 
 
 def number_of(value: object) -> float | None:

@@ -30,6 +30,8 @@ from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, profile_of, protocol_of, said_statistics
 
 NodeKey = tuple[str, int]
+FOR_SAFE_STATE = ("safe", "cancel")
+"""Methods of a program that has a place for the safe state."""
 
 
 def _reads_of(role: Role) -> RequestOptions:
@@ -37,10 +39,17 @@ def _reads_of(role: Role) -> RequestOptions:
 
 
 class Client:
-    """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for."""
+    """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for.
 
-    def __init__(self, line: ServedLine, peer: Peer, number: int, outbox: Outbox) -> None:
+    `in_safe_place`: it has one of the places for programs that only send the safe state, and nothing else is done for
+    it.
+    """
+
+    def __init__(
+        self, line: ServedLine, peer: Peer, number: int, outbox: Outbox, *, in_safe_place: bool = False
+    ) -> None:
         self.peer = peer
+        self.in_safe_place = in_safe_place
         self.dropped: dict[Hashable, int] = {}
         """Of each stream, how many messages the client was too slow for."""
         self.outbox = outbox
@@ -134,6 +143,8 @@ class Client:
         number, method, params = said.get("id"), said.get("method"), said.get("params", {})
         if not isinstance(method, str) or not isinstance(params, dict):
             raise Malformed("a message has a method, and its parameters by name")
+        if self.in_safe_place and method not in FOR_SAFE_STATE:
+            raise Malformed("all other places are taken: this program can send the safe state, and nothing else")
         if number is None:
             try:
                 self._notified(method, params)

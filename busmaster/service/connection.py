@@ -6,12 +6,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from busmaster.bounds import SEND_WITHIN
 from busmaster.errors import InvalidCommand
+from busmaster.gate.refusals import peer_of
 from busmaster.service.frames import NO_MASK, look_at, new_key, text_frame
+from busmaster.service.peers import CREDENTIALS
 
 if TYPE_CHECKING:
     from websockets.client import ClientProtocol
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
 
 PING_EVERY = 20.0
 """Seconds between two pings. One that says nothing at all between two of them is let go."""
+LONGEST_REFUSAL = 300
+"""Bytes of the words of a refusal that are shown."""
 CLOSE_WITHIN = 1.0
 """Seconds that the other end has to hear the last of it."""
 NORMAL, GOING_AWAY, NO_TEXT, POLICY = 1000, 1001, 1007, 1008
@@ -278,6 +283,12 @@ class ServedConnection(Connection):
         server = check_installed()[0]
         core = server(origins=[None], max_size=longest, logger=_quiet())
         super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
+        self.origin: int | str | None = None
+        """Where the connection comes from: the number of a user, or an address of the network."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.origin = origin_of(transport.get_extra_info("socket"))
+        super().connection_made(transport)
 
     def _shake_hands(self, event: Request) -> None:
         refusal = self._hearer.refusal(event)
@@ -315,6 +326,13 @@ class AskingConnection(Connection):
         return None if response is None else int(response.status_code)
 
     @property
+    def refusal(self) -> str:
+        """Return the words with which the other end did not let us in, "" if it said none."""
+        body = getattr(getattr(self._core.handshake_exc, "response", None), "body", None)
+        text = bytes(body or b"")[:LONGEST_REFUSAL].decode(errors="replace").strip()
+        return text if text.isprintable() else ""
+
+    @property
     def complaint(self) -> str | None:
         """Return why the other end cannot be spoken with, None as long as it can."""
         return None if self._core.handshake_exc is None else str(self._core.handshake_exc)
@@ -342,6 +360,18 @@ class AskingConnection(Connection):
     def _shake_hands(self, event: Response) -> None:
         if self._core.state == _OPEN:
             self._open()
+
+
+def origin_of(connected: socket.socket) -> int | str | None:
+    """Return the number of the user that has connected a Unix socket, or the address of a peer of the network."""
+    try:
+        if connected.family == socket.AF_UNIX:
+            size = CREDENTIALS.size
+            user: int = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))[1]
+            return user
+        return peer_of(str(connected.getpeername()[0]))
+    except OSError:  # it has gone already
+        return None
 
 
 def check_installed() -> tuple[type[ServerProtocol], type[ClientProtocol], Callable[[str], Any]]:

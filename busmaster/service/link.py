@@ -33,6 +33,7 @@ ENDED = "the program that owns the line has ended"
 READ_AT_ONCE = 1 << 16
 TCP = "tcp://"
 GONE = "the connection to the program that owns the line was lost"
+NO_PLACE = "see busmaster status; where no place is free, end a program that uses the line"
 AGAIN = "see whether it runs, and connect again"
 
 
@@ -86,8 +87,11 @@ class Link:
         token: str | None,
         on_news: Callable[[str, Mapping[str, Any]], None],
         on_lost: Callable[[], None],
+        *,
+        safe_only: bool = False,
     ) -> None:
         self.address = address
+        self._safe_only = safe_only
         self._token = token
         self._on_news = on_news
         self._on_lost = on_lost
@@ -104,7 +108,9 @@ class Link:
         where, place = _where(self.address)
         loop = asyncio.get_running_loop()
         self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
-        params = {"versions": list(VERSIONS), "program": program}
+        params: dict[str, Any] = {"versions": list(VERSIONS), "program": program}
+        if self._safe_only:
+            params["safe_only"] = True
         self._waiting.appendleft((numbered(words("hello", params), 0), hello))
         try:
             async with asyncio.timeout(CONNECT_WITHIN):
@@ -235,9 +241,14 @@ class Link:
             what = f"{where} {'wants a token' if self._token is None else 'does not know this token'}"
             return LineDown(what, hint="its owner has the tokens in a file, see [service] of LINE.toml")
         if status == HTTPStatus.SERVICE_UNAVAILABLE:
-            return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
+            what = f"{where} does not let this program in: {connection.refusal if connection else ''}"
+            return LineDown(what, hint=NO_PLACE)
+        if status == HTTPStatus.TOO_MANY_REQUESTS and connection is not None:
+            return LineDown(
+                f"{where} does not check this token: {connection.refusal}", hint="correct the token, and wait"
+            )
         if farewell:
-            return LineDown(f"{where} does not let this program in: {farewell}", hint="see busmaster status")
+            return LineDown(f"{where} does not let this program in: {farewell}", hint=NO_PLACE)
         if connection is not None and isinstance(error, TimeoutError):
             what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
             return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")

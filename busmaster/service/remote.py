@@ -46,14 +46,15 @@ CLOCK_IS_HEARD = 3
 """How often, as this program, which is beginning, may be busy elsewhere when it is: its writes would seem old."""
 
 
-def connect(address: str, *, token: str | None = None) -> RemoteBus:
+def connect(address: str, *, token: str | None = None, safe_only: bool = False) -> RemoteBus:
     """Return the bus that another program owns, for `async with`, which connects.
 
     `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them; or
     `tcp://HOST:PORT`, where a `token` that the line's owner knows may be needed. The token goes over the network as it
-    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes.
+    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes. `safe_only`: the program does
+    nothing but `enter_safe_state`, and is admitted also where no other place is free.
     """
-    return RemoteBus(address, token=token)
+    return RemoteBus(address, token=token, safe_only=safe_only)
 
 
 class RemoteBus:
@@ -66,13 +67,14 @@ class RemoteBus:
     would not take. A lost connection is not made again: enter a new RemoteBus.
     """
 
-    def __init__(self, address: str, *, token: str | None = None) -> None:
+    def __init__(self, address: str, *, token: str | None = None, safe_only: bool = False) -> None:
         if token is not None and not address.startswith(TCP):
             raise InvalidCommand(f"{address} takes no token: it is for tcp://HOST:PORT")
         if token is not None and not (token.isascii() and token.isprintable() and token.split() == [token]):
             raise InvalidCommand("a token is of letters, digits and signs, without spaces")
         self.address = address
         self._token = token
+        self._safe_only = safe_only
         self.line = ""
         """The name of the line's port, once it is entered."""
         self.about: Mapping[str, Any] = {}
@@ -103,7 +105,7 @@ class RemoteBus:
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
             raise InvalidCommand(f"the bus of {self.address} was entered already: enter it once, and share it")
-        link = Link(self.address, self._token, self._hear, self._lost)
+        link = Link(self.address, self._token, self._hear, self._lost, safe_only=self._safe_only)
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
@@ -114,7 +116,8 @@ class RemoteBus:
         for node in self._named:
             self._name(node)
         try:
-            if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
+            if self.address.startswith(TCP) and not self._safe_only:
+                # another machine, perhaps: its clock began at another moment
                 self._ahead = max([await self._hear_clock() for _ in range(CLOCK_IS_HEARD)])
             for node, commands, stop in self._prepared:
                 for first in range(0, len(commands), MOST_CHECKED):

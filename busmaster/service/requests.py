@@ -46,6 +46,11 @@ class Requests:
         """Return what is to be done at its nodes."""
         return tuple(errand for errand in self._under_way.values() if errand is not None)
 
+    @property
+    def sends_safe_state(self) -> bool:
+        """Return whether the safe state is being sent for this program."""
+        return None in self._under_way.values()
+
     def begin(self, number: int, said: Mapping[str, Any] | PlainRead) -> None:
         """Have a command carried out. Raises Malformed for the number of something that is not answered yet."""
         under_way = self._under_way

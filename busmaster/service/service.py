@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import socket
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -14,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
-from busmaster.bounds import MOST_CLIENTS, MOST_STRANGERS
 from busmaster.bus.bus import Bus
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
+from busmaster.gate.refusals import Logins, wait_text
 from busmaster.registry import protocols
+from busmaster.service.admission import Admission, stranger_to_close
 from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
@@ -26,7 +30,7 @@ from busmaster.service.line import ServedLine
 from busmaster.service.messages import INVALID_PARAMS, VERSIONS, Malformed, written
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import state_text
-from busmaster.service.peers import Peer, find_name, process_of
+from busmaster.service.peers import Holder, Peer, find_name, process_of
 from busmaster.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 from busmaster.service.visit import Reception, Visit
 
@@ -39,7 +43,6 @@ HOSTS = ("localhost", "busmaster")
 MOST_WAITING_TO_CONNECT = 100
 NAME_WITHIN = 1.0
 """Seconds that the first client waits at most for this user's name: records then have his number."""
-TOO_MANY = f"{MOST_CLIENTS} programs are here already"
 
 
 class Service:
@@ -89,6 +92,11 @@ class Service:
         """Connections of which no first message has come, the oldest first."""
         self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
+        self._admission = Admission(self.gate.refusals)
+        self._logins = Logins(partial(self.gate.refusals.note_login, "service"), time.monotonic)
+        self._log = logging.getLogger("busmaster.service")
+        self.tell: Callable[[str], None] = self._log.warning
+        """Told, at most once a minute, of connections and logins that were refused."""
         self.reception = Reception()
 
     @property
@@ -148,6 +156,7 @@ class Service:
         self.line.journal.begin()
         self.bus.on_touched.append(self._tell_touched)
         self.gate.on_access.append(self._tell_access)
+        self.gate.refusals.on_report.append(self._report)
         return self
 
     async def __aexit__(
@@ -157,6 +166,7 @@ class Service:
         self.bus.on_stop.remove(self._tell_stop)
         self.bus.on_touched.remove(self._tell_touched)
         self.gate.on_access.remove(self._tell_access)
+        self.gate.refusals.on_report.remove(self._report)
         await self.line.safe_wishes.close()
         for server in self._servers:
             server.close()
@@ -177,6 +187,11 @@ class Service:
             finally:
                 self._served.__exit__(None, None, None)
                 await self.line.journal.close()
+
+    def _report(self, text: str) -> None:
+        """Report what was refused, and show it among the events of the line."""
+        self.line.journal.note(text)
+        self.tell(text)
 
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
@@ -204,10 +219,10 @@ class Service:
         return server
 
     def _visited(self) -> asyncio.BaseProtocol:
-        """Return the end of a connection that was made just now. Of strangers, the oldest goes for one too many."""
-        if len(self._strangers) >= MOST_STRANGERS:
+        """Return the end of a connection that was made just now, and close one that is one too many for it."""
+        if (one_too_many := stranger_to_close(self._strangers)) is not None:
             self.refused += 1
-            next(iter(self._strangers)).connection.abort()
+            one_too_many.connection.abort()
         visit = Visit(self)
         self._strangers[visit] = None
         return visit.connection
@@ -226,11 +241,17 @@ class Service:
         hosts, shown = headers.get_all("Host"), headers.get_all("Authorization")
         if len(hosts) != 1 or not self._is_our_name(hosts[0]):
             return HTTPStatus.FORBIDDEN, f"no such host: {', '.join(hosts)[:40]!r}\n"
-        peer = self._peer(visit.connection.transport.get_extra_info("socket"), shown)
+        peer, origin = self._peer(visit.connection.transport.get_extra_info("socket"), shown), visit.connection.origin
+        if shown and isinstance(origin, str):  # by TCP
+            wait = self._logins.judge(origin, peer.token if isinstance(peer, Holder) else None)
+            if wait:
+                return HTTPStatus.TOO_MANY_REQUESTS, f"{wait_text(wait)}\n"
         if peer is None:
             return HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n"
-        if len(self._clients) >= MOST_CLIENTS:
-            return HTTPStatus.SERVICE_UNAVAILABLE, f"{TOO_MANY}\n"
+        permission = peer.permission(self.gate.access)
+        # One that may write says in `hello` whether it only sends the safe state, which has places of its own.
+        if not permission.writes and (refusal := self._admission.refusal(permission, self._clients)):
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"{refusal}\n"
         visit.peer = peer
         return None
 
@@ -260,16 +281,17 @@ class Service:
         common = [version for version in VERSIONS if version in wanted]
         if not common:
             raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
-        if len(self._clients) >= MOST_CLIENTS:
-            raise Malformed(TOO_MANY)
         if not visit.peer.may_stay(self.gate.access):
             raise Malformed("this token is known no more")
+        permission, safe_only = visit.peer.permission(self.gate.access), params.get("safe_only") is True
+        in_safe_place = self._admission.admit(permission, self._clients, safe_only=safe_only)
 
         def drop(stream: object) -> None:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
 
         self._count += 1
-        client = Client(self.line, visit.peer, self._count, Outbox(visit.connection, drop))
+        outbox = Outbox(visit.connection, drop)
+        client = Client(self.line, visit.peer, self._count, outbox, in_safe_place=in_safe_place)
         del self._strangers[visit]
         self._clients[client] = visit
         client.outbox.put(written({"id": said.get("id"), "result": self._about(client, max(common))}))
@@ -317,6 +339,8 @@ class Service:
             "process": owner.pid,
             "read_only": client.read_only,
             "clients": len(self._clients),
+            "refused_connections": self.gate.refusals.connections.total(),
+            "failed_logins": self.gate.refusals.logins.total(),
             "state": state_text(self.bus),
             "nodes": nodes,
         }

@@ -129,7 +129,7 @@ class Visit:
             if self.client is None:
                 self.client = self._host.welcome(self, read_request(message))
                 self._stranger.cancel()
-            elif (read := plain_read_of(message)) is not None:
+            elif not self.client.in_safe_place and (read := plain_read_of(message)) is not None:
                 self.client.requests.begin(*read)
             else:
                 self.client.take(read_request(message))

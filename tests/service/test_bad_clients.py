@@ -289,21 +289,6 @@ def test_one_program_has_so_many_requests_and_a_few_urgent_ones_more(
     on_a_served_line(tmp_path, story)
 
 
-def test_so_many_programs_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("busmaster.service.service.MOST_CLIENTS", 1)
-
-    async def story(line: Served, remote: RemoteBus) -> None:
-        with pytest.raises(InvalidStatus, match="503"):
-            async with raw(line):
-                pass
-        await remote.__aexit__(None, None, None)
-        await line.alone()
-        async with raw(line):
-            pass
-
-    on_a_served_line(tmp_path, story)
-
-
 def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> None:
     way, dropped = SlowWay(), list[object]()
     outbox = Outbox(way, dropped.append)

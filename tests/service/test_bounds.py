@@ -197,7 +197,7 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
 def test_of_those_who_never_say_hello_the_oldest_goes_for_one_too_many(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("busmaster.service.service.MOST_STRANGERS", 3)
+    monkeypatch.setattr("busmaster.service.admission.MOST_STRANGERS", 3)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         path = line.address.removeprefix("unix:")

@@ -1,0 +1,83 @@
+"""Which connections the owner of a line admits.
+
+A program that may only read could otherwise take every place, and lock out writers, the owner's user and the command
+that sends the safe state.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+from busmaster.bounds import MOST_CLIENTS, MOST_STRANGERS, RESERVED_FOR_SAFE
+from busmaster.gate.permission import Permission
+from busmaster.gate.refusals import Refusals
+from busmaster.gate.rights import RIGHTS, Role
+from busmaster.service.client import Client
+from busmaster.service.messages import Malformed
+from busmaster.service.visit import Visit
+
+
+class Admission:
+    """Decides by their roles which programs are admitted, and which connections are closed for new ones.
+
+    Each role has the places that are reserved for it, and MOST_CLIENTS are for all roles. RESERVED_FOR_SAFE are for
+    programs that say in `hello` that they only send the safe state, once they find no other place.
+    """
+
+    def __init__(self, refusals: Refusals) -> None:
+        self._refusals = refusals
+
+    def refusal(self, permission: Permission, clients: Iterable[Client]) -> str:
+        """Return why a program is not admitted beside `clients`, "" if it is. A refusal is counted and reported."""
+        if self._has_place(permission.role, clients):
+            return ""
+        self._refusals.note_connection(permission.role.value)
+        return self._why_not(permission.role)
+
+    def admit(self, permission: Permission, clients: Mapping[Client, Visit], *, safe_only: bool) -> bool:
+        """Admit one more program beside `clients`, and return whether it gets a place for the safe state.
+
+        `safe_only`: it says that it only sends the safe state. Raises Malformed, saying why, if it is not admitted.
+        """
+        if self._has_place(permission.role, clients):
+            return False
+        if not (safe_only and permission.writes):
+            raise Malformed(self.refusal(permission, clients))
+        here = [client for client in clients if client.in_safe_place]
+        if len(here) >= RESERVED_FOR_SAFE:
+            idle = next((client for client in here if not client.requests.sends_safe_state), None)
+            if idle is None:
+                self._refusals.note_connection("safe")
+                raise Malformed(f"{len(here)} programs are sending the safe state already")
+            clients[idle].connection.abort()
+        return True
+
+    def _has_place(self, role: Role, clients: Iterable[Client]) -> bool:
+        """Return whether one more program of this role is admitted beside `clients`."""
+        counts = Counter(client.permission.role for client in clients if not client.in_safe_place)
+        if counts[role] < RIGHTS[role].reserved:
+            return True
+        return sum(max(0, count - RIGHTS[other].reserved) for other, count in counts.items()) < MOST_CLIENTS
+
+    def _why_not(self, role: Role) -> str:
+        """Return what a refused program is told."""
+        others = ", ".join(
+            f"{rights.reserved} more are for role {other.value}"
+            for other, rights in RIGHTS.items()
+            if rights.reserved and other is not role
+        )
+        return f"all {MOST_CLIENTS + RIGHTS[role].reserved} places for role {role.value} are taken; {others}"
+
+
+def stranger_to_close(strangers: Collection[Visit]) -> Visit | None:
+    """Return the connection without a first message that is closed for one more; None while there is room.
+
+    Of the user or the address that has most of them it is the oldest: whoever opens many closes its own.
+    """
+    if len(strangers) < MOST_STRANGERS:
+        return None
+    origins: Counter[Any] = Counter(visit.connection.origin for visit in strangers)
+    [(crowd, _)] = origins.most_common(1)
+    return next(visit for visit in strangers if visit.connection.origin == crowd)

@@ -1,0 +1,242 @@
+"""Which programs are admitted to a served line, with processes and sockets: readers cannot take every place."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+from busmaster import Hcp2Controller, bounds, connect
+from busmaster.errors import LineDown
+from busmaster.gate.permission import Access, Permission, digest_of
+from busmaster.gate.refusals import LimitedReport, Refusals
+from busmaster.gate.rights import RIGHTS, Role
+from busmaster.service.admission import stranger_to_close
+from busmaster.service.visit import Visit
+from busmaster.testing import run_in_virtual_time
+from tests.patience import PATIENCE
+from tests.service.lines import Served, raw, served, until
+
+TOKENS = {role.value: f"token-of-{role.value}-programs" for role in Role}
+ACCESS = Access(
+    tokens={role.value: Permission(f"token {role.value}", role) for role in Role},
+    secrets={name: digest_of(secret) for name, secret in TOKENS.items()},
+)
+
+
+class Crowd:
+    """Programs of a role that come by TCP, and stay."""
+
+    def __init__(self, line: Served, stack: AsyncExitStack) -> None:
+        self.line = line
+        self._stack = stack
+
+    async def come(self, role: Role) -> None:
+        assert self.line.service.tcp_address is not None
+        remote = connect(self.line.service.tcp_address, token=TOKENS[role.value])
+        await self._stack.enter_async_context(remote)
+
+    async def fill(self, role: Role) -> int:
+        """Have programs come until one is refused, and return how many are here."""
+        count, refusals = 0, list[str]()
+        while not refusals:
+            try:
+                await self.come(role)
+            except LineDown as error:
+                refusals.append(str(error))
+            else:
+                count += 1
+        assert f"places for role {role.value} are taken" in refusals[0]
+        assert "end a program that uses the line" in refusals[0]
+        return count
+
+
+Story = Callable[[Crowd], Awaitable[None]]
+
+
+def among(folder: Path, story: Story) -> None:
+    async def run() -> None:
+        async with (
+            asyncio.timeout(PATIENCE),
+            served(folder, access=ACCESS, listen=("127.0.0.1", 0)) as line,
+            AsyncExitStack() as stack,
+        ):
+            await story(Crowd(line, stack))
+
+    asyncio.run(run())
+
+
+def test_readers_do_not_lock_out_writers_and_the_owners_user(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        assert await crowd.fill(Role.READ) == bounds.MOST_CLIENTS
+        assert await crowd.fill(Role.WRITE) == bounds.RESERVED_FOR_WRITERS
+        async with connect(crowd.line.address) as own:  # by its Unix socket
+            assert await Hcp2Controller(own, 5).read(1) == 0
+        assert await crowd.fill(Role.ADMIN) == bounds.RESERVED_FOR_ADMINS
+
+    among(tmp_path, story)
+
+
+def test_writers_do_not_lock_out_admins_and_places_that_nobody_reserved_are_everybodys(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        assert await crowd.fill(Role.WRITE) == bounds.MOST_CLIENTS + bounds.RESERVED_FOR_WRITERS
+        with pytest.raises(LineDown, match="role read are taken; 8 more are for role write"):
+            await crowd.come(Role.READ)
+        assert await crowd.fill(Role.ADMIN) == RIGHTS[Role.ADMIN].reserved
+
+    among(tmp_path, story)
+
+
+def test_a_place_is_free_again_when_its_program_has_gone(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        async with AsyncExitStack() as stack:
+            await Crowd(crowd.line, stack).come(Role.READ)
+            assert await crowd.fill(Role.READ) == bounds.MOST_CLIENTS - 1
+        await until(lambda: len(crowd.line.service.clients) == bounds.MOST_CLIENTS - 1)
+        await crowd.come(Role.READ)
+
+    among(tmp_path, story)
+
+
+def test_one_that_only_sends_the_safe_state_is_admitted_when_all_places_are_taken_and_can_do_nothing_else(
+    tmp_path: Path,
+) -> None:
+    async def story(crowd: Crowd) -> None:
+        line = crowd.line
+        await crowd.fill(Role.READ)
+        await crowd.fill(Role.ADMIN)
+        with pytest.raises(LineDown, match="role admin are taken"):
+            await connect(line.address).__aenter__()
+        for said in (
+            {"method": "now", "params": {}},
+            {
+                "method": "request",
+                "params": {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}},
+            },
+            {"method": "hold", "params": {"sequence": 1, "protocol": "hcp2", "address": 5, "max_hold": 1.0}},
+        ):
+            async with raw(line, hello=False) as client:
+                assert "result" in await client.ask("hello", versions=[2], safe_only=True)
+                await client.say(**said, **({} if said["method"] == "hold" else {"id": 2}))  # as a plain read is said
+                assert "can send the safe state, and nothing else" in (await client.hear())["error"]["message"]
+        async with raw(line, hello=False) as client:
+            await client.ask("hello", versions=[2], safe_only=True)
+            # It comes as far as the gate, which knows no safe state of this line.
+            assert "knows no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
+
+    among(tmp_path, story)
+
+
+def test_of_idle_programs_in_the_places_for_the_safe_state_the_oldest_goes(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        line = crowd.line
+        await crowd.fill(Role.READ)
+        await crowd.fill(Role.ADMIN)
+        async with AsyncExitStack() as stack:
+            clients = []
+            for _ in range(bounds.RESERVED_FOR_SAFE + 1):
+                clients.append(await stack.enter_async_context(raw(line, hello=False)))
+                await clients[-1].ask("hello", versions=[2], safe_only=True)
+            with pytest.raises(ConnectionClosed):
+                await clients[0].hear()
+            for client in clients[1:]:
+                assert "error" in await client.ask("safe", writes={})
+
+    among(tmp_path, story)
+
+
+def test_a_reader_has_no_place_of_those_for_the_safe_state(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        await crowd.fill(Role.READ)
+        assert crowd.line.service.tcp_address is not None
+        with pytest.raises(LineDown, match="role read are taken"):
+            await connect(crowd.line.service.tcp_address, token=TOKENS["read"], safe_only=True).__aenter__()
+
+    among(tmp_path, story)
+
+
+def test_refused_programs_are_counted_and_reported_at_most_once_a_minute(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        told: list[str] = []
+        crowd.line.service.tell = told.append
+        for _ in range(3):
+            await crowd.fill(Role.READ)
+        assert crowd.line.gate.refusals.connections == {"read": 3}
+        assert [text.partition(":")[0] for text in told] == ["1 connection was refused, because no place was free"]
+        assert [text for _, text in crowd.line.service.line.journal.entries if "refused" in text] == told
+        async with connect(crowd.line.address) as own:
+            assert own.about["refused_connections"] == 3
+
+    among(tmp_path, story)
+
+
+def test_a_report_comes_at_once_and_then_once_a_minute_with_the_count() -> None:
+    async def run() -> None:
+        told: list[tuple[float, str]] = []
+        loop = asyncio.get_running_loop()
+        refusals = Refusals()
+        refusals.on_report.append(lambda text: told.append((loop.time() - began, text.partition(":")[0])))
+        began = loop.time()
+        for _ in range(90):
+            refusals.note_connection("read")
+            await asyncio.sleep(1)
+        await asyncio.sleep(300)
+        refusals.note_connection("write")
+        because = "refused, because no place was free"
+        assert told == [
+            (0, f"1 connection was {because}"),
+            (60, f"59 connections were {because}"),
+            (120, f"30 connections were {because}"),
+            (390, f"1 connection was {because}"),
+        ]
+
+    run_in_virtual_time(run())
+
+
+def test_what_a_report_keeps_of_many_peers_is_bounded() -> None:
+    async def run() -> None:
+        reported: list[int] = []
+        report = LimitedReport(lambda text: reported.append(int(text)), lambda counts: str(len(counts)))
+        report.note("first")
+        for number in range(10 * bounds.MOST_REPORTED):
+            report.note(str(number))
+        await asyncio.sleep(61)
+        assert reported == [1, bounds.MOST_REPORTED + 1]
+
+    run_in_virtual_time(run())
+
+
+def test_who_opens_many_connections_and_says_nothing_closes_its_own(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        service, path = crowd.line.service, crowd.line.address.removeprefix("unix:")
+        assert service.tcp_address is not None
+        host, _, port = service.tcp_address.removeprefix("tcp://").rpartition(":")
+        own = await asyncio.open_unix_connection(path)
+        many = [await asyncio.open_connection(host, int(port)) for _ in range(3 * bounds.MOST_STRANGERS)]
+        await until(lambda: service.refused == 2 * bounds.MOST_STRANGERS + 1)
+        assert service.strangers == bounds.MOST_STRANGERS
+        assert os.getuid() in {visit.connection.origin for visit in service._strangers}
+        own[1].write(b"x\r\n\r\n")  # it is still heard
+        await own[0].read()
+        for _, writer in (own, *many):
+            writer.transport.abort()
+
+    among(tmp_path, story)
+
+
+def test_of_strangers_the_oldest_of_the_crowd_is_closed_once_there_are_too_many() -> None:
+    def stranger(origin: str) -> Any:
+        visit = Visit.__new__(Visit)
+        visit.connection = type("Connection", (), {"origin": origin})()
+        return visit
+
+    one, *crowd = [stranger("alone"), *(stranger("crowd") for _ in range(bounds.MOST_STRANGERS - 2))]
+    assert stranger_to_close([one, *crowd]) is None
+    last = stranger("another")
+    assert stranger_to_close([one, *crowd, last]) is crowd[0]
