@@ -239,7 +239,7 @@ class Choice:
     def _other_probe(self, probe: Transaction, now: float) -> Chosen | None:
         """Have a probe ask the same dead node for something that is not owed. Returns None where there is nothing."""
         node = probe.node
-        for command in checks_of(node):
+        for command in node.checks():
             exchange = command.open(node.address, node.timings)
             if not self._in_step.clashes(exchange.answers, now, node):
                 probe.command = command
@@ -298,7 +298,7 @@ class Choice:
 def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
     """Yield the reads of these nodes whose answers are fit to prove something."""
     for node in nodes:
-        for command in checks_of(node):
+        for command in node.checks():
             exchange = command.open(node.address, node.timings)
             if not unfit(exchange.answers, node):
                 yield node, command, exchange
@@ -309,14 +309,6 @@ def _is_decisive(chosen: Chosen) -> bool:
     transaction, exchange = chosen
     last = transaction.retried >= transaction.retries and not transaction.probe
     return transaction.writes or not exchange.answered or last
-
-
-def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
-    """Yield cheap reads of a node: those that it has answered, then those of its protocol that it does not refuse."""
-    yield from node.answered.values()
-    for command in node.profile.checks:
-        if not node.refuses(command):
-            yield command
 
 
 def _opened(transaction: Transaction) -> Exchange[Any] | None:

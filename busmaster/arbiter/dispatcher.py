@@ -253,7 +253,7 @@ class Dispatcher:
         node = transaction.node
         node.counters.refused += 1
         if not transaction.writes:
-            node.note_refused(transaction.command)
+            node.note_refused(transaction.command, certain)
         transaction.unsure = transaction.unsure or not certain
         again = refusal.confirm if certain else not transaction.writes or transaction.idempotent
         if again and not transaction.refusals and not transaction.probe and self.is_wanted(transaction):

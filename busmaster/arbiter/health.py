@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from math import inf
 from typing import Any
 
@@ -67,6 +67,7 @@ class NodeRecord:
 
     __slots__ = (
         "_before_raised",
+        "_perhaps_refused",
         "_refused",
         "address",
         "answered",
@@ -135,7 +136,9 @@ class NodeRecord:
         self.answered: dict[Sequence[bytes], Command[Any]] = {}
         """A few reads that it has answered, by what their answers look like (R15)."""
         self._refused: dict[Command[Any], int] = {}
-        """How often it has refused a check since it has answered it."""
+        """How often it has refused a check for certain since it has answered it."""
+        self._perhaps_refused: dict[Command[Any], None] = {}
+        """The checks that were last answered with a NAK that may have been another request's (R15)."""
         self.unheard = 0
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
@@ -154,8 +157,9 @@ class NodeRecord:
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """Note that the node has answered this command rightly, after `took` seconds."""
         self.unheard = 0
-        if self._refused:
+        if self._refused or self._perhaps_refused:
             self._refused.pop(command, None)
+            self._perhaps_refused.pop(command, None)
         # Up at once, down slowly: it decides which answers are believed (R15), and one slow reply among many fast ones
         # is what it must not forget.
         slowest = self.slowest
@@ -172,18 +176,32 @@ class NodeRecord:
         """Return the seconds to the first byte of a reply that is no later than usual; `unknown` if none was timed."""
         return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
 
-    def note_refused(self, command: Command[Any]) -> None:
+    def note_refused(self, command: Command[Any], certain: bool) -> None:
         """Note that the node has refused this read. If it has refused all checks, one of them may have been refused by
-        mistake, and all are checks again."""
-        if command in self.profile.checks:
+        mistake, and all are checks again. A refusal that is not `certain` may be another request's, and must not take
+        away what could prove that the line is in step: it only puts the check behind the others."""
+        check = command in self.profile.checks
+        if not certain:
+            if check:
+                self._perhaps_refused[command] = None
+            return
+        if check:
             self._refused[command] = min(self._refused.get(command, 0) + 1, KNOWN_TO_REFUSE)
         if all(self.refuses(check) for check in self.profile.checks):
             self._refused.clear()
         self.answered = {key: read for key, read in self.answered.items() if read != command}
 
     def refuses(self, check: Command[Any]) -> bool:
-        """Return whether the node is known to refuse a check: once may be noise, or was said to somebody else."""
+        """Return whether the node is known to refuse a check: one refusal may be noise."""
         return self._refused.get(check, 0) >= KNOWN_TO_REFUSE
+
+    def checks(self) -> Iterator[Command[Any]]:
+        """Yield cheap reads of this node: those that it has answered, then those of its protocol that it does not
+        refuse, those last that it may have refused."""
+        yield from self.answered.values()
+        checks = [check for check in self.profile.checks if not self.refuses(check)]
+        yield from (check for check in checks if check not in self._perhaps_refused)
+        yield from (check for check in checks if check in self._perhaps_refused)
 
     def raise_lateness(self, lateness: float, now: float) -> None:
         """Raise the node's lateness to at least `lateness` seconds: it was slower than was believed."""

@@ -11,8 +11,7 @@
   explored. Checks are one read of each node.
 - Whose turn it is, of those who wait in a class: anybody's may be next. What a turn costs is counted by nobody.
 - Whether the line has been noisy for too long: with NOISE it may be or not, at each stray byte; without, it never is.
-- Where R15 is not set aside, its spans are what the world says. They are shorter: fewer debts at a time. A node may
-  refuse any request, but it is never known to refuse a check: where it refuses all but one, a debt is forgiven.
+- Where R15 is not set aside, its spans are what the world says. They are shorter: fewer debts at a time.
 """
 
 from __future__ import annotations
@@ -187,7 +186,6 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(alike, "LONGEST_STEADY", setup.alike + 1)
     put(alike.Alike, "_was_untimely", _may_be_untimely)
     put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
-    put(NodeRecord, "note_refused", _refuses_no_check)
     put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup))
     if setup.learned is not None:
         for owner, name, stand_in in learned_windows(setup):
@@ -213,11 +211,6 @@ def _untimed(right: Callable[..., None]) -> Callable[..., None]:
         right(node, answers, command, 0.0)
 
     return note_reply
-
-
-def _refuses_no_check(node: NodeRecord, command: Command[Any]) -> None:
-    """No check is known to be refused: see the top."""
-    node.answered = {key: read for key, read in node.answered.items() if read != command}
 
 
 class Looked:
