@@ -252,14 +252,15 @@ class Dispatcher:
         `certain`, it may be an earlier request's (R15): a read is asked once more; a write was perhaps carried out."""
         node = transaction.node
         node.counters.refused += 1
-        if not transaction.writes:
-            node.note_refused(transaction.command, certain)
         transaction.unsure = transaction.unsure or not certain
         again = refusal.confirm if certain else not transaction.writes or transaction.idempotent
         if again and not transaction.refusals and not transaction.probe and self.is_wanted(transaction):
             transaction.refusals += 1
             self._requeue(transaction, now)
             return
+        # A NAK that may be noise, or another request's, takes nothing away that could prove that the line is in step.
+        if certain and not transaction.writes and (transaction.refusals or not refusal.confirm):
+            node.note_refused(transaction.command)
         node.last_reply = now  # a refusal is an answer too (R11)
         if node.health is not UP:
             self._watch.heard(node, now)

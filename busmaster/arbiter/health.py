@@ -38,8 +38,6 @@ SILENT = 2
 """Attempts in a row without a byte after which a node is not asked whether it is in step."""
 MOST_ANSWERED = 3
 """Commands that are remembered of a node because it has answered them."""
-KNOWN_TO_REFUSE = 2
-"""Refusals of a check, none of them followed by an answer to it, after which it is not asked for any more."""
 SLOWER, SLOWER_BY = 1.25, 0.001
 """A reply is later than its node usually is if it takes so many times its slowest one, and so many seconds."""
 SLOWEST_DECAY = 0.002
@@ -67,7 +65,6 @@ class NodeRecord:
 
     __slots__ = (
         "_before_raised",
-        "_perhaps_refused",
         "_refused",
         "address",
         "answered",
@@ -135,10 +132,8 @@ class NodeRecord:
         """How often it was told to stop: what was decided before must not undo it."""
         self.answered: dict[Sequence[bytes], Command[Any]] = {}
         """A few reads that it has answered, by what their answers look like (R15)."""
-        self._refused: dict[Command[Any], int] = {}
-        """How often it has refused a check for certain since it has answered it."""
-        self._perhaps_refused: dict[Command[Any], None] = {}
-        """The checks that were last answered with a NAK that may have been another request's (R15)."""
+        self._refused: set[Command[Any]] = set()
+        """The checks that it has refused for certain, and not answered since."""
         self.unheard = 0
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
@@ -157,9 +152,8 @@ class NodeRecord:
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """Note that the node has answered this command rightly, after `took` seconds."""
         self.unheard = 0
-        if self._refused or self._perhaps_refused:
-            self._refused.pop(command, None)
-            self._perhaps_refused.pop(command, None)
+        if self._refused:
+            self._refused.discard(command)
         # Up at once, down slowly: it decides which answers are believed (R15), and one slow reply among many fast ones
         # is what it must not forget.
         slowest = self.slowest
@@ -176,32 +170,22 @@ class NodeRecord:
         """Return the seconds to the first byte of a reply that is no later than usual; `unknown` if none was timed."""
         return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
 
-    def note_refused(self, command: Command[Any], certain: bool) -> None:
-        """Note that the node has refused this read. If it has refused all checks, one of them may have been refused by
-        mistake, and all are checks again. A refusal that is not `certain` may be another request's, and must not take
-        away what could prove that the line is in step: it only puts the check behind the others."""
-        check = command in self.profile.checks
-        if not certain:
-            if check:
-                self._perhaps_refused[command] = None
-            return
-        if check:
-            self._refused[command] = min(self._refused.get(command, 0) + 1, KNOWN_TO_REFUSE)
-        if all(self.refuses(check) for check in self.profile.checks):
+    def note_refused(self, command: Command[Any]) -> None:
+        """Note that the node has refused this read for certain: it is no check any more. If the node has refused all
+        checks, all are checks again."""
+        if command in self.profile.checks:
+            self._refused.add(command)
+        if self._refused.issuperset(self.profile.checks):
             self._refused.clear()
         self.answered = {key: read for key, read in self.answered.items() if read != command}
 
-    def refuses(self, check: Command[Any]) -> bool:
-        """Return whether the node is known to refuse a check: one refusal may be noise."""
-        return self._refused.get(check, 0) >= KNOWN_TO_REFUSE
-
     def checks(self) -> Iterator[Command[Any]]:
         """Yield cheap reads of this node: those that it has answered, then those of its protocol that it does not
-        refuse, those last that it may have refused."""
+        refuse."""
         yield from self.answered.values()
-        checks = [check for check in self.profile.checks if not self.refuses(check)]
-        yield from (check for check in checks if check not in self._perhaps_refused)
-        yield from (check for check in checks if check in self._perhaps_refused)
+        for check in self.profile.checks:
+            if check not in self._refused:
+                yield check
 
     def raise_lateness(self, lateness: float, now: float) -> None:
         """Raise the node's lateness to at least `lateness` seconds: it was slower than was believed."""

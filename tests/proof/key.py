@@ -50,7 +50,7 @@ COME_AND_GO: Final = (Transaction, Owed, Ticket, Backlog, SharedBacklog, Fifo, E
 asks any more what lies in those before."""
 _ALTERS: Final = object()
 """What lies there is never left out."""
-_MADE_ANEW: Final = (list, deque, dict, bytearray)
+_MADE_ANEW: Final = (list, deque, dict, set, bytearray)
 """What lies there is usually an empty one of these."""
 
 
