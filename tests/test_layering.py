@@ -40,6 +40,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "gate.gate",
         "gate.permission",
         "gate.record",
+        "gate.refusals",
         "files",
     }
     | BASE,

@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from busmaster.bounds import MOST_SHOWN_POINTS
 from busmaster.bus.snapshots import Snapshot
+from busmaster.doors.failed_logins import FailedLogins
 from busmaster.doors.following import Following
 from busmaster.doors.opcua_access import Rules, guard
 from busmaster.doors.opcua_connections import OpcuaServer
@@ -386,7 +387,7 @@ async def serving(
     if certificate is not None:
         await load_certificate(server, *certificate)
     shown = LineServer(server, line, rules, tell)
-    guard(server, rules, shown.write)
+    guard(server, rules, shown.write, FailedLogins("opcua", line, tell).note)
     host, port = listen
     server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{port}/")
     server.socket_address = listen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -16,6 +17,7 @@ from busmaster.bounds import MOST_CONNECTIONS, MOST_SUBSCRIPTIONS
 from busmaster.doors.opcua_sessions import use_sessions
 from busmaster.doors.opcua_terms import CODES
 from busmaster.gate.permission import Access
+from busmaster.gate.refusals import Logins
 
 OPEN = [ua.SecurityPolicyType.NoSecurity]
 SIGNED = [
@@ -60,8 +62,11 @@ class Rules:
 class Users:
     """Says who somebody is: a user with the name of a token, or an anonymous one. Nobody is an administrator."""
 
-    def __init__(self, rules: Rules) -> None:
+    def __init__(self, rules: Rules, failed: Callable[[str], None] = lambda _: None) -> None:
         self._rules = rules
+        self._logins = Logins(failed, time.monotonic)
+        self.peer = ""
+        """The address of the client whose session is being activated, which the library does not hand to `get_user`."""
         self._access = Access(secrets=rules.secrets)
 
     def get_user(
@@ -77,7 +82,11 @@ class Users:
             return None
         if username is None:
             return User(role=UserRole.User)
-        if self._access.token_name(password or "") != username:
+        name = self._access.token_name(password or "")
+        wait = self._logins.judge(self.peer, name if name == username else None)
+        if wait:
+            raise ServiceError(CODES.BadServerTooBusy)
+        if wait is not None:
             return None
         return User(role=UserRole.User, name=username)
 
@@ -109,10 +118,13 @@ def _refuse(*arguments: Any) -> None:
     raise ServiceError(CODES.BadServiceUnsupported)
 
 
-def guard(server: Server, rules: Rules, write: Write) -> None:
-    """Have a server let in and through what the rules say, with encryption where it has a certificate."""
+def guard(server: Server, rules: Rules, write: Write, failed: Callable[[str], None]) -> None:
+    """Have a server let in and through what the rules say, with encryption where it has a certificate.
+
+    `failed` is told the address of each client whose login failed.
+    """
     iserver = server.iserver
-    iserver.user_manager = Users(rules)
+    iserver.user_manager = Users(rules, failed)
     use_sessions(iserver, rules.refusal)
     iserver.attribute_service = Writes(iserver.aspace, write)
     iserver.max_connections = MOST_CONNECTIONS

@@ -50,6 +50,13 @@ class Session(InternalSession):  # type: ignore[misc]  # it is untyped
 
     # The library ignores what it does not support, so that the client takes the reply for what it asked for.
 
+    def activate_session(
+        self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None
+    ) -> ua.ActivateSessionResult:
+        """Log a user in. Raises BadUserAccessDenied, and BadServerTooBusy for a peer that has failed too often."""
+        self.iserver.user_manager.peer = str(self.name[0])
+        return super().activate_session(params, peer_certificate)
+
     async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
         """Read attributes. Each node whose read is not supported has a Bad status."""
         if not params.MaxAge >= 0:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import asdict
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from busmaster.bounds import LONGEST_COMMAND, LONGEST_PAGE_MESSAGE, MOST_PAGES
 from busmaster.doors.audience import Audience, Seat
 from busmaster.doors.connections import Crowd
+from busmaster.doors.failed_logins import FailedLogins
 from busmaster.doors.following import Following, Lost
 from busmaster.doors.guard import Guard, Guarded
 from busmaster.errors import (
@@ -35,6 +38,7 @@ from busmaster.errors import (
     Refused,
 )
 from busmaster.gate.record import cut
+from busmaster.gate.refusals import Logins, wait_text
 from busmaster.service.messages import encoded
 from busmaster.service.picture import Row
 from busmaster.service.tcp import HostPort, listening
@@ -64,6 +68,7 @@ class Api:
         self._line = line
         self._guard = guard
         self._tell = tell
+        self._logins = Logins(FailedLogins("web", line, tell).note, time.monotonic)
         self._audience = Audience(line)
         self._pages = 0
 
@@ -117,10 +122,14 @@ class Api:
     async def write(self, request: Request) -> Response:
         """Write one point. The body is JSON, and says so: what a form of another site sends never is."""
         by = self._guard.writer(request.headers)
+        client = request.client.host if request.client is not None else "?"
+        if self._guard.wants_token and "authorization" in request.headers:
+            wait = self._logins.judge(client, by)
+            if wait:
+                raise HTTPException(429, wait_text(wait), {"retry-after": str(ceil(wait))})
         if by is None:
             raise HTTPException(401 if self._guard.wants_token else 403, self._why_not())
         row, value = self._row(request), await _value(request)
-        client = request.client.host if request.client is not None else "?"
         who = f"{f'token {by}' if by else 'a page'} from {client}"
         asked = f"{row.key} = {cut(repr(value))}, asked by {who}"
         try:
@@ -336,8 +345,8 @@ async def _explain(_: Request, error: Exception) -> Response:
 
 async def _explain_http(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return _json({"error": "NotServed", "what": error.detail}, error.status_code)
+    return _json({"error": "NotServed", "what": error.detail}, error.status_code, error.headers)
 
 
-def _json(said: Any, status: int = 200) -> Response:
-    return Response(encoded(said), status, media_type="application/json")
+def _json(said: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    return Response(encoded(said), status, headers, media_type="application/json")

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority
-from busmaster.bounds import MOST_CHECKED, MOST_HOLDS, MOST_NODES, MOST_POLLED, MOST_POLLED_POINTS, MOST_STREAMS
+from busmaster.bounds import (
+    LONGEST_SENDER,
+    MOST_CHECKED,
+    MOST_HOLDS,
+    MOST_NODES,
+    MOST_POLLED,
+    MOST_POLLED_POINTS,
+    MOST_REPORTED,
+    MOST_STREAMS,
+)
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
@@ -17,6 +27,7 @@ from busmaster.bus.requester import ORDINARY, Requester, RequestOptions, checked
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Permission
+from busmaster.gate.refusals import INTERFACES
 from busmaster.gate.rights import RIGHTS, Rights, Role
 from busmaster.service.errands import Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of, said_error
@@ -30,6 +41,8 @@ from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, profile_of, protocol_of, said_statistics
 
 NodeKey = tuple[str, int]
+MOST_FAILED = 1_000_000
+"""Failed logins of one peer in one message."""
 FOR_SAFE_STATE = ("safe", "cancel")
 """Methods of a program that has a place for the safe state."""
 
@@ -177,12 +190,22 @@ class Client:
                 self._hold(params)
             case "release":
                 self._release(params.get("sequence", -1))
+            case "failed_logins":
+                self._take_failed_logins(params.get("interface"), params.get("peers"))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
                 if node is not None and self.permission.covers(node):
                     node.note_stop()
                 elif node is not None:
                     self._stopping.add(node)
+
+    def _take_failed_logins(self, interface: object, peers: object) -> None:
+        """Count what an interface in another process reports. What is not a count is ignored."""
+        if interface not in INTERFACES[1:] or not isinstance(peers, dict):
+            return
+        for peer, count in islice(peers.items(), MOST_REPORTED + 1):
+            if type(count) is int and 0 < count <= MOST_FAILED and len(peer) <= LONGEST_SENDER and peer.isprintable():
+                self._line.gate.refusals.note_login(str(interface), peer, count)
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
         """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""

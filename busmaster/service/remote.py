@@ -258,6 +258,10 @@ class RemoteBus:
         """
         return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
 
+    def report_failed_logins(self, interface: str, peers: Mapping[str, int]) -> None:
+        """Tell the owner how many logins of each peer failed at an interface that this program serves: web or opcua."""
+        self.link.tell("failed_logins", {"interface": interface, "peers": dict(peers)})
+
     async def groups(self) -> tuple[str, ...]:
         """Return the names of the line's poll groups."""
         return tuple(group["name"] for group in await self._ask("groups", {}))

@@ -7,15 +7,17 @@ import json
 import socket
 import subprocess
 import urllib.request
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, closing
+from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
+from asyncua import Client, ua
 
 from busmaster import Hcp2Controller, bounds, connect
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import LineDown
-from tests.cli.conftest import Command, owner
+from tests.cli.conftest import Command, owner, started
 from tests.patience import PATIENCE
 
 READER, WRITER = "a-token-of-a-reader-1", "a-token-of-a-writer-2"
@@ -62,6 +64,129 @@ def told(process: subprocess.Popen[str], what: str) -> str:
     while what not in (line := process.stderr.readline()):
         assert line, "it ended"
     return line
+
+
+GUESSER = "127.0.0.2"
+
+
+def status_of(port: int, token: str, source: str, *, path: str, method: str = "GET", body: str = "") -> int:
+    """Return the status of a request that shows a token, from an address of this machine."""
+    headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
+    if method == "GET":
+        headers |= {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+        headers["Sec-WebSocket-Key"] = "dGhlIHNhbXBsZSBub25jZQ=="
+    connection = HTTPConnection("127.0.0.1", port, timeout=PATIENCE, source_address=(source, 0))
+    with closing(connection):
+        connection.request(method, path, body or None, headers)
+        return connection.getresponse().status
+
+
+def failed_logins(busmaster: Command) -> int:
+    count: int = json.loads(busmaster("status", "--json").out)["failed_logins"]
+    return count
+
+
+def test_who_guesses_tokens_of_the_service_is_slowed_down_counted_and_reported(
+    busmaster: Command, file: Path, metrics: int
+) -> None:
+    with owner("serve", str(file)) as (process, _):
+        tcp = json.loads(busmaster("status", "--json").out)["tcp"]
+        port = int(tcp.rpartition(":")[2])
+        statuses = [status_of(port, "x" * 16, GUESSER, path="/") for _ in range(bounds.FREE_LOGINS + 3)]
+        assert statuses == [401] * bounds.FREE_LOGINS + [429] * 3
+        assert f"1 failed login at service: 1 from {GUESSER}" in told(process, "failed login")
+        assert status_of(port, WRITER, "127.0.0.1", path="/") == 101  # from another address
+        count = len(statuses)
+        while status_of(port, WRITER, GUESSER, path="/") == 429:
+            count += 1  # until the pause is over
+        assert failed_logins(busmaster) == count
+        assert f"slitter: {count} logins failed" in busmaster("status").err
+        assert count_of(metrics, 'logins_failed_total{interface="service"}') == count
+
+
+def test_who_guesses_tokens_of_the_page_is_slowed_down_counted_and_reported(
+    busmaster: Command, file: Path, metrics: int
+) -> None:
+    tokens = str(file.with_name("tokens"))
+    with (
+        owner("serve", str(file)) as (process, address),
+        started("web", "--bind", "127.0.0.1:0", "--token-file", tokens, address) as door,
+    ):
+        try:
+            port = int(told(door, "the page is at").rpartition(":")[2].strip().strip("/"))
+            told(door, "is followed")
+            place = {"path": "/api/points/fast/winder/force", "method": "PUT", "body": '{"value": 3}'}
+            while status_of(port, WRITER, "127.0.0.1", **place) != 200:
+                pass  # until the page knows the points
+            statuses = [status_of(port, "x" * 16, GUESSER, **place) for _ in range(bounds.FREE_LOGINS + 3)]
+            assert statuses == [401] * bounds.FREE_LOGINS + [429] * 3
+            assert f"1 failed login at web: 1 from {GUESSER}" in told(door, "failed login")
+            assert status_of(port, READER, "127.0.0.1", **place) == 200
+            assert told(process, "at web: ").strip().endswith(f"from {GUESSER}")
+            while failed_logins(busmaster) < len(statuses):
+                pass
+            assert count_of(metrics, 'logins_failed_total{interface="web"}') == len(statuses)
+        finally:
+            door.kill()
+            door.communicate(timeout=PATIENCE)
+
+
+def test_who_guesses_passwords_of_opcua_is_slowed_down_counted_and_reported(
+    busmaster: Command, file: Path, metrics: int
+) -> None:
+    tokens = str(file.with_name("tokens"))
+    with (
+        owner("serve", str(file)) as (process, address),
+        started("opcua", "--bind", "127.0.0.1:0", "--token-file", tokens, "--allow", "*", address) as door,
+    ):
+        try:
+            port = int(told(door, "opc.tcp://").rpartition(":")[2].strip().strip("/"))
+
+            async def story() -> None:
+                relay, far = await relayed(port, GUESSER)
+                wrong = [await login(far, "writer", "x" * 16) for _ in range(bounds.FREE_LOGINS + 3)]
+                assert wrong == ["BadUserAccessDenied"] * bounds.FREE_LOGINS + ["BadServerTooBusy"] * 3
+                assert await login(port, "writer", WRITER) == "Good"  # from another address
+                relay.close()
+
+            asyncio.run(asyncio.wait_for(story(), PATIENCE))
+            count = bounds.FREE_LOGINS + 3
+            assert f"1 failed login at opcua: 1 from {GUESSER}" in told(door, "failed login")
+            told(process, "failed login")
+            while failed_logins(busmaster) < count:
+                pass
+            assert count_of(metrics, 'logins_failed_total{interface="opcua"}') == count
+        finally:
+            door.kill()
+            door.communicate(timeout=PATIENCE)
+
+
+async def login(port: int, user: str, password: str) -> str:
+    """Return the status with which an OPC UA server lets a user in."""
+    client = Client(f"opc.tcp://127.0.0.1:{port}/")
+    client.set_user(user)
+    client.set_password(password)
+    try:
+        async with client:
+            return "Good"
+    except ua.UaStatusCodeError as error:
+        return type(error).__name__
+
+
+async def relayed(port: int, source: str) -> tuple[asyncio.Server, int]:
+    """Relay connections to a port of this machine, so that they come from another of its addresses."""
+
+    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(1 << 16):
+            writer.write(data)
+        writer.close()
+
+    async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        far = await asyncio.open_connection("127.0.0.1", port, local_addr=(source, 0))
+        await asyncio.gather(pump(reader, far[1]), pump(far[0], writer), return_exceptions=True)
+
+    server = await asyncio.start_server(relay, "127.0.0.1", 0)
+    return server, server.sockets[0].getsockname()[1]
 
 
 def test_readers_in_all_places_keep_out_no_writer_no_owner_and_no_safe_state(

@@ -105,7 +105,9 @@ def test_who_may_write_a_part_of_a_node_stops_it_with_a_write_that_is_let_throug
     on_a_port(tmp_path, story)
 
 
-def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path) -> None:
+def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.gate.refusals.FREE_LOGINS", 8)  # it is not slowed down yet
+
     async def story(line: Served, address: str) -> None:
         for token in ("a-token-of-nobody-at-all", SECRETS["hmi"][:-1]):
             with pytest.raises(LineDown, match="does not know this token"):
