@@ -129,7 +129,7 @@ LARGEST_VALUE = 1e15
 MOST_AT_ONCE = 16
 """Commands of one interface that are being written at a time."""
 AUDIT_WITHIN = 5.0
-"""Seconds in which an audit entry must be durable where `audit = "strict"`: then the client is told that it is not."""
+"""Seconds for an audit entry to become durable with `audit = "strict"`; then the client gets WriteUnconfirmed."""
 MOST_COMMANDS = 100
 """MQTT commands that wait for their turn, and refusals that wait to be answered: more are only counted."""
 LONGEST_NAME = 256

@@ -171,8 +171,7 @@ class NodeRecord:
         return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
 
     def note_refused(self, command: Command[Any]) -> None:
-        """Note that the node has refused this read for certain: it is no check any more. If the node has refused all
-        checks, all are checks again."""
+        """Stop using a sync read that was refused for certain. If the node has refused all of them, use all again."""
         if command in self.profile.checks:
             self._refused.add(command)
         if self._refused.issuperset(self.profile.checks):

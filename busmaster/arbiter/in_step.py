@@ -24,9 +24,9 @@ the next frame, to whichever node, for that rest, and replies with a NAK (or an 
 delay later. So after the line came up, no NAK is trusted, and every ACK is held, until that time has passed behind the
 first frame.
 
-What nobody owed and yet came, though it is like a reply of the last exchanges, was said twice. Then answers like those
-heard lately are doubted for a while, and neighbours that could be confused are not asked one after the other where
-there is a choice.
+A reply that is not overdue and yet looks like one of the last exchanges was sent twice. Then replies like those
+received lately are ambiguous for a while, and if there is a choice, requests whose replies could be confused are not
+sent one after the other.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class InStep:
         self.last: Sequence[bytes] = ()
         """What would answer the exchange that was begun last."""
         self.recent: deque[Sequence[bytes]] = deque(maxlen=RECENT)
-        """What would answer that one and those before it: what nobody owes and is like one of these was said twice."""
+        """The keys of its replies and of those before: a reply like one of these that is not overdue was sent twice."""
         self._doubted: list[tuple[bytes, float]] = []
         self._forgiven: list[tuple[bytes, float]] = []
         self.lone_bytes_until = -inf

@@ -119,7 +119,7 @@ class UnaskedBytes:
 
     def blame_straggler(self, owing: Sequence[NodeRecord | None]) -> None:
         """Blame the node that did not answer last, if it is one of those who owed the reply that was found.
-        Bytes that are no such reply raise nothing: noise would make healthy nodes slow."""
+        Other bytes raise nothing: noise would make healthy nodes slow."""
         straggler, self._straggler = self._straggler, None
         if straggler is not None and straggler[0][0] in owing:
             self.unanswered_one, first_byte, self._looked, self._look_at = straggler

@@ -142,7 +142,7 @@ class _Run:
             return
         if not self._driver.exchange.answered:
             self.note(heard)
-            return  # nobody replies to a broadcast: what comes behind it is unasked
+            return  # a broadcast has no reply: bytes behind it are unexpected
         self._told.append(heard)
         self._pause(heard.packet.micros)
         self.note(heard)

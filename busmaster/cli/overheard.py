@@ -129,7 +129,7 @@ class Overheard:
         self._request_ended = -inf
         self._lateness = 0.0
         self._unread = False
-        """The request that is open is none of ours: nobody knows how its reply begins."""
+        """The open request was not understood: how its reply begins is not known."""
         self._profile = protocol.profile
         self._dialect = protocol.dialect()
         self._nodes: dict[int, Node] = {}

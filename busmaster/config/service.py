@@ -224,7 +224,7 @@ def _private_text(path: str) -> str:
             if found.st_mode & 0o027 or found.st_uid not in (0, os.getuid()):
                 raise InvalidCommand(f"others may read {path}, or change it: chmod 600 {path}, as its only user")
             if found.st_size > LONGEST_FILE:
-                raise InvalidCommand(f"{path} has more than {LONGEST_FILE} bytes: it is no list of tokens")
+                raise InvalidCommand(f"{path} has more than {LONGEST_FILE} bytes: this is not a list of tokens")
             return file.read(LONGEST_FILE).decode()
     except OSError as error:
         raise InvalidCommand(f"{path} cannot be read: {error.strerror}") from None

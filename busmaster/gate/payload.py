@@ -32,7 +32,7 @@ def read_payload(payload: object) -> Payload:
     """Read `12.5`, `[1, 2]`, or `{"value": 12.5, "id": "a1", "expires": 1767225600}`. Raises NoCommand."""
     raw = payload if isinstance(payload, bytes | bytearray) else str(payload).encode()
     if len(raw) > LONGEST_COMMAND:
-        raise NoCommand(f"{len(raw)} bytes are no command: it has {LONGEST_COMMAND} at most", "")
+        raise NoCommand(f"{len(raw)} bytes: a command has {LONGEST_COMMAND} at most", "")
     text = bytes(raw).decode(errors="replace")
     try:
         said = json.loads(text, parse_constant=lambda name: name)
@@ -68,7 +68,7 @@ def _numbers(value: Any, text: str) -> Any:
     if not numbers or not all(map(_is_number, numbers)):
         raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
     if any(abs(number) > LARGEST_VALUE for number in numbers):
-        raise InvalidCommand(f"{text[:40]!r} is beyond {LARGEST_VALUE:g}: nobody means that much")
+        raise InvalidCommand(f"{text[:40]!r} is larger than {LARGEST_VALUE:g}")
     return value
 
 

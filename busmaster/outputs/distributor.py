@@ -161,7 +161,7 @@ class Distributor:
         try:
             durable.get_loop().call_soon_threadsafe(note)
         except RuntimeError:
-            pass  # the loop is closed: nobody waits any more
+            pass  # the loop is closed
 
     def _not_kept(self, durable: asyncio.Future[str], missing: set[str]) -> None:
         """Wait no longer for these outputs."""

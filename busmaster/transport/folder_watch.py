@@ -1,7 +1,7 @@
-"""Tells at once when something comes into a folder: a device node that is made, a link, a change of its rights.
+"""Reports at once that an entry of a folder was created or changed: a device node, a link, its rights.
 
-Linux's inotify, read by the loop like a port. Where there is none (another system, a loop that reads no descriptors or
-keeps a time of its own, no watch left for this user), the log says so once, and whoever waits looks by the clock.
+Linux's inotify, read by the loop like a port. Where it is not available (another system, a loop that
+cannot read descriptors or has a virtual clock, no watch left for this user), this is logged once, and callers poll.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ IN_DELETE_SELF, IN_MOVE_SELF = 0x400, 0x800
 CHANGES = IN_CREATE | IN_MOVED_TO | IN_ATTRIB | IN_DELETE_SELF | IN_MOVE_SELF | IN_ONLYDIR
 """linux/inotify.h. IN_ATTRIB: udev gives a node its group after the kernel has made it."""
 READ_SIZE = 65536
-"""Bytes of events that are read at once: what they say is not looked at."""
+"""Bytes of events that are read at once. Their content is not used."""
 
 
 class FolderWatch:
-    """Calls `on_change` when something comes into the folders that `follow` was told last. Raises OSError."""
+    """Calls `on_change` when an entry appears in a folder of the last `follow`. Raises OSError."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, on_change: Callable[[], None]) -> None:
         self._loop = loop
@@ -44,18 +44,18 @@ class FolderWatch:
     def follow(self, folders: Callable[[], tuple[str, ...]]) -> None:
         """Watch these folders too. Raises OSError where one cannot be watched.
 
-        They are told again until nothing changes: what came between the question and the watch was not seen. A folder
-        that is watched already stays so.
+        `folders` is called again until its result does not change: an entry that appears between the call and the
+        beginning of the watch would be missed. Folders of earlier calls are still watched.
         """
         watched: set[str] = set()
         while new := set(folders()) - watched:
             for folder in new:
-                with contextlib.suppress(FileNotFoundError, NotADirectoryError):  # then it is told otherwise next time
+                with contextlib.suppress(FileNotFoundError, NotADirectoryError):  # the next `follow` names another one
                     call_system("inotify_add_watch", self._descriptor, os.fsencode(folder), CHANGES)
             watched |= new
 
     def close(self) -> None:
-        """Call nothing any more. The kernel takes some 10 ms to give the descriptor back: not on the loop."""
+        """Stop. The kernel takes some 10 ms to close the descriptor, so that is not done on the loop."""
         self._loop.remove_reader(self._descriptor)
         in_own_thread(functools.partial(os.close, self._descriptor), "close inotify")
 
@@ -68,7 +68,7 @@ class FolderWatch:
 def watch_folders(
     watch: FolderWatch | None, folders: Callable[[], tuple[str, ...]], on_change: Callable[[], None]
 ) -> FolderWatch | None:
-    """Have these folders watched, by this watch if there is one. None where that is not possible."""
+    """Watch these folders, with this watch if there is one. Return None where that is not possible."""
     loop = asyncio.get_running_loop()
     if is_virtual(loop):
         return None
@@ -85,5 +85,5 @@ def watch_folders(
 
 @cache
 def tell_once(why: str) -> None:
-    """Say in the log that ports which come back are noticed a little later."""
-    logger.info("a port that comes back is looked for by the clock, since no folder can be watched: %s", why)
+    """Log that a port which comes back is noticed a little later."""
+    logger.info("polling for ports that come back, because folders cannot be watched: %s", why)

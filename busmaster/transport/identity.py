@@ -190,7 +190,7 @@ def resolve(name: str, scan: Scan | None = None) -> str:
         case [device]:
             return device.path
         case []:
-            others = f"there is {_listed(there, scan)}" if there else "there is no USB serial port at all"
+            others = f"there is {_listed(there, scan)}" if there else "no USB serial port was found"
             raise LineDown(f"{name} is not plugged in: {others}", hint="plug it in, or use one that is there")
         case _:
             raise LineDown(f"{name} could be any of {_listed(found, scan)}", hint="say which, by one of these names")

@@ -268,7 +268,7 @@ class Pump(asyncio.Protocol):
             if line_due or caller_due:
                 unread = self._port.unread()
             if (line_due or caller_due) and not self._all_has_left:
-                self._check_output(now)  # what is held is said to be, whoever's time is over
+                self._check_output(now)  # report held output before a request expires
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 

@@ -272,4 +272,4 @@ def test_an_adapter_without_a_serial_number_goes_by_its_place(
 def test_a_serial_number_that_is_not_there_is_all_that_is_said(usb: UsbTree) -> None:
     (finding,) = inspect("usb:A500ABC")
     assert not finding.ok
-    assert finding.what == "usb:A500ABC is not plugged in: there is no USB serial port at all"
+    assert finding.what == "usb:A500ABC is not plugged in: no USB serial port was found"

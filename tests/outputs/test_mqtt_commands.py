@@ -217,7 +217,7 @@ async def test_whatever_is_sent_is_refused_and_answered_and_the_output_stays_up(
             assert there.output.error == "", what
         assert (await there.ask("7"))["ok"]
         assert len(there.records) == len(STRANGE) + 1
-        [long] = [record for record in there.records if "200000 bytes are no command" in record.error]
+        [long] = [record for record in there.records if "200000 bytes: a command has" in record.error]
         assert long.value == f"'{'1' * 100}... (200000 bytes)'"
 
 

@@ -295,7 +295,7 @@ async def test_where_no_folder_can_be_watched_the_clock_serves_and_the_log_says_
         usb_dev.plug(back.path, "A500ABC", place="1-3", node="ttyUSB0")
         usb_dev.make_node("ttyUSB0", back.path)
         await recorder.connected(2)
-    said = [record.message for record in caplog.records if "looked for by the clock" in record.message]
+    said = [record.message for record in caplog.records if "polling for ports that come back" in record.message]
     assert len(said) == 1
     assert "too many watches" in said[0]
 

@@ -120,7 +120,7 @@ def test_a_serial_number_is_resolved_to_the_path_that_its_adapter_has_now(
 
 
 def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: PtyMaster, two: PtyMaster) -> None:
-    with pytest.raises(LineDown, match="usb:A500ABC is not plugged in: there is no USB serial port at all; plug it in"):
+    with pytest.raises(LineDown, match="usb:A500ABC is not plugged in: no USB serial port was found; plug it in"):
         resolve("usb:A500ABC")
     usb.plug(one.path, "A500XYZ", place="1-1")
     usb.plug(two.path, place="1-2")
