@@ -1,4 +1,4 @@
-"""What all tests share: hypothesis without a deadline, and the same examples every time where CI says so."""
+"""What all tests share: which of them run by default, hypothesis without a deadline, and cached bytecode."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shutil
 import signal
 import tempfile
 
+import pytest
 from hypothesis import settings
 
 pytest_plugins = ["tests.transport.usb"]
@@ -21,6 +22,13 @@ atexit.register(shutil.rmtree, os.environ["XDG_RUNTIME_DIR"], ignore_errors=True
 
 settings.load_profile("ci" if os.environ.get("CI") else "busmaster")
 
+# Tests start some hundred interpreters. Where the environment forbids cached bytecode, each of them would compile all
+# that it imports, a third of the processor time of a short command: bytecode is cached for this run. Programs that
+# change code between two runs (tests.mutation) set PYTHONPYCACHEPREFIX too: then the environment is left as it is.
+if "PYTHONPYCACHEPREFIX" not in os.environ and os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
+    os.environ["PYTHONPYCACHEPREFIX"] = tempfile.mkdtemp(prefix="busmaster-bytecode-")
+    atexit.register(shutil.rmtree, os.environ["PYTHONPYCACHEPREFIX"], ignore_errors=True)
+
 # A shell that starts a job in the background has it ignore these, and so would every command that the tests start and
 # end by Ctrl-C. What a process handles is back at its default in those that it starts.
 for number, handler in (
@@ -30,3 +38,16 @@ for number, handler in (
 ):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Leave the slow tests out where neither `-m` nor a path selects tests; CONTRIBUTING.md describes the tiers.
+
+    A path selects what is below it, but for the exhaustive tests, and the name of a test selects that test.
+    """
+    if config.option.markexpr:
+        return
+    if config.args_source is not pytest.Config.ArgsSource.ARGS:
+        config.option.markexpr = "not slow and not exhaustive"
+    elif not any("::" in argument for argument in config.args):
+        config.option.markexpr = "not exhaustive"

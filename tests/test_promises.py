@@ -6,6 +6,7 @@ import ast
 import re
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,7 @@ def explanations(path: Path) -> Iterator[str]:
             yield ast.get_docstring(node) or ""
 
 
+@cache
 def cited_by_tests() -> dict[int, set[str]]:
     """The files that show each rule."""
     found: dict[int, set[str]] = defaultdict(set)
@@ -48,12 +50,11 @@ def cited_by_tests() -> dict[int, set[str]]:
     return found
 
 
-CITED = cited_by_tests()
-
-
 def comments(path: Path) -> Iterator[tuple[int, str]]:
     """Lines that may cite a rule: of Python what is not code, and names of tests; of anything else all."""
     text = path.read_text()
+    if cited_in(text) <= SECTIONS.keys():  # parsing every file takes seconds
+        return
     if path.suffix != ".py":
         yield from enumerate(text.splitlines(), 1)
         return
@@ -77,7 +78,7 @@ def test_a_rule_says_what_is_promised_what_it_rests_on_and_what_it_costs(number:
 
 @pytest.mark.parametrize("number", SECTIONS, ids="R{}".format)
 def test_a_rule_is_cited_by_tests_that_show_it(number: int) -> None:
-    assert CITED[number]
+    assert cited_by_tests()[number]
 
 
 @pytest.mark.parametrize("number", SECTIONS, ids="R{}".format)
@@ -85,7 +86,7 @@ def test_the_tests_that_a_rule_names_cite_it(number: int) -> None:
     _, _, held_by = SECTIONS[number].partition("\nHeld by ")
     named = set(re.findall(r"`(tests/[\w/]+\.py)`", held_by))
     assert named, f"R{number} names no test"
-    assert named <= CITED[number], f"R{number}: {sorted(named - CITED[number])} do not cite it"
+    assert named <= cited_by_tests()[number], f"R{number}: {sorted(named - cited_by_tests()[number])} do not cite it"
 
 
 def test_every_rule_that_is_cited_is_on_the_page() -> None:

@@ -22,6 +22,7 @@ from busmaster.registry import make_device
 from busmaster.testing import answers_of, run_in_virtual_time
 from tests.docs.pages import ROOT, Block, blocks
 from tests.patience import PATIENCE
+from tests.tiers import one_by_default
 
 README = ROOT / "README.md"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -74,7 +75,7 @@ def test_the_program_in_the_readme_writes_and_polls(
     assert len(capsys.readouterr().out.splitlines()) >= 5
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))
+@pytest.mark.parametrize("path", one_by_default(EXAMPLES), ids=lambda path: str(path.name))
 def test_an_example_runs_by_itself_and_ends(path: Path) -> None:
     done = run([sys.executable, str(path)])
     assert done.returncode == 0, done.stderr

@@ -48,6 +48,7 @@ def watched_slices(monkeypatch: pytest.MonkeyPatch, told: Callable[[], None]) ->
     monkeypatch.setattr(Schedule, "begin", watched)
 
 
+@pytest.mark.slow
 def test_two_hundred_groups_added_at_once_fail_nothing_and_exchanges_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each slice of the work takes half a millisecond here: reads must come between them as they came before."""
     slices = 0

@@ -125,6 +125,7 @@ class Campaign:
         assert slave.answers[int(transaction.value)] == asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_r3_r6_r8_every_value_is_the_right_one_and_every_transaction_ends_once(seed: int) -> None:
     campaign = Campaign(seed)

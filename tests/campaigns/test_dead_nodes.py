@@ -11,6 +11,7 @@ from busmaster.arbiter.health import BUDGET_SHARE, PROBE_JITTER, Health
 from busmaster.arbiter.transaction import Transaction
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.campaigns.loads import EXCHANGE, Load
+from tests.tiers import one_by_default
 
 SATURATED = 0.03
 """Eight nodes polled every 30 ms ask for 127 % of the line."""
@@ -44,10 +45,10 @@ def returns(load: Load, count: int, within: float) -> list[float]:
     return sorted(min((begun for _, begun, _ in c if begun > start), default=inf) - start for c in cycles)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", one_by_default([1, 2]))
 @pytest.mark.parametrize("period", [SATURATED, EASY])
 @pytest.mark.parametrize("dead", [1, 3])
-@pytest.mark.parametrize("seconds", [5.0, 30.0])
+@pytest.mark.parametrize("seconds", one_by_default([5.0, 30.0]))
 def test_r11_the_living_keep_95_percent_of_their_rate_from_5_s_after_a_death(
     dead: int, period: float, seconds: float, seed: int
 ) -> None:
@@ -63,7 +64,7 @@ def test_r11_the_living_keep_95_percent_of_their_rate_from_5_s_after_a_death(
 
 
 @pytest.mark.parametrize("dead", [1, 3])
-@pytest.mark.parametrize("down_for", [3.0, 20.0, 100.0])
+@pytest.mark.parametrize("down_for", one_by_default([3.0, 20.0, 100.0]))
 def test_r11_a_node_that_returns_is_polled_again_within_its_probe_delay(dead: int, down_for: float) -> None:
     """On a saturated line, where the budget is 2 %, or as soon as that pays for a probe of each dead node."""
     load = polled(8)
@@ -107,8 +108,8 @@ def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls() -> None:
     assert order == ["returned", "written"]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("after", [5.0, 60.0])
+@pytest.mark.parametrize("seed", one_by_default([1, 2, 3]))
+@pytest.mark.parametrize("after", one_by_default([5.0, 60.0]))
 def test_r11_thirty_dead_of_forty_at_70_percent_load_all_return_soon(seed: int, after: float) -> None:
     load = polled(40, period=40 * EXCHANGE / 0.7, seed=seed)
     load.run(5.0)
@@ -120,6 +121,7 @@ def test_r11_thirty_dead_of_forty_at_70_percent_load_all_return_soon(seed: int, 
     assert back[-1] <= 30.0
 
 
+@pytest.mark.slow
 def test_r11_thirty_dead_of_forty_beside_ten_that_need_70_percent_all_return_soon() -> None:
     load = Load(40, spread=0.3)
     for node in load.nodes:
@@ -155,11 +157,13 @@ def flapping(dead: float, alive: float) -> tuple[Load, int]:
     return load, len(load.changes) - before
 
 
+@pytest.mark.slow
 def test_r11_a_node_that_is_away_for_moments_is_suspect_until_it_is_calm() -> None:
     _, changes = flapping(dead=0.8, alive=2.0)
     assert changes == 1
 
 
+@pytest.mark.slow
 def test_r11_a_node_that_comes_and_goes_is_down_for_longer_and_longer_and_costs_the_others_little() -> None:
     load, changes = flapping(dead=4.0, alive=2.0)
     assert changes <= 3 * (5 + 300 / 30)

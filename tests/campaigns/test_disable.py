@@ -24,6 +24,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import microflex
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.tiers import one_by_default
 
 SETTINGS = LineSettings(57600)
 WARM = 0.5
@@ -117,7 +118,7 @@ with_or_without_polls = pytest.mark.parametrize("polled", [False, True], ids=["n
 
 @one_or_several
 @with_or_without_polls
-@pytest.mark.parametrize("silent", [False, True], ids=["others answer", "all are silent"])
+@pytest.mark.parametrize("silent", one_by_default([False, True]), ids=["others answer", "all are silent"])
 def test_a_disable_that_the_drive_does_not_hear_is_never_confirmed_by_the_ack_of_the_write_before(
     nodes: int, polled: bool, silent: bool
 ) -> None:

@@ -17,12 +17,13 @@ from tests.campaigns.hunt import Hunt
 from tests.campaigns.judge import Totals
 from tests.campaigns.kinds import KINDS
 from tests.campaigns.mixes import BEYOND, IN_STEP, STANDING_LONG, WITHIN
+from tests.tiers import in_turn_by_default, one_by_default
 
 EACH = 700
 """Transactions of one hunt."""
 LONG = 150
 """Likewise, of one with standstills of seconds."""
-EVERY_PROTOCOL = pytest.mark.parametrize("protocol", list(KINDS))
+EVERY_PROTOCOL = pytest.mark.parametrize("protocol", one_by_default(KINDS))
 
 
 def check(totals: Totals, hunt: Hunt) -> None:
@@ -30,8 +31,7 @@ def check(totals: Totals, hunt: Hunt) -> None:
     assert not totals.problems, f"{totals.problems[0]}\nits transcript: {again}"
 
 
-@EVERY_PROTOCOL
-@pytest.mark.parametrize("mix", [mix.name for mix in WITHIN])
+@pytest.mark.parametrize(("protocol", "mix"), in_turn_by_default(KINDS, (mix.name for mix in WITHIN)))
 def test_r1_to_r13_inside_the_assumption_nothing_is_wrong_or_lost_and_everything_heals(protocol: str, mix: str) -> None:
     hunt = Hunt(protocol, mix, 1)
     totals = hunt.run(EACH)
@@ -71,8 +71,7 @@ def test_beyond_the_assumption_the_oracle_sees_what_is_wrong(protocol: str, monk
     assert wrong("overdue").confused > 0
 
 
-@EVERY_PROTOCOL
-@pytest.mark.parametrize("mix", [mix.name for mix in IN_STEP])
+@pytest.mark.parametrize(("protocol", "mix"), in_turn_by_default(KINDS, (mix.name for mix in IN_STEP)))
 def test_r15_whatever_stands_still_nothing_is_wrong_or_lost_and_everything_heals(protocol: str, mix: str) -> None:
     hunt = Hunt(protocol, mix, 1)
     totals = hunt.run(EACH)
@@ -81,9 +80,8 @@ def test_r15_whatever_stands_still_nothing_is_wrong_or_lost_and_everything_heals
     assert totals.transactions >= EACH
 
 
-@EVERY_PROTOCOL
 @pytest.mark.parametrize("learned", [False, True])
-@pytest.mark.parametrize("mix", [mix.name for mix in STANDING_LONG])
+@pytest.mark.parametrize(("protocol", "mix"), in_turn_by_default(KINDS, (mix.name for mix in STANDING_LONG)))
 def test_r15_a_network_that_stands_still_for_6_s_confirms_no_write_and_delivers_no_other_value(
     protocol: str, mix: str, learned: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,6 +94,7 @@ def test_r15_a_network_that_stands_still_for_6_s_confirms_no_write_and_delivers_
     assert totals.transactions >= LONG
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mix", [mix.name for mix in BEYOND])
 def test_beyond_the_assumption_too_everything_ends_and_heals(mix: str) -> None:
     for protocol in KINDS:
@@ -117,6 +116,7 @@ def test_the_same_seed_gives_the_same_transcript_and_another_another(protocol: s
     assert transcript(protocol, "everything", 2) != first
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_transcript_byte_for_byte_in_any_process() -> None:
     """Whatever the seed of the hashes is: no set and no address of an object may decide anything."""
     command = [sys.executable, "-m", "tests.campaigns", "--each", "200", "--replay", "msc/everything/1"]
@@ -129,6 +129,7 @@ def test_the_same_seed_gives_the_same_transcript_byte_for_byte_in_any_process() 
     assert digests == {hashlib.sha256(here.encode()).hexdigest()}
 
 
+@pytest.mark.slow
 def test_nothing_grows_without_bound() -> None:
     """What is remembered is full after some thousand transactions; then twice as many leave no more objects."""
 
@@ -164,8 +165,10 @@ def test_the_command_adds_up_and_says_how_to_replay(
     assert len(transcript) > 10
 
 
-@EVERY_PROTOCOL
-@pytest.mark.parametrize("mix", ["calm", "lost", "late", "garbled", "everything", "edges", "edges, all"])
+@pytest.mark.parametrize(
+    ("protocol", "mix"),
+    in_turn_by_default(KINDS, ["calm", "lost", "late", "garbled", "everything", "edges", "edges, all"]),
+)
 def test_r15_with_learned_times_nothing_is_wrong_or_lost_and_everything_heals(
     protocol: str, mix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,11 @@ from tests.campaigns.loads import EXCHANGE, LINE, REPLY_TIME, VALUE, Load, quant
 SPREAD = 0.3
 LONGEST = 16 * LINE.byte_time + REPLY_TIME * (1 + SPREAD)
 HOUR = 3600.0
+TIERS_OF_SECONDS = [
+    60.0,
+    pytest.param(HOUR / 6, marks=pytest.mark.slow, id="ten minutes"),
+    pytest.param(HOUR, marks=pytest.mark.exhaustive, id="an hour"),
+]
 PERIODS = (0.25, 0.5, 1.0)
 
 
@@ -27,20 +32,22 @@ def jitters(line: Load, since: float = 1.0) -> list[float]:
 
 
 @pytest.mark.timeout(300)
-def test_r10_sixty_points_at_67_percent_of_the_line_start_on_time_for_an_hour() -> None:
+@pytest.mark.parametrize("seconds", TIERS_OF_SECONDS)
+def test_r10_sixty_points_at_67_percent_of_the_line_start_on_time(seconds: float) -> None:
     line = Load(8, spread=SPREAD)
     for period in PERIODS:
         line.poll_of(f"{period}", period, [Transaction(line.nodes[i % 8], hcp2.Read(i // 8 + 1)) for i in range(20)])
-    line.run(HOUR)
+    line.run(seconds)
     late = jitters(line)
     assert line.world.arbiter.statistics(line.now).utilisation == pytest.approx(0.67, abs=0.01)
-    assert len(late) >= 7 * (HOUR - 2)
+    assert len(late) >= 7 * (seconds - 2)
     assert quantile(late, 0.99) <= LONGEST + 0.001
     assert sum(poll.missed for poll in line.polls) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("one_by_one", [False, True])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in (2, 3))])
 def test_r10_sixty_groups_of_one_point_start_on_time_in_whatever_order_they_were_added(
     seed: int, one_by_one: bool
 ) -> None:
@@ -102,6 +109,7 @@ def test_the_plan_of_a_schedule_that_fits_is_what_comes_of_it(groups: list[tuple
     assert [poll.missed for poll in line.polls] == missed
 
 
+@pytest.mark.slow
 def test_a_schedule_that_needs_118_percent_misses_what_the_plan_says() -> None:
     count = round(1.18 / (1 / 0.25 + 1 / 0.5 + 1 / 1.0) / EXCHANGE)
     line = Load(8, spread=SPREAD)
@@ -131,8 +139,14 @@ def resident() -> int:
 
 @pytest.mark.timeout(300)
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the resident size is read from /proc")
-def test_r12_a_million_requests_with_callers_that_give_up_at_random_leave_nothing_behind() -> None:
-    requests = 1_000_000
+@pytest.mark.parametrize(
+    "requests",
+    [
+        pytest.param(100_000, marks=pytest.mark.slow, id="a tenth of it"),
+        pytest.param(1_000_000, marks=pytest.mark.exhaustive, id="a million"),
+    ],
+)
+def test_r12_a_million_requests_with_callers_that_give_up_at_random_leave_nothing_behind(requests: int) -> None:
     line = Load(8, spread=SPREAD)
     chance, arbiter = line.random, line.world.arbiter
     reads = [hcp2.Read(element) for element in range(1, 100)]

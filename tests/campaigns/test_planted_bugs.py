@@ -26,11 +26,12 @@ from tests.planted import (
     without_the_adapter_in_the_silence,
     without_the_byte_time,
 )
+from tests.tiers import one_by_default
 
 SEEDS = range(1, 21)
 EACH = 2000
 """Transactions of a hunt. Most are broken off long before."""
-EVERY_PROTOCOL = pytest.mark.parametrize("protocol", list(KINDS))
+EVERY_PROTOCOL = pytest.mark.parametrize("protocol", one_by_default(KINDS))
 
 
 def caught(protocol: str, mix: str) -> Totals:
@@ -69,7 +70,7 @@ def test_a_lateness_of_zero_is_caught(protocol: str, monkeypatch: pytest.MonkeyP
     assert "WRONG" in caught(protocol, "late").problems[0]
 
 
-@pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
+@pytest.mark.parametrize("protocol", one_by_default(["hcp", "hcp2", "mentor", "dc104"]))
 def test_a_wrong_echo_that_does_not_settle_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(readers, "find_field", excusing(readers.find_field))
     monkeypatch.setattr(dc104.Reading, "feed", excusing(dc104.Reading.feed))
@@ -83,7 +84,7 @@ def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkey
 
 
 # `excusing` does not reach the reader of Modbus, whose replies name no register
-@pytest.mark.parametrize("protocol", [protocol for protocol in KINDS if protocol != "modbus"])
+@pytest.mark.parametrize("protocol", one_by_default(protocol for protocol in KINDS if protocol != "modbus"))
 def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The element check removed; for an MSC, that of unit and name."""
     right, read = readers.find_field, dc104.Reading.feed
@@ -112,7 +113,7 @@ def test_a_byte_time_left_out_of_the_lateness_brings_a_wrong_value(
     assert "WRONG" in caught(protocol, "edges, equal").problems[0]
 
 
-@pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
+@pytest.mark.parametrize("protocol", one_by_default(["hcp", "hcp2", "mentor", "dc104"]))
 def test_without_r3_a_request_that_leaves_too_early_is_caught_before_it_does_harm(
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,7 +137,7 @@ def broken(protocol: str, mix: str) -> str:
     pytest.fail(f"{len(SEEDS)} hunts found nothing wrong")
 
 
-NOT_MSC = pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
+NOT_MSC = pytest.mark.parametrize("protocol", one_by_default(["hcp", "hcp2", "mentor", "dc104"]))
 
 
 @NOT_MSC

@@ -18,6 +18,13 @@ OF_MSC = (0.04, 0.35, 0.76, 1.06, 1.12, 1.18, 1.24, 1.42, 1.48, 1.61)
 """Likewise of MSC, whose replies may begin last: those in which a refusal confirmed a write before it was received."""
 
 
+THOROUGH = [
+    pytest.param(protocol, strict, learned, marks=[] if learned and not strict else [pytest.mark.slow])
+    for protocol, strict, learned in product(KINDS, (False, True), (False, True))
+]
+"""By default each protocol once, with what is used unless it is set otherwise."""
+
+
 @pytest.fixture(autouse=True)
 def restored_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the constants that `be_hasty` sets restored afterwards."""
@@ -25,9 +32,7 @@ def restored_learning(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(learning, name, getattr(learning, name))
 
 
-@pytest.mark.parametrize("learned", [False, True])
-@pytest.mark.parametrize("strict", [False, True])
-@pytest.mark.parametrize("protocol", KINDS)
+@pytest.mark.parametrize(("protocol", "strict", "learned"), THOROUGH)
 def test_r15_a_refusal_held_up_by_a_standstill_confirms_no_write_and_delivers_no_other_value(
     protocol: str, strict: bool, learned: bool
 ) -> None:

@@ -18,6 +18,7 @@ from busmaster.registry import make_device
 from tests.campaigns.mixes import Standstill
 from tests.campaigns.standing import Channel
 from tests.real_wire.kinds import KINDS, Teller
+from tests.tiers import one_by_default
 
 NODES = 4
 BEGUN = 2.0
@@ -132,8 +133,8 @@ def standstills(protocol: str, *, writes: bool) -> Iterator[tuple[Saturated, flo
             yield line, line.stand_still(lasting, tuple(ways))
 
 
-@pytest.mark.parametrize("writes", [False, True])
-@pytest.mark.parametrize("protocol", KINDS)
+@pytest.mark.parametrize("writes", one_by_default([True, False]))
+@pytest.mark.parametrize("protocol", one_by_default(KINDS))
 def test_r15_after_a_standstill_of_up_to_a_second_all_nodes_soon_give_good_values_again(
     protocol: str, writes: bool
 ) -> None:

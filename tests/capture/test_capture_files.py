@@ -151,6 +151,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_capture_whose_process_was_killed_replays_up_to_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -340,6 +340,7 @@ def test_every_byte_is_accounted_for_and_chunks_change_nothing(protocol: str, ch
     assert all(frame.fault for frame in at_once if frame.kind is Kind.NOISE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", sorted(kinds()))
 @pytest.mark.parametrize("sender", Direction)
 def test_whoever_is_said_to_speak_no_bytes_are_too_odd_for_a_listener(protocol: str, sender: Direction) -> None:

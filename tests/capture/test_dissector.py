@@ -218,6 +218,7 @@ CONVERSATIONS: dict[str, list[tuple[Direction, str, str, str, str, str]]] = {
 TITLES = {"hcp": "HCP", "hcp2": "HCP2", "microflex": "MicroFlex", "msc": "MSC", "mentor": "Mentor", "dc104": "DC104"}
 
 
+@pytest.mark.slow
 def test_every_command_of_every_protocol_is_put_into_words(tmp_path: Path) -> None:
     packets: list[Packet] = []
     expected: list[list[str]] = []
@@ -303,6 +304,7 @@ def test_a_reply_is_tied_to_the_request_of_its_own_exchange_and_to_no_other(tmp_
     ]
 
 
+@pytest.mark.slow
 def test_a_capture_of_an_older_version_reads_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     packets = [
         packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"),
@@ -322,6 +324,7 @@ def test_a_capture_of_an_older_version_reads_the_same(tmp_path: Path, monkeypatc
     assert today[1][-1] == "1"
 
 
+@pytest.mark.slow
 def test_no_bytes_however_garbled_upset_it(tmp_path: Path) -> None:
     draw = random.Random(4)
     frames = vectors()
@@ -381,6 +384,7 @@ def test_what_comes_after_its_request_was_given_up_is_called_late(tmp_path: Path
     assert rows[6][:3] == ["", "0.005", "6"]
 
 
+@pytest.mark.slow
 def test_the_profile_shows_times_of_replies_and_colours_what_went_wrong(tmp_path: Path) -> None:
     packets = [
         packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"),

@@ -75,6 +75,7 @@ packets = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(packets, max_size=4), st.text(max_size=20))
 def test_what_is_written_is_read_back(sequence: list[Packet], port: str) -> None:
     assert list(read_packets(io.BytesIO(written(*sequence, port=port)))) == sequence

@@ -66,6 +66,7 @@ async def test_every_exchange_of_a_bus_is_recorded_with_its_outcome(tmp_path: Pa
     assert exchanges[-1].command in ("read element 100", "read element 115")
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 @pytest.mark.parametrize("echo", [False, True])
 @pytest.mark.parametrize(

@@ -13,7 +13,12 @@ from busmaster.capture.pcapng import Outcome, PcapngWriter, read_packets
 from busmaster.capture.replay import replay
 from tests.campaigns.hunt import Hunt
 from tests.campaigns.kinds import KINDS
+from tests.tiers import in_turn_by_default
 
+MIXES = (
+    *("calm", "cancelled", "garbled", "glued-bytewise", "refusals", "echo", "everything"),
+    *("all stand still", "repeated"),
+)
 EACH = 300
 """Transactions of one campaign."""
 
@@ -48,11 +53,7 @@ def recorded(protocol: str, mix: str, seed: int) -> Tape:
     return tape
 
 
-@pytest.mark.parametrize("protocol", KINDS)
-@pytest.mark.parametrize(
-    "mix",
-    ["calm", "cancelled", "garbled", "glued-bytewise", "refusals", "echo", "everything", "all stand still", "repeated"],
-)
+@pytest.mark.parametrize(("protocol", "mix"), in_turn_by_default(KINDS, MIXES))
 def test_a_replay_says_what_the_arbiter_said(protocol: str, mix: str) -> None:
     tape = recorded(protocol, mix, 1)
     tape.assembler.finish(1e6)

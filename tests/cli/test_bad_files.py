@@ -46,6 +46,7 @@ BAD: list[tuple[Callable[[Path, str], None], str]] = [
 ]
 
 
+@pytest.mark.slow
 def test_a_running_line_goes_on_whatever_its_file_has_become(file: Path) -> None:
     text = file.read_text()
     with started("run", str(file), "--plain") as process:
@@ -76,6 +77,7 @@ def test_a_bad_file_is_refused_in_one_sentence(
     assert "Traceback" not in ran.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["template", "symbols", "learned"])
 def test_a_fifo_that_a_file_names_is_not_waited_for(
     busmaster: Command, file: Path, key: str, three_controllers: TcpServer
@@ -108,6 +110,7 @@ def test_a_table_of_points_that_is_too_large_is_not_read(busmaster: Command, fil
     assert file.read_text() == before
 
 
+@pytest.mark.slow
 def test_status_shows_the_lines_whatever_else_is_in_their_folder(
     busmaster: Command, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

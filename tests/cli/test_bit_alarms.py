@@ -7,6 +7,8 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import pytest
+
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
@@ -28,6 +30,7 @@ path = "{folder}/line.sqlite"
 ALARM = "drive/status_word.ASYNCHRONOUS_ERROR is set"
 
 
+@pytest.mark.slow
 def test_a_trip_is_reported_on_standard_error_and_as_an_event(tmp_path: Path) -> None:
     drive = make_device("microflex", 3, axis_error=2)
     path = tmp_path / "line.toml"

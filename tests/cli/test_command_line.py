@@ -119,6 +119,7 @@ SHAPES = {
 """Of each protocol a node, commands to it without their PORT, and the lines that they print, one after another."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", SHAPES)
 def test_each_item_prints_the_lines_that_are_promised(busmaster: Command, drive: str) -> None:
     protocol, node = drive.split()
@@ -130,6 +131,7 @@ def test_each_item_prints_the_lines_that_are_promised(busmaster: Command, drive:
             assert (done.status, done.lines, done.err) == (0, lines.split(", "), "")
 
 
+@pytest.mark.slow
 def test_json_is_an_object_a_line_with_the_promised_fields(busmaster: Command, controllers: TcpServer) -> None:
     hcp2 = (controllers.path, "--protocol", "hcp2", "--timeout", "1000")
     for arguments, fields in (
@@ -142,6 +144,7 @@ def test_json_is_an_object_a_line_with_the_promised_fields(busmaster: Command, c
         assert list(json.loads(done.out)) == fields
 
 
+@pytest.mark.slow
 def test_each_exit_status_is_the_promised_one(busmaster: Command, controllers: TcpServer) -> None:
     """That of Ctrl-C, 130, takes a process: see test_processes."""
     hcp2 = (controllers.path, "--protocol", "hcp2", "--timeout", "1000", "--node", "5")

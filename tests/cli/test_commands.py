@@ -171,6 +171,7 @@ def test_a_tcp_port_that_is_taken_is_said_so(busmaster: Command) -> None:
     assert "Address already in use; use another port" in outcome.err
 
 
+@pytest.mark.slow
 def test_poll_prints_a_line_a_value_and_a_summary_on_standard_error(controllers: TcpServer) -> None:
     options = ("--nodes", "1-2", "--items", "1,axis0.idle", "--period", "0.02")
     began = datetime.now(UTC)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Health
 from busmaster.cli.demo import PERIOD, devices
@@ -35,6 +37,7 @@ async def missed_cycles() -> tuple[list[int], float]:
         return missed, max(group.recent_periods)
 
 
+@pytest.mark.slow
 def test_r11_a_node_that_dies_costs_a_second_of_cycles_and_a_node_that_is_down_next_to_none() -> None:
     (before, dying, probed, later, last), longest = run_in_virtual_time(missed_cycles())
     assert before == 0

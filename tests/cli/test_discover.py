@@ -27,6 +27,7 @@ def unknown() -> Iterator[PtyServer]:
         yield server
 
 
+@pytest.mark.slow
 def test_what_it_finds_is_a_file_that_runs(busmaster: Command, unknown: PtyServer, tmp_path: Path) -> None:
     path = tmp_path / "line.toml"
     done = busmaster("discover", unknown.path, *HCP2, "--yes", "-o", str(path))
@@ -41,6 +42,7 @@ def test_what_it_finds_is_a_file_that_runs(busmaster: Command, unknown: PtyServe
     assert run.status == 130, run.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "nodes"), [("microflex", tuple(range(1, 11))), ("ct-ansi", (12, 23)), ("modbus", (5, 17, 18))]
 )
@@ -59,6 +61,7 @@ def test_every_node_of_the_protocol_is_found(
     assert "not asked" not in done.err
 
 
+@pytest.mark.slow
 def test_without_a_file_it_is_printed(busmaster: Command, unknown: PtyServer) -> None:
     done = busmaster("discover", f"{unknown.path}?baudrate=9600", *HCP2, "--yes")
     assert done.status == 0
@@ -84,6 +87,7 @@ def test_a_file_that_is_there_is_not_overwritten(busmaster: Command, unknown: Pt
     assert path.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_where_nobody_answers_the_status_is_1(busmaster: Command) -> None:
     with serve_tcp(Line(LineSettings(9600), [], paced=False)) as server:
         done = busmaster("discover", server.path, "--protocol", "dc104", "--yes")
@@ -93,6 +97,7 @@ def test_where_nobody_answers_the_status_is_1(busmaster: Command) -> None:
     assert "not asked" not in done.err, "it has no addresses"
 
 
+@pytest.mark.slow
 def test_what_was_not_asked_is_printed(busmaster: Command) -> None:
     with serve_tcp(Line(LineSettings(9600), [], paced=False)) as server:
         done = busmaster("discover", server.path, "--protocol", "msc", "--yes")
@@ -100,6 +105,7 @@ def test_what_was_not_asked_is_printed(busmaster: Command) -> None:
     assert "not asked: msc 9-15" in done.err
 
 
+@pytest.mark.slow
 def test_a_device_server_is_searched_at_the_rate_that_it_has(busmaster: Command) -> None:
     with serve_tcp(Line(LineSettings(9600), [make_device("mentor", 2)], paced=False)) as server:
         done = busmaster("discover", server.path, "--protocol", "mentor", "--nodes", "2", "--yes")

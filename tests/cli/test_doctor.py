@@ -314,6 +314,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(examination, "PROBES", 4)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("hasty")
 def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command) -> None:
     with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
@@ -324,6 +325,7 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("hasty")
 def test_json_has_an_object_for_each_finding(busmaster: Command) -> None:
     with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:

@@ -58,6 +58,7 @@ def polled(path: Path, link: str | None = None) -> dict[str, Sample[Any]]:
     return samples
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))
 def test_an_example_polls_clean_against_its_own_emulator(path: Path, tmp_path: Path) -> None:
     link = str(tmp_path / "line")
@@ -76,6 +77,7 @@ def file_of(text: str, points: Iterable[str], folder: Path) -> tuple[Path, str]:
     return path, link
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "kind", "wanted"), VALUES, ids=[kind for _, kind, _ in VALUES])
 def test_a_line_with_options_and_values_polls_clean_against_its_own_emulator(
     text: str, kind: str, wanted: dict[str, Any], tmp_path: Path
@@ -86,6 +88,7 @@ def test_a_line_with_options_and_values_polls_clean_against_its_own_emulator(
     assert {key.partition("/")[2]: sample.value for key, sample in samples.items()} == wanted, kind
 
 
+@pytest.mark.slow
 def test_run_shows_what_the_emulated_line_holds(tmp_path: Path) -> None:
     text, _, wanted = next(one for one in VALUES if one[1] == "msc")
     path, link = file_of(text, wanted, tmp_path)
@@ -103,6 +106,7 @@ def test_run_shows_what_the_emulated_line_holds(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_emulate_says_where_the_file_asks_for_what_no_device_has(tmp_path: Path) -> None:
     path, _ = file_of(VALUES[0][0].replace("outputs = 5", "outptus = 5"), ["outputs"], tmp_path)
     with started("emulate", str(path)) as process:

@@ -120,6 +120,7 @@ def test_a_signal_that_another_thread_takes_ends_an_emulated_line_too() -> None:
         signal.signal(signal.SIGUSR1, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", ["--help", "--version", "read --help"])
 def test_a_full_disk_under_a_help_text_is_one_line(arguments: str) -> None:
     with open("/dev/full", "w", encoding="utf-8") as full:

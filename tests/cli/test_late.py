@@ -71,6 +71,7 @@ def test_a_write_that_is_confirmed_late_says_what_to_try(busmaster: Command, slo
     assert ": try --timeout 2" in done.err
 
 
+@pytest.mark.slow
 def test_a_scan_finds_who_is_late_and_names_who_is_too_late(busmaster: Command, slow: TcpServer) -> None:
     done = busmaster("scan", slow.path, "--protocol", "hcp", "--nodes", "1-4")
     assert done.status == 0
@@ -79,6 +80,7 @@ def test_a_scan_finds_who_is_late_and_names_who_is_too_late(busmaster: Command, 
     assert "node 4: it answers late, after " in done.err
 
 
+@pytest.mark.slow
 def test_r2_poll_prints_every_value_of_nodes_that_are_as_late_as_their_document_allows(
     busmaster: Command, allowed: PtyServer
 ) -> None:
@@ -98,6 +100,7 @@ def test_r2_poll_prints_every_value_of_nodes_that_are_as_late_as_their_document_
     assert "is down" not in done.err
 
 
+@pytest.mark.slow
 def test_r2_run_delivers_every_value_of_such_nodes_and_says_what_to_write(
     busmaster: Command, allowed: PtyServer, tmp_path: Path
 ) -> None:
@@ -120,6 +123,7 @@ def test_r2_run_delivers_every_value_of_such_nodes_and_says_what_to_write(
     assert "set timing = { window = 0.2 } in its section" in done.err
 
 
+@pytest.mark.slow
 def test_a_scan_in_hcp2_tries_hcp_too(busmaster: Command) -> None:
     line = Line(find("hcp").profile.line, [make_device("hcp", 2), make_device("hcp2", 3)], paced=False)
     with serve_tcp(line) as server:

@@ -102,6 +102,7 @@ def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
     assert f"by safe {number.name}" in err
 
 
+@pytest.mark.slow
 def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:
     with subprocess.Popen(
         ["sh", "-c", 'trap "" INT QUIT; exec "$0" -m busmaster run "$1" --plain', sys.executable, str(path)],
@@ -117,6 +118,7 @@ def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:
     assert process.returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGQUIT])
 def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(
     path: Path, winder: TcpServer, number: signal.Signals
@@ -194,6 +196,7 @@ def test_safe_says_why_the_port_is_refused_and_names_each_point(
     assert [line.partition(" is not")[0] for line in rest] == ["busmaster: the safe state of winder/force"]
 
 
+@pytest.mark.slow
 def test_safe_says_who_has_the_port_and_serves_it_to_nobody(busmaster: Command, path: Path) -> None:
     with serve_pty(Line(find("hcp2").profile.line, [make_device("hcp2", 1)], paced=False)) as served:
         text = f"{TEXT}{SAFE}[service]\nenabled = false\n".replace("PORT", served.path)
@@ -213,6 +216,7 @@ def test_safe_without_a_safe_state_is_wrong_usage(busmaster: Command, path: Path
     assert busmaster("safe", str(path)).status == 2
 
 
+@pytest.mark.slow
 def test_sighup_replaces_what_changed_and_leaves_the_rest_unbroken(path: Path) -> None:
     with started("run", str(path), "--plain") as process:
         polls(process)
@@ -236,6 +240,7 @@ def test_sighup_replaces_what_changed_and_leaves_the_rest_unbroken(path: Path) -
     assert int(fast.split()[2]) > 1
 
 
+@pytest.mark.slow
 def test_a_port_that_is_missing_at_the_start_is_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "line.toml"
     path.write_text(TEXT.replace("PORT", f"socket://127.0.0.1:{free_port()}"))
@@ -250,6 +255,7 @@ def test_a_port_that_is_missing_at_the_start_is_waited_for(tmp_path: Path) -> No
     assert process.returncode == 0
 
 
+@pytest.mark.slow
 def test_systemd_hears_that_it_is_ready_lives_reloads_and_stops(path: Path, tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
@@ -280,6 +286,7 @@ def test_systemd_hears_that_it_is_ready_lives_reloads_and_stops(path: Path, tmp_
             assert all(line.startswith(("<5>busmaster: ", "<6>busmaster: ")) for line in journal)
 
 
+@pytest.mark.slow
 def test_a_full_disk_under_standard_output_does_not_end_a_run(path: Path, winder: TcpServer) -> None:
     with open("/dev/full", "w", encoding="utf-8") as full:
         process = subprocess.Popen(
@@ -292,6 +299,7 @@ def test_a_full_disk_under_standard_output_does_not_end_a_run(path: Path, winder
     assert (process.returncode, force(winder)) == (0, 15)
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_closed_does_not_end_a_run(path: Path, winder: TcpServer) -> None:
     pid, master = pty.fork()
     if not pid:
@@ -359,6 +367,7 @@ sys.exit(main(["run", sys.argv[1], "--plain"]))
 """
 
 
+@pytest.mark.slow
 def test_sighup_before_the_file_is_loaded_does_not_end_a_run(path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", EARLY, str(path)],
@@ -374,6 +383,7 @@ def test_sighup_before_the_file_is_loaded_does_not_end_a_run(path: Path) -> None
 SPILLING = '[outputs.jsonl]\npath = "FOLDER/line.jsonl"\nspill = "FOLDER/spool"\n'
 
 
+@pytest.mark.slow
 def test_a_spool_is_handed_over_at_sighup_and_a_damaged_one_is_told(path: Path, tmp_path: Path) -> None:
     (tmp_path / "spool").write_text("not a database at all " * 400)
     path.write_text(path.read_text() + SPILLING.replace("FOLDER", str(tmp_path)))

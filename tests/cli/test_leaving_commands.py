@@ -102,6 +102,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
         yield found
 
 
+@pytest.mark.slow
 def test_every_command_that_is_answered_while_a_run_ends_is_on_record(broker: Broker, tmp_path: Path) -> None:
     path = tmp_path / "line.toml"
     with serve("hcp2", 1) as winder:

@@ -111,6 +111,7 @@ def rows(path: Path, query: str = "select node, item, value, unit from history")
         database.close()
 
 
+@pytest.mark.slow
 def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> None:
     with tapped() as line:
         command = [sys.executable, "-m", "busmaster", "monitor", str(written(tmp_path, line.port)), "--json"]
@@ -137,6 +138,7 @@ def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> No
     assert process.returncode == 130
 
 
+@pytest.mark.slow
 @needs_mosquitto
 @pytest.mark.asyncio
 async def test_mqtt_says_that_it_listens_and_of_the_state_of_a_line_that_nobody_asks_it_says_nothing(
@@ -279,6 +281,7 @@ def test_what_is_overheard_is_never_good_and_as_old_as_its_first_byte_may_be(tmp
     assert sample.age(time.monotonic()) >= 3.0
 
 
+@pytest.mark.slow
 def test_a_listener_that_stood_still_tells_no_old_value_as_new(tmp_path: Path) -> None:
     with create_server(("127.0.0.1", 0)) as server:
         path = written(tmp_path, server.getsockname()[1])

@@ -50,6 +50,7 @@ def test_a_read_says_that_the_format_differs(busmaster: Command, verbose: TcpSer
     assert done.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_scan_and_a_poll_say_so_too(busmaster: Command, verbose: TcpServer) -> None:
     found = busmaster("scan", verbose.path, *HCP2, "--nodes", "2-3")
     assert found.lines[0].startswith(f"2 read element 1: {WHAT}; {HINT}")
@@ -59,6 +60,7 @@ def test_a_scan_and_a_poll_say_so_too(busmaster: Command, verbose: TcpServer) ->
     assert error == WHAT
 
 
+@pytest.mark.slow
 def test_the_doctor_says_so_too(busmaster: Command, verbose: TcpServer) -> None:
     found = busmaster("doctor", verbose.path, *HCP2, "--nodes", "2-3", "--json")
     (node,) = [finding for finding in map(json.loads, found.lines) if finding["topic"] == "node 2"]

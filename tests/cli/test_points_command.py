@@ -59,6 +59,7 @@ def test_people_see_a_table_with_the_columns_in_which_something_is_said(busmaste
     assert len({line.index("temperature") for line in shown.lines[1:] if "temperature" in line}) == 1
 
 
+@pytest.mark.slow
 def test_a_terminal_narrower_than_the_table_shows_the_points_one_below_the_other(path: Path) -> None:
     shown, terminal = pty.openpty()
     with os.fdopen(shown, "rb", buffering=0) as reader:
@@ -76,6 +77,7 @@ def test_a_file_without_points_says_so(busmaster: Command, path: Path) -> None:
     assert busmaster("points", str(path)).lines == ["no points: describe them in [nodes.NAME.points]"]
 
 
+@pytest.mark.slow
 def test_out_and_in_again_the_file_is_not_even_written(path: Path) -> None:
     before = path.stat()
     out = process(path, "--csv", encoding="ascii")
@@ -88,6 +90,7 @@ def test_out_and_in_again_the_file_is_not_even_written(path: Path) -> None:
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
+@pytest.mark.slow
 def test_points_go_from_one_file_to_another_and_come_out_the_same(path: Path, tmp_path: Path) -> None:
     (tmp_path / "points.csv").write_bytes(process(path, "--csv").stdout)
     other = tmp_path / "other.toml"

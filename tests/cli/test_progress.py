@@ -8,6 +8,8 @@ import subprocess
 import sys
 from contextlib import suppress
 
+import pytest
+
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT
 from tests.patience import PATIENCE
@@ -37,6 +39,7 @@ def scan_on_a_terminal(port: str, *, results_too: bool) -> tuple[bytes, bytes]:
     return out or b"", drawn
 
 
+@pytest.mark.slow
 def test_the_bar_is_drawn_on_the_terminal_and_standard_output_has_the_results_alone(controllers: TcpServer) -> None:
     out, drawn = scan_on_a_terminal(controllers.path, results_too=False)
     assert out == b"6 read element 1: 0\n7 read element 1: 0\n8 read element 1: 0\n"
@@ -45,6 +48,7 @@ def test_the_bar_is_drawn_on_the_terminal_and_standard_output_has_the_results_al
     assert b"element" not in drawn
 
 
+@pytest.mark.slow
 def test_a_result_on_the_same_terminal_has_a_line_of_its_own(controllers: TcpServer) -> None:
     _, drawn = scan_on_a_terminal(controllers.path, results_too=True)
     for node in b"678":

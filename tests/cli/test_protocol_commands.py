@@ -37,6 +37,7 @@ def mentor(busmaster: Command, mentors: TcpServer) -> Ask:
     return lambda verb, *rest: busmaster(verb, mentors.path, "--protocol", "mentor", "--node", "12", *rest)
 
 
+@pytest.mark.slow
 def test_msc_data_flags_and_status(msc: Ask) -> None:
     assert msc("write", "2008=1234", "flag:40=1", "--verify").lines == ["2008 ok", "flag:40 ok"]
     assert msc("read", "2008", "flag:40", "flag:41", "status").lines == [
@@ -49,6 +50,7 @@ def test_msc_data_flags_and_status(msc: Ask) -> None:
     assert 40 in json.loads(msc("read", "flags", "--json").out)["value"]
 
 
+@pytest.mark.slow
 def test_msc_values_in_a_row_need_the_address_step(msc: Ask) -> None:
     refused = msc("write", "3000=1,2,3")
     assert (refused.status, refused.out) == (2, "")
@@ -80,6 +82,7 @@ def test_msc_refuses_before_anything_is_sent(msc: Ask, assignment: str, complain
     assert msc("read", "2000").out == "2000 0\n"
 
 
+@pytest.mark.slow
 def test_mentor_parameters_wide_integers_and_runs(mentor: Ask) -> None:
     assert mentor("write", "1.17=-476", "15.60:wide=54321", "--verify").lines == ["1.17 ok", "15.60:wide ok"]
     assert mentor("write", "1.18=1,2").out == "1.18 ok\n"
@@ -116,6 +119,7 @@ def test_mentor_says_that_a_parameter_does_not_exist(mentor: Ask) -> None:
     assert "read 17.23" in outcome.err
 
 
+@pytest.mark.slow
 def test_dc104_takes_no_node_and_raw_16_bit_values(busmaster: Command) -> None:
     with serve("dc104", 0) as server:
         dc104 = ("--protocol", "dc104")

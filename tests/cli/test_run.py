@@ -96,6 +96,7 @@ def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None
     assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "quality", "error", "late"}
 
 
+@pytest.mark.slow
 def test_run_takes_another_port_and_records_the_line(line: Path, controllers: TcpServer) -> None:
     line.write_text(line.read_text().replace(controllers.path, "socket://127.0.0.1:1"))
     capture = line.parent / "x.pcapng"
@@ -115,6 +116,7 @@ def test_run_on_a_port_that_is_not_there_says_why_once_and_waits(line: Path) -> 
     assert "cannot connect" not in said + rest
 
 
+@pytest.mark.slow
 def test_an_output_that_is_down_is_said_and_the_line_runs_on(line: Path, tmp_path: Path) -> None:
     (tmp_path / "x.db").mkdir()
     with started("run", str(line), "--plain") as process:
@@ -230,6 +232,7 @@ def emulated(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
             process.kill()
 
 
+@pytest.mark.slow
 def test_emulate_serves_a_file_where_run_looks_for_it(tmp_path: Path) -> None:
     path = tmp_path / "line.toml"
     link = tmp_path / "tty"
@@ -244,6 +247,7 @@ def test_emulate_serves_a_file_where_run_looks_for_it(tmp_path: Path) -> None:
     assert not os.path.lexists(link)
 
 
+@pytest.mark.slow
 def test_emulate_puts_no_link_under_dev_and_goes_where_it_is_told(tmp_path: Path) -> None:
     path = tmp_path / "line.toml"
     for port in ("/dev/ttyUSB99", "usb:A500ABC"):
@@ -272,6 +276,7 @@ def test_ctrl_c_ends_a_run_with_its_summary_and_everything_written(line: Path, t
     assert err.splitlines()[-1].endswith(" written, 0 dropped")
 
 
+@pytest.mark.slow
 def test_r13_a_lost_port_and_why_it_does_not_come_back_are_told_on_standard_error(tmp_path: Path) -> None:
     path, link = tmp_path / "line.toml", tmp_path / "tty"
     path.write_text(TEXT.replace("PORT", str(link)))

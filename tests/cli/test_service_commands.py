@@ -68,6 +68,7 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, thr
     ]
 
 
+@pytest.mark.slow
 def test_points_of_a_file_are_read_by_name_and_in_their_unit_with_and_without_an_owner(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -86,6 +87,7 @@ def test_points_of_a_file_are_read_by_name_and_in_their_unit_with_and_without_an
         assert "no such point 'nowhere/1'" in ran.err
 
 
+@pytest.mark.slow
 def test_options_that_differ_from_the_owners_are_wrong_usage(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -127,6 +129,7 @@ def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path,
     assert busmaster("status").out == ""
 
 
+@pytest.mark.slow
 def test_a_line_whose_file_says_so_is_served_to_nobody(busmaster: Command, file: Path) -> None:
     file.write_text(file.read_text() + "[service]\nenabled = false\n")
     with started("run", "--plain", str(file)) as process:
@@ -137,6 +140,7 @@ def test_a_line_whose_file_says_so_is_served_to_nobody(busmaster: Command, file:
         process.communicate(timeout=PATIENCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "serve"])
 def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command: str) -> None:
     with owner("serve", str(file)) as (process, _):
@@ -153,6 +157,7 @@ def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command:
     assert f"is owned by process {process.pid}; end that first: two masters on one line garble each other" in ran.stderr
 
 
+@pytest.mark.slow
 def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
     with owner("serve", str(file)) as (process, _), serve("hcp2", 1) as other:
         ran = subprocess.run(
@@ -168,6 +173,7 @@ def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_sa
     assert f"is served already by process {process.pid}" in ran.stderr
 
 
+@pytest.mark.slow
 def test_where_the_extra_is_not_installed_a_line_runs_and_says_what_it_takes_to_share_it(
     file: Path, tmp_path: Path
 ) -> None:
@@ -185,6 +191,7 @@ def test_where_the_extra_is_not_installed_a_line_runs_and_says_what_it_takes_to_
     assert "pip install 'busmaster[service]'" in ran.stderr
 
 
+@pytest.mark.slow
 def test_an_owner_that_was_killed_leaves_nothing_in_the_way(file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, first):
         process.send_signal(signal.SIGKILL)
@@ -210,6 +217,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.slow
 def test_the_audit_is_true_of_a_program_that_was_killed_as_it_wrote(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -251,6 +259,7 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
 # every command with a PORT
 
 
+@pytest.mark.slow
 def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, address):
         port = three_controllers.path.removeprefix("socket://")
@@ -272,6 +281,7 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, thre
         assert ran.status == 0 or (ran.status == 1 and '"value": 0' not in ran.out)
 
 
+@pytest.mark.slow
 def test_a_poll_whose_owner_ends_says_so(file: Path, three_controllers: TcpServer) -> None:
     with (
         owner("serve", str(file)) as (process, address),
@@ -285,6 +295,7 @@ def test_a_poll_whose_owner_ends_says_so(file: Path, three_controllers: TcpServe
         assert "the program that owns the line has ended" in err
 
 
+@pytest.mark.slow
 def test_nothing_is_written_through_an_owner_unless_all_may_be(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -321,6 +332,7 @@ def test_commands_that_need_a_port_of_their_own_say_so_of_a_line_that_is_served(
 # by TCP
 
 
+@pytest.mark.slow
 def test_commands_come_by_tcp_with_the_token_of_the_environment(
     busmaster: Command, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -375,6 +387,7 @@ def test_tokens_that_others_may_read_keep_a_line_from_starting(busmaster: Comman
 SAFE = '[safe]\nwithin = 2.0\nrepeatable = ["winder/force"]\nwrites = { "winder/force" = 1.5 }\n'
 
 
+@pytest.mark.slow
 def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -398,6 +411,7 @@ def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
     assert [row for row in audit(file.parent) if row[0] == "safe"] == [("safe", "winder/force", 1.5, "written")] * 2
 
 
+@pytest.mark.slow
 def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -414,6 +428,7 @@ def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
 # lines of the system
 
 
+@pytest.mark.slow
 def test_status_lists_the_lines_of_the_system_too_and_which_of_them_are_not_for_this_user(
     busmaster: Command, file: Path, tmp_path: Path, three_controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -447,6 +462,7 @@ def refuse(connect: Callable[[socket.socket, Any], None]) -> Callable[[socket.so
     return refused
 
 
+@pytest.mark.slow
 def test_points_of_a_file_are_written_through_its_lines_owner(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
@@ -464,6 +480,7 @@ def test_points_of_a_file_are_written_through_its_lines_owner(
     ]
 
 
+@pytest.mark.slow
 def test_a_second_owner_is_refused_however_it_spells_the_serial_server(busmaster: Command, file: Path) -> None:
     text = file.read_text()
     other = file.parent / "other.toml"

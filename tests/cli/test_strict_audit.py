@@ -76,6 +76,7 @@ def test_no_acknowledged_write_is_missing_in_an_audit_log_after_sigkill(file: Pa
     assert len(written) >= KILLS
 
 
+@pytest.mark.slow
 def test_a_write_whose_audit_entry_cannot_be_kept_is_not_acknowledged(file: Path, tmp_path: Path) -> None:
     file.write_text(f'{file.read_text()}audit = "strict"\n')
 

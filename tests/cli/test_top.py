@@ -156,6 +156,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
+@pytest.mark.slow
 def test_a_run_whose_view_cannot_be_served_prints_plain_lines(file: Path, tmp_path: Path) -> None:
     file.write_text(file.read_text() + "[service]\nenabled = false\n")
     long = tmp_path / ("x" * 100)
@@ -178,6 +179,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_a_run_without_websockets_prints_plain_lines_and_says_what_to_install(file: Path) -> None:
     with terminal("run", str(file), program=("-c", WITHOUT)) as shown:
         shown.until(lambda drawn: b"winder/force 0" in drawn)
@@ -191,6 +193,7 @@ def test_top_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     assert top.what_is_missing() == "an extra: pip install 'busmaster[tui,service]'"
 
 
+@pytest.mark.slow
 def test_top_without_a_terminal_is_wrong_usage(file: Path) -> None:
     with owner("serve", str(file)), started("top", "slitter") as process:
         _, err = process.communicate(timeout=PATIENCE)
@@ -198,6 +201,7 @@ def test_top_without_a_terminal_is_wrong_usage(file: Path) -> None:
     assert err.startswith("busmaster: top draws on a terminal")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "said"), [("nobody", "no program of this user serves 'nobody', "), ("unix:/nobody", "no program serves ")]
 )
@@ -208,6 +212,7 @@ def test_that_there_is_no_such_line_is_said_before_that_there_is_no_terminal(lin
     assert err.startswith(f"busmaster: {said}")
 
 
+@pytest.mark.slow
 def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(
     file: Path, tmp_path: Path, three_controllers: TcpServer
 ) -> None:
@@ -223,6 +228,7 @@ def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(
     assert top.address_of("nobody") == "nobody"
 
 
+@pytest.mark.slow
 def test_top_names_the_lines_where_several_run_and_says_where_none_does(file: Path, tmp_path: Path) -> None:
     with terminal("top") as shown:
         assert shown.status() == 1

@@ -146,6 +146,7 @@ def test_behind_a_tls_proxy_the_page_its_stream_and_its_writes_work_under_its_na
             assert len(asyncio.run(follow())) == 3
 
 
+@pytest.mark.slow
 def test_with_a_name_of_a_proxy_nobody_writes_without_a_token(file: Path) -> None:
     with owner("serve", str(file)) as (_, address), web(address, "--host", NAME) as (door, client):
         until_said(door, "is followed")

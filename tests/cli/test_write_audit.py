@@ -113,6 +113,7 @@ def test_without_a_file_the_protocol_is_missed(busmaster: Command) -> None:
     assert "--protocol P, or a LINE.toml in place of the port" in ran.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "by"), [(signal.SIGTERM, "SIGTERM"), (signal.SIGINT, "SIGINT")])
 def test_the_safe_state_at_the_end_of_a_run_is_on_record_with_what_ended_it(
     path: Path, number: signal.Signals, by: str
@@ -124,6 +125,7 @@ def test_the_safe_state_at_the_end_of_a_run_is_on_record_with_what_ended_it(
     assert audit(path) == [("safe", by, "winder/force", 1.5, "written", None)]
 
 
+@pytest.mark.slow
 def test_a_safe_write_that_is_not_confirmed_is_on_record_as_unconfirmed_once(path: Path, winder: TcpServer) -> None:
     with started("run", str(path), "--plain") as process:
         polls(process)
@@ -192,6 +194,7 @@ async def told_by_mqtt(broker: Broker, path: str) -> dict[str, Any]:
     return topics
 
 
+@pytest.mark.slow
 @needs_mosquitto
 def test_mqtt_hears_of_the_write_and_nothing_of_a_line_that_another_process_may_run(path: Path, tmp_path: Path) -> None:
     with running(tmp_path) as broker:

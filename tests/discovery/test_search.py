@@ -96,6 +96,7 @@ def every_probe() -> dict[bytes, str]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
 def test_no_probe_changes_a_value_however_the_ends_are_set(kind: NodeKind) -> None:
     """Every request, said at every setting that is tried, into a device at every setting that it may have.

@@ -38,6 +38,7 @@ async def shown(of: Page, path: str) -> tuple[object, str]:
     return said["value"], said["quality"]
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_none_of_60_reads_after_60_writes_reports_the_old_value_as_good(tmp_path: Path) -> None:
     async with served(tmp_path) as line, page(tmp_path) as of:
@@ -55,6 +56,7 @@ async def test_none_of_60_reads_after_60_writes_reports_the_old_value_as_good(tm
         assert await shown(of, TWIN) == (600, "good")
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_with_read_after_write_none_of_60_reads_reports_an_old_value_as_good_and_the_new_one_comes_by_itself(
     tmp_path: Path,

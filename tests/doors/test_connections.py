@@ -76,6 +76,7 @@ async def test_requests_one_after_the_other_may_take_longer_than_one(
         end[1].close()
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_a_client_that_does_not_read_its_replies_is_let_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -124,6 +124,7 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
             await asyncio.to_thread(entered.__exit__, None, None, None)
 
 
+@pytest.mark.slow
 async def test_none_of_60_reads_after_60_writes_is_the_old_value_as_good(opened: Opened) -> None:
     async with opened.owned() as line:
         controller = Hcp2Controller(line.bus, 5)
@@ -291,6 +292,7 @@ async def test_a_point_that_the_line_has_no_longer_says_so(opened: Opened) -> No
         await opened.is_("5/11", "Good")
 
 
+@pytest.mark.slow
 async def test_a_subscription_is_told_of_each_change_of_value_and_status(opened: Opened) -> None:
     async with contextlib.AsyncExitStack() as leave:
         line = await leave.enter_async_context(opened.owned())

@@ -109,6 +109,7 @@ def test_a_door_that_is_killed_again_and_again_is_nothing_to_the_line(file: Path
         assert process.poll() is None
 
 
+@pytest.mark.slow
 def test_with_a_certificate_only_trusted_clients_come_and_users_with_a_token_write(file: Path, tmp_path: Path) -> None:
     server_files, client_files = certificate(tmp_path / "own", "door"), certificate(tmp_path / "trusted", "client")
     other_files = certificate(tmp_path / "others", "other")

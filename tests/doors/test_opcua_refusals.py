@@ -58,6 +58,7 @@ def monitor(client: OtherClient, names: list[str], kind: Any = None, deadband: f
         subscription.delete()
 
 
+@pytest.mark.slow
 async def test_a_read_that_is_not_supported_is_refused(opened: Opened) -> None:
     async with opened.owned() as line:
         line.poll("10")
@@ -192,6 +193,7 @@ async def test_a_connection_without_a_session_is_closed(opened: Opened, monkeypa
     await asyncio.to_thread(closes, (host, int(port)), b"")
 
 
+@pytest.mark.slow
 async def test_the_work_of_a_client_that_is_killed_ends_at_once(opened: Opened) -> None:
     async with opened.owned() as line:
         line.poll("10")

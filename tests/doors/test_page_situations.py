@@ -42,6 +42,7 @@ async def reads(browser: Browser, *words: str, without: str = NOTHING) -> str:
     return str(await asyncio.to_thread(browser.until, fact, without, words))
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_a_person_reads_of_a_dead_drive_a_lost_line_and_an_owner_that_is_away(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -441,6 +441,7 @@ async def test_of_what_a_slow_page_has_not_taken_the_latest_of_each_is_told() ->
 # the line beside it
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_doors_with_pages_that_come_and_go_leave_nothing_with_the_line(tmp_path: Path) -> None:
     async with served(tmp_path) as line:

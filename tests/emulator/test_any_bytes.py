@@ -184,6 +184,7 @@ def made(kind: Kind) -> Device:
     return device
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 @given(st.data())
 @settings(max_examples=50)

@@ -333,6 +333,7 @@ def test_a_cut_may_spare_the_devices_before_it() -> None:
 # Anything, in any order
 
 
+@pytest.mark.slow
 @given(
     st.integers(),
     st.lists(st.tuples(st.sampled_from(["send", "wait", "cut", "restore", "restart", "look"]), st.floats(0, 0.01))),

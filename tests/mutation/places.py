@@ -7,6 +7,7 @@ what only types are made of, and docstrings.
 from __future__ import annotations
 
 import ast
+import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "pump": ("busmaster/transport/pump.py", "busmaster/transport/marks.py"),
 }
 """The rooms whose mutants count, by patterns of their files."""
+WITHOUT_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONPYCACHEPREFIX": os.devnull}
+"""Environment of tests whose code changes: a change within a second that keeps a file's size would not be compiled. The
+second variable keeps tests/conftest.py from caching bytecode all the same."""
 IDLE = {"core/ReplaceComparisonOperator_Is_Eq", "core/ReplaceComparisonOperator_IsNot_NotEq"}
 """Operators that change nothing here: `is` compares None, members of enums, and objects that equal only themselves."""
 

@@ -23,6 +23,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.mutation.places import WITHOUT_BYTECODE
+
 ROOT = Path(__file__).parents[2]
 LISTS = sorted(Path(__file__).parent.glob("planted_*.json"))
 PAGE = ROOT / "docs" / "planted-bugs.md"
@@ -157,7 +159,7 @@ def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
     run = subprocess.run(
         [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"--timeout={LONGEST}", *tests],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"},
+        env=os.environ | WITHOUT_BYTECODE | {"PYTHONPATH": str(folder), "CI": "true"},
         capture_output=True,
         text=True,
         check=False,

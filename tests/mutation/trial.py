@@ -20,7 +20,7 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
 from tests.mutation.asked import NEAR, Measured, asked, changed_lines
-from tests.mutation.places import Mutant
+from tests.mutation.places import WITHOUT_BYTECODE, Mutant
 from tests.mutation.warm import UNLIKE
 
 
@@ -101,7 +101,7 @@ class Copy:
         return subprocess.Popen(
             [sys.executable, "-m", "tests.mutation.warm", what, str(self._said(what)), *arguments],
             cwd=self.folder,
-            env=os.environ | {"PYTHONPATH": str(self.folder), "CI": "true"},
+            env=os.environ | WITHOUT_BYTECODE | {"PYTHONPATH": str(self.folder), "CI": "true"},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -295,6 +295,7 @@ def threads_of_ours() -> int:
     return sum(thread.name.startswith("busmaster") for thread in threading.enumerate())
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_a_thousand_half_open_connections_cost_no_threads_and_keep_no_scrape_out(
     capfd: pytest.CaptureFixture[str],
@@ -317,6 +318,7 @@ async def test_a_thousand_half_open_connections_cost_no_threads_and_keep_no_scra
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_two_hundred_scrapes_at_once_are_all_answered_by_a_few_threads(capfd: pytest.CaptureFixture[str]) -> None:
     async def scrape(port: int) -> bytes:

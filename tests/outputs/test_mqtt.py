@@ -219,6 +219,7 @@ def answering(answer: bytes) -> Iterator[int]:
             thread.join()
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 @pytest.mark.parametrize(
     ("answer", "said"),

@@ -360,6 +360,7 @@ async def test_that_commands_are_not_heard_any_more_is_noticed_on_their_own_conn
     forbidden.close()
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_more_commands_than_the_line_takes_are_refused_not_kept(broker: Broker) -> None:
     async with plant(broker) as there:

@@ -68,6 +68,7 @@ def numbers(path: Path) -> list[int]:
 every = pytest.mark.parametrize("make", [csv, jsonl, sqlite])
 
 
+@pytest.mark.slow
 @every
 def test_ten_times_what_memory_holds_waits_on_disk_and_is_written_in_order(tmp_path: Path, make: Make) -> None:
     (tmp_path / "x").mkdir()
@@ -251,6 +252,7 @@ async def test_an_output_that_a_file_does_not_name_any_more_says_what_it_leaves_
     assert told[-1] == "csv is ended: 0 written, 0 dropped, 2 kept on disk"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["csv", "sqlite"])
 def test_a_full_disk_costs_nothing_where_what_waits_is_on_another(tmp_path: Path, kind: str) -> None:
     (tmp_path / "disk").mkdir()

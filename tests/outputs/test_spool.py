@@ -101,6 +101,7 @@ async def values_heard(broker: Broker, output: MqttOutput, count: int) -> list[i
     return [payload["value"] for _, payload, _ in found]
 
 
+@pytest.mark.slow
 @needs_mosquitto
 @pytest.mark.asyncio
 async def test_what_a_broker_that_is_away_misses_is_sent_in_order_when_it_is_back(tmp_path: Path) -> None:
@@ -129,6 +130,7 @@ async def test_what_a_broker_that_is_away_misses_is_sent_in_order_when_it_is_bac
     assert output.statistics() == type(counts)("mqtt", "written", 500, 0, 0, "", 0)
 
 
+@pytest.mark.slow
 @needs_mosquitto
 @pytest.mark.asyncio
 @pytest.mark.parametrize("silent", [False, True])
@@ -193,6 +195,7 @@ def killed(folder: Path) -> int:
     return spilled
 
 
+@pytest.mark.slow
 @needs_mosquitto
 @pytest.mark.asyncio
 async def test_a_process_that_is_killed_loses_nothing_that_it_had_put_on_disk(tmp_path: Path) -> None:

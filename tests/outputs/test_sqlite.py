@@ -232,6 +232,7 @@ def test_at_once_a_tenth_is_forgotten_and_never_more_than_a_piece(
     assert database.execute("select min(time) from samples").fetchone() == (gone,)
 
 
+@pytest.mark.slow
 def test_a_limit_in_megabytes_forgets_the_oldest_and_the_events_of_that_time(tmp_path: Path) -> None:
     path = tmp_path / "x.db"
     now = time.monotonic()
@@ -248,6 +249,7 @@ def test_a_limit_in_megabytes_forgets_the_oldest_and_the_events_of_that_time(tmp
     assert query(path, "select count(*) from events") == [(0,)]
 
 
+@pytest.mark.slow
 def test_a_limit_in_megabytes_holds_where_hardly_anything_but_refused_commands_comes(tmp_path: Path) -> None:
     path = tmp_path / "x.db"
     with recording(path, keep_mb=0.5) as output:

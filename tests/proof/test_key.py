@@ -49,6 +49,7 @@ WALKS = 40
 pytestmark = pytest.mark.timeout(300)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", [*EVERY.values(), OWES, LEARNS], ids=[*EVERY, "owes", "learns"])
 def test_a_world_that_was_restored_from_its_key_has_the_same_fate(setup: Setup) -> None:
     assert sum(walk(setup, seed) for seed in range(WALKS)) > WALKS
@@ -142,6 +143,7 @@ def without_when_it_began(view: View) -> None:
         backlog._since = -inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("forget", "setup"),
     [

@@ -309,6 +309,7 @@ def with_a_last_attempt_that_is_not_waited_for(patch: Any) -> None:
     patch.setattr(InStep, "over", lambda in_step, answers: -inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "setup", "rule"),
     [

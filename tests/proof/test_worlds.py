@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import pytest
 
 from tests.proof.explore import Explorer
@@ -13,9 +16,15 @@ LIMIT = 600.0
 """Seconds for one world: a few of an idle core, and a busy one is ten times slower."""
 
 
-@pytest.mark.slow
+def in_tiers() -> Iterator[Any]:
+    """The first world by default, and the largest ones before a release."""
+    for number, setup in enumerate(quick()):
+        large = setup.kind == "msc" and setup.in_step
+        yield pytest.param(setup, marks=[pytest.mark.exhaustive] if large else [pytest.mark.slow] if number else [])
+
+
 @pytest.mark.timeout(LIMIT + 30)
-@pytest.mark.parametrize("setup", list(quick()), ids=lambda setup: setup.name)
+@pytest.mark.parametrize("setup", list(in_tiers()), ids=lambda setup: setup.name)
 def test_nothing_breaks_a_promise_in_a_world_that_is_explored_to_the_end(setup: Setup) -> None:
     found = Explorer(setup).run(LIMIT)
     for problem, histories in found.violations.items():

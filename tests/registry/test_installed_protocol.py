@@ -130,6 +130,7 @@ def test_an_option_of_its_own_is_no_option_of_others(tally: None, busmaster: Com
     assert "--gate is for tally alone" in wrong.err
 
 
+@pytest.mark.slow
 def test_the_doctor_asks_its_nodes(served: TcpServer, busmaster: Command) -> None:
     found = busmaster("doctor", served.path, *TALLY, "--nodes", "3", "--timeout", "1000")
     assert found.status == 0

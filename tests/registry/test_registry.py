@@ -30,6 +30,7 @@ from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.registry import NodeKind, Protocol, find, kinds, make_device, protocols
 from tests.patience import PATIENCE
+from tests.tiers import one_by_default
 
 every_kind = pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
 every_protocol = pytest.mark.parametrize("protocol", protocols(), ids=lambda protocol: protocol.name)
@@ -161,7 +162,7 @@ SCALARS = st.none() | st.booleans() | st.integers(-3, 300) | st.integers() | st.
 VALUES = st.recursive(SCALARS, lambda some: st.lists(some, max_size=33) | st.dictionaries(TEXTS, some, max_size=2))
 
 
-@every_protocol
+@pytest.mark.parametrize("protocol", one_by_default(protocols()), ids=lambda protocol: protocol.name)
 @given(st.data())
 def test_whatever_a_stranger_writes_down_is_a_command_that_can_be_sent_or_invalid(
     protocol: Protocol, data: st.DataObject

@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import random
 
+import pytest
+
 from tests.patience import PATIENCE
 from tests.service.assault import assault
 
 
+@pytest.mark.slow
 def test_whatever_programs_do_to_it_the_owner_goes_on_and_its_records_are_true() -> None:
     async def run() -> None:
         async with asyncio.timeout(PATIENCE):

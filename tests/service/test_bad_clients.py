@@ -351,6 +351,7 @@ def test_a_program_that_is_lost_while_it_does_not_read_leaves_all_the_same(
     on_a_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_a_thousand_programs_come_and_go_as_they_like_and_leave_nothing(tmp_path: Path) -> None:
     chance = random.Random(1)
     half_open: list[asyncio.StreamWriter] = []

@@ -166,6 +166,7 @@ def test_a_program_that_stands_still_is_let_go(tmp_path: Path, monkeypatch: pyte
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

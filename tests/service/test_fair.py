@@ -51,6 +51,7 @@ def payer(transaction: Transaction) -> LineClient | None:
     return client.client if isinstance(client, Hold) else client
 
 
+@pytest.mark.slow
 def test_a_program_that_asks_more_than_it_may_at_a_time_has_it_all_answered(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
@@ -72,6 +73,7 @@ def test_a_program_that_asks_more_than_it_may_at_a_time_has_it_all_answered(tmp_
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_requests_that_are_given_up_make_room_for_others(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
@@ -87,6 +89,7 @@ def test_requests_that_are_given_up_make_room_for_others(tmp_path: Path) -> None
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         absent = Hcp2Controller(remote, ABSENT, timings=PATIENT)
@@ -112,6 +115,7 @@ def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Pa
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_r9_a_program_with_thousands_of_requests_delays_anothers_by_two_exchanges_at_most(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         asked = watched(line)
@@ -158,6 +162,7 @@ def test_r9_a_sequence_of_one_program_is_not_interrupted_by_another(tmp_path: Pa
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_a_sequence_of_a_program_that_floods_the_line_itself_goes_on(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         mine = Hcp2Controller(remote, 5)

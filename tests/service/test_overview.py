@@ -287,6 +287,7 @@ def test_one_that_does_not_read_sees_fewer_pictures_and_no_other_fewer(tmp_path:
     on_a_watched_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_the_line_goes_between_one_part_and_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     turn, worked = 0, list[int]()
 

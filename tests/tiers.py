@@ -1,0 +1,25 @@
+"""Parametrisations of which a part runs by default and the rest with `-m slow`: what each shows is shown in both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import pytest
+
+
+def one_by_default(values: Iterable[Any]) -> list[Any]:
+    """Return parameters of which the first runs by default; the others are slow."""
+    first, *others = values
+    return [first, *(pytest.param(value, marks=pytest.mark.slow) for value in others)]
+
+
+def in_turn_by_default(firsts: Iterable[Any], seconds: Iterable[Any]) -> list[Any]:
+    """Return all pairs as parameters. By default each of the seconds runs once, with the next of the firsts in turn;
+    the other pairs are slow."""
+    turns: Sequence[Any] = list(firsts)
+    return [
+        pytest.param(first, second, marks=[] if number % len(turns) == turn else [pytest.mark.slow])
+        for number, second in enumerate(seconds)
+        for turn, first in enumerate(turns)
+    ]
