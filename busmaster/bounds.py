@@ -100,6 +100,8 @@ MOST_POLLED_POINTS = 1000
 """Points of one poll group of a client."""
 LONGEST_REPLY = 5.0
 """Seconds for which a client may have the line wait for a reply: nothing else is sent meanwhile."""
+LONGEST_WAIT = 86_400.0
+"""Seconds of `start_within` and `finish_within` of a client's request: a day."""
 LONGEST_SUSPENSION = 86_400.0
 """Seconds for which a node can be suspended: a day. A suspension does not end with the program that asked for it."""
 

@@ -12,7 +12,7 @@ from busmaster.cli.output import Level, note
 
 NAME = "busmaster.audit"
 TICK = 0.05
-MOST_WAITING = 1_000
+MOST_WAITING_ENTRIES = 1_000
 """Lines that may wait for a standard error from which nobody takes them."""
 FAREWELL = 2.0
 """Seconds in which it is to take the rest, at the end."""
@@ -54,7 +54,7 @@ class AuditLog(logging.Handler):
         """Have it printed. Never waits."""
         if not self._is_free():
             return
-        if len(self._waiting) >= MOST_WAITING:
+        if len(self._waiting) >= MOST_WAITING_ENTRIES:
             self._lost += 1
             return
         level = Level.WARNING if record.levelno >= logging.WARNING else Level.INFO

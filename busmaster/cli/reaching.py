@@ -5,9 +5,7 @@ A PORT that another busmaster owns is reached through that, and so are `unix:PAT
 
 from __future__ import annotations
 
-import ipaddress
 import os
-import socket
 from collections.abc import Hashable, Mapping
 from typing import Any
 from urllib.parse import parse_qs
@@ -17,9 +15,8 @@ import click
 from busmaster.bus.bus import Bus
 from busmaster.cli.arguments import Connection
 from busmaster.cli.output import note
-from busmaster.contract.arguments import host_and_port
 from busmaster.errors import BusError, InvalidCommand, LineDown
-from busmaster.service.folder import Owner, owners
+from busmaster.service.folder import Owner, addresses_of, owners
 from busmaster.service.remote import RemoteBus
 from busmaster.transport.endpoints import Endpoint, is_served
 from busmaster.transport.identity import resolve
@@ -93,23 +90,10 @@ def device_of(name: str, *, by_tcp: bool) -> set[Hashable]:
     """Return what a port's name leads to: a device, or the addresses of a host with the port."""
     try:
         if by_tcp:
-            host, port = host_and_port(name)
-            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-            return {(plain_address(str(place[0])), place[1]) for *_, place in found}
+            return addresses_of(name)
         return {os.path.realpath(resolve(name))}
     except (InvalidCommand, BusError, OSError):  # it is not there now, or a name of the other kind
         return {name}
-
-
-def plain_address(text: str) -> str:
-    """Return an address in the one spelling that is compared.
-
-    The same server is at ::ffff:192.0.2.7 as at 192.0.2.7; at 0.0.0.0, :: and ::1 it is this machine's.
-    """
-    address = ipaddress.ip_address(text)
-    address = getattr(address, "ipv4_mapped", None) or address
-    is_here = address.is_unspecified or address == ipaddress.IPv6Address(1)
-    return "127.0.0.1" if is_here else str(address)
 
 
 def check_settings(connection: Connection, about: Mapping[str, Any]) -> None:

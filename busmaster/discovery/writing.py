@@ -18,7 +18,7 @@ from busmaster.transport import identity
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-SHORTEST_PERIOD = 0.5
+SHORTEST_WRITTEN_PERIOD = 0.5
 ROOM = 2.0
 """How much longer than its exchanges a cycle of all nodes may take."""
 NEAR = 0.75
@@ -114,7 +114,7 @@ def _node(name: str, node: Found) -> Iterator[str]:
 def _period(settings: LineSettings | None, nodes: Sequence[Found]) -> float:
     """Return a period, in seconds, in which all of them can be asked with room to spare."""
     total = sum(node.starts[-1] + 64 * (settings or node.protocol.profile.line).byte_time for node in nodes)
-    return max(SHORTEST_PERIOD, math.ceil(2 * ROOM * total) / 2)
+    return max(SHORTEST_WRITTEN_PERIOD, math.ceil(2 * ROOM * total) / 2)
 
 
 __all__ = ["lasting", "line_text", "summary"]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Transaction
+from busmaster.bounds import LONGEST_WAIT
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, RequestOptions
@@ -336,6 +337,7 @@ def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLin
     if not set(given) <= OPTIONS:
         raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
     RequestOptions.of(given, node.label)  # checked here, before it may wait
+    _check_waits(given, node)
     now, stops_seen = line.bus.now(), said.get("stops_seen")
     stops_seen = None if stops_seen is None else stops_seen + asker.stops_before(node)
     client = asker.client_of(said.get("sequence"), node)
@@ -346,6 +348,16 @@ def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLin
         options = replace(options, priority=max(options.priority, asker.rights.reads))
         return Reading(node, command, client, stops_seen, options)
     return Writing(task, given, line=line, asker=asker, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+
+
+def _check_waits(options: CommandOptions, node: Node) -> None:
+    """Raise InvalidCommand for a request that may wait for longer than a client can mean."""
+    for name in ("start_within", "finish_within"):
+        limit = options.get(name)
+        if isinstance(limit, int | float) and limit > LONGEST_WAIT:
+            raise InvalidCommand(
+                f"{node.label}: {name} is {LONGEST_WAIT:g} s at most, not {limit:g} s: leave it out for no limit"
+            )
 
 
 def _left(options: CommandOptions, age: float) -> CommandOptions:

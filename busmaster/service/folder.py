@@ -8,23 +8,25 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import ipaddress
 import json
 import os
 import re
 import socket
 import stat
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
 from busmaster.bounds import LONGEST_LINE_RECORD
+from busmaster.contract.arguments import host_and_port
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.files import read_file
 
 SYSTEM = Path("/run/busmaster")
 """Where the lines are that systemd runs."""
-LONGEST_NAME = 60
+LONGEST_LINE_NAME = 60
 LONGEST_PATH = 107
 """Bytes of a Unix socket's path that the kernel takes."""
 
@@ -49,7 +51,7 @@ class Owner:
 
 def line_name(text: str) -> str:
     """Return what a line is called after its file or its port: /dev/ttyUSB0 is "ttyUSB0"."""
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", os.path.basename(text.rstrip("/")) or text).strip(".-")[:LONGEST_NAME]
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", os.path.basename(text.rstrip("/")) or text).strip(".-")[:LONGEST_LINE_NAME]
     return name or "line"
 
 
@@ -104,15 +106,48 @@ def owners() -> Iterator[Owner]:
 
 
 def find_owner(port: str) -> Owner | None:
-    """Return who serves the line that has this name, or whose port this is, however the port is written."""
-    device = _device(port)
-    return next((owner for owner in owners() if owner.name == port or _device(owner.port) == device), None)
+    """Return who serves the line that has this name, or whose port this is, however the port is written.
+
+    It may take long: a host is known by its addresses.
+    """
+    known = list(owners())
+    by_name = next((owner for owner in known if owner.name == port), None)
+    if by_name is not None:
+        return by_name
+    wanted = _devices(port)
+    return next((owner for owner in known if wanted & _devices(owner.port)), None)
 
 
-def _device(port: str) -> str:
-    """Return what a port is, whatever leads to it and is said of it: a device, or HOST:PORT."""
+def _devices(port: str) -> set[Hashable]:
+    """Return what a port is, whatever leads to it and is said of it: a device, or the addresses of a serial server."""
     name = port.partition("?")[0].removeprefix("socket://")
-    return os.path.realpath(name) if name.startswith("/") else name
+    if name.startswith("/"):
+        return {os.path.realpath(name)}
+    try:
+        return addresses_of(name)
+    except (InvalidCommand, OSError):  # it is the name of a line, or of a host that nobody knows now
+        return {name}
+
+
+def addresses_of(name: str) -> set[Hashable]:
+    """Return the addresses of `HOST:PORT`, each in the one spelling that is compared. It may take long.
+
+    Raises InvalidCommand for what is something else, OSError for a host that is not known.
+    """
+    host, port = host_and_port(name)
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    return {(plain_address(str(place[0])), place[1]) for *_, place in found}
+
+
+def plain_address(text: str) -> str:
+    """Return an address in the one spelling that is compared.
+
+    The same server is at ::ffff:192.0.2.7 as at 192.0.2.7; at 0.0.0.0, :: and ::1 it is this machine's.
+    """
+    address = ipaddress.ip_address(text)
+    address = getattr(address, "ipv4_mapped", None) or address
+    is_here = address.is_unspecified or address == ipaddress.IPv6Address(1)
+    return "127.0.0.1" if is_here else str(address)
 
 
 def socket_path(address: str) -> str:
@@ -189,7 +224,7 @@ class ServedSocket:
                 other = _read(self._line)
                 who = "another process" if other is None else f"process {other.pid}, for {other.port}"
                 mend = "use it, or end that first"
-                if other is not None and _device(other.port) != _device(self.owner.port):
+                if other is not None and not _devices(other.port) & _devices(self.owner.port):
                     mend = "call this line something else, after which its socket is named"
                 raise InvalidCommand(f"{self._path} is served already by {who}: {mend}") from None
             os.close(self._lock)

@@ -105,7 +105,10 @@ class Link:
 
     async def open(self, program: str) -> dict[str, Any]:
         """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
-        where, place = _where(self.address)
+        # A thread, since the host of a serial server may have to be found.
+        where, place = (
+            await asyncio.to_thread(_where, self.address) if is_a_name(self.address) else _where(self.address)
+        )
         loop = asyncio.get_running_loop()
         self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
         params: dict[str, Any] = {"versions": list(VERSIONS), "program": program}
@@ -301,6 +304,11 @@ class Link:
             asked.future.set_exception(error)
         else:
             asked.future.set_result(said.get("result"))
+
+
+def is_a_name(address: str) -> bool:
+    """Return whether an address is the name of a line or of a port, and not itself a place."""
+    return not address.startswith((TCP, "unix:"))
 
 
 def _where(address: str) -> tuple[str, tuple[str, int] | None]:

@@ -80,7 +80,7 @@ def test_nothing_is_printed_into_a_picture(gate: Gate, printed: Printed) -> None
 def test_a_standard_error_that_takes_nothing_holds_up_nobody_and_what_is_lost_is_told(
     gate: Gate, printed: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(audit_log, "MOST_WAITING", 3)
+    monkeypatch.setattr(audit_log, "MOST_WAITING_ENTRIES", 3)
     printed.goes_on.clear()
     with AuditLog(lambda: True):
         write(gate, "5/0")

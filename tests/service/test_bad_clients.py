@@ -450,6 +450,65 @@ def test_a_line_is_found_by_its_name_and_by_its_port_however_that_is_written(
     assert list(owners()) == []
 
 
+@pytest.mark.parametrize(
+    "spelling",
+    [
+        "127.0.0.1:4001",
+        "socket://LOCALHOST:4001",
+        "[::ffff:127.0.0.1]:4001",
+        "socket://[::ffff:7f00:1]:4001?echo=1",
+        "127.1:4001",
+    ],
+)
+def test_the_owner_of_a_serial_server_is_found_by_its_address_in_any_spelling(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spelling: str
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = runtime_folder()
+    with ServedSocket(Owner("slitter", "localhost:4001", str(folder / "slitter.sock"), os.getpid())) as served_socket:
+        assert find_owner(spelling) == served_socket.owner
+        assert find_owner(spelling.replace("4001", "4002")) is None
+        assert find_owner("no such name") is None
+
+
+@pytest.mark.parametrize("name", ["start_within", "finish_within"])
+@pytest.mark.parametrize(
+    ("value", "complaint"),
+    [
+        ("1e308", "86400 s at most, not 1e+308 s: leave it out for no limit"),
+        ("86400.5", "86400 s at most"),
+        ("1" * 400, "is a time of 0 s or more"),
+        ("NaN", "is a time of 0 s or more"),
+        ("Infinity", "is a time of 0 s or more"),
+        ('{"float": "inf"}', "is a time of 0 s or more"),
+        ("true", "is a time of 0 s or more"),
+        ("-1", "is a time of 0 s or more"),
+    ],
+)
+def test_a_request_waits_for_a_time_that_a_client_can_mean(
+    tmp_path: Path, name: str, value: str, complaint: str
+) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for command in ('{"command": "read", "element": 1}', '{"command": "write", "element": 1, "values": [7.0]}'):
+                params = f'{{"protocol": "hcp2", "address": 5, "command": {command}, "options": {{"{name}": {value}}}}}'
+                await client.connection.send(f'{{"jsonrpc":"2.0","method":"request","params":{params},"id":1}}')
+                said = await client.hear()
+                assert name in said["error"]["message"]
+                assert complaint in said["error"]["message"]
+            assert line.bus.statistics().exchanges == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_request_may_wait_for_a_day(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        assert await controller.read(1, start_within=86_400, finish_within=86_400.0) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_systemd_says_where_its_lines_have_their_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", f"{tmp_path}/slitter")
     assert runtime_folder() == tmp_path / "slitter"

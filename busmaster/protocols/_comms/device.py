@@ -20,7 +20,7 @@ from busmaster.wire.checks import xor
 STX, ETX, EOT, ENQ, ACK, BEL = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 FIRST_PRINTABLE = 0x20
 LONGEST_WRITE = 60
-LONGEST_REPLY = 20
+LONGEST_REPLY_TEXT = 20
 GREATEST = 1e9
 """What a value may be that is there from the start."""
 DECIMALS = Decimal("0.0001")
@@ -214,7 +214,7 @@ class HostCommsDevice(Device):
     def _answer_read(self, element: int, now: float) -> None:
         value = self.read_element(element, now) if self.traceable is None else self.traceable.read(element)
         text = None if value is None else number_text(value, self.fixed_decimals)
-        if text is None or len(text) > LONGEST_REPLY:
+        if text is None or len(text) > LONGEST_REPLY_TEXT:
             self.reply(NAK, now)
         else:
             self.reply(telegram(self.framing, element, text), now)

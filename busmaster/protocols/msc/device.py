@@ -52,7 +52,7 @@ REPLIES = {b"DREAD,": VALUE, b"BREAD,": VALUE * BLOCK, b"RFLAGS,": FLAGS // 8, b
 RUNNING, RAM_NOT_RELIABLE, SYSTEM_RESET, AUTO_START = 1, 4, 8, 64
 RUN_FLAG = 200
 """The user flag that lets the program count. Ours, like the address: the document has no program."""
-SHORTEST_PERIOD = 0.001
+SHORTEST_COUNT_PERIOD = 0.001
 FORM = "a data address that there is, flag:5, flags (the numbers of those that are on), or status"
 COUNT = 2000
 """The data address at which it counts."""
@@ -93,8 +93,8 @@ class EmulatedMsc(Device):
                 f"no MSC is unit {address}, an {model!r} or has addresses {address_step} apart: use units 1 to 15, "
                 f"{', '.join(MODELS)}, and steps of 1, 2 or 4"
             )
-        if period < SHORTEST_PERIOD:
-            raise InvalidCommand(f"its program counts every {SHORTEST_PERIOD} s at most, not every {period:g} s")
+        if period < SHORTEST_COUNT_PERIOD:
+            raise InvalidCommand(f"its program counts every {SHORTEST_COUNT_PERIOD} s at most, not every {period:g} s")
         if traceable is not None and traceable.modulus > 2**31:
             raise InvalidCommand(f"an MSC carries 2**31 traceable values, not {traceable.modulus}")
         self.model = model
