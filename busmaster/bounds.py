@@ -71,6 +71,9 @@ has not requested it."""
 MOST_STRANGERS = 64
 """Connections from which no first message has arrived: one more closes the oldest of the user or the address that has
 most of them."""
+MOST_FRAMES = 50
+"""Frames of a client within a second that are not a whole message: pings, pongs and pieces of messages. Each takes as
+long to understand as a request, and no client needs so many: the connection of one that sends more is closed."""
 MOST_REQUESTS = 256
 """Requests of one client that have not been answered."""
 MOST_URGENT = 16

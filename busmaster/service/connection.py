@@ -8,9 +8,10 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable
+from math import inf
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from busmaster.bounds import SEND_WITHIN
+from busmaster.bounds import MOST_FRAMES, SEND_WITHIN
 from busmaster.errors import InvalidCommand
 from busmaster.gate.refusals import peer_of
 from busmaster.service.frames import NO_MASK, look_at, new_key, text_frame
@@ -215,6 +216,9 @@ class Connection(asyncio.BufferedProtocol):
         del self._rest[:size]
         return part
 
+    def _check_frame(self) -> None:
+        """Look at a frame that is not a whole message."""
+
     def _feed(self, data: bytes) -> None:
         """Have the library see to what is no whole text."""
         self._core.receive_data(data)
@@ -226,6 +230,7 @@ class Connection(asyncio.BufferedProtocol):
                 self._shake_hands(event)
 
     def _hear(self, frame: Frame) -> None:
+        self._check_frame()
         if frame.opcode >= _CONTROL:
             return
         if frame.opcode:
@@ -285,10 +290,24 @@ class ServedConnection(Connection):
         super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
         self.origin: int | str | None = None
         """Where the connection comes from: the number of a user, or an address of the network."""
+        self._frames = 0
+        self._counted_from = -inf
+        """When it was begun to count frames."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.origin = origin_of(transport.get_extra_info("socket"))
         super().connection_made(transport)
+
+    def _check_frame(self) -> None:
+        """Close the connection of a client that sends so many of them that it would take the time of others."""
+        now = self._loop.time()
+        if now - self._counted_from >= 1.0:
+            self._frames, self._counted_from = 0, now
+        self._frames += 1
+        if self._frames > MOST_FRAMES and self._talks:
+            self._core.fail(POLICY, f"{MOST_FRAMES} pings and pieces of messages in a second at most")
+            self._write()
+            self.pause()  # what else it sends is not read: it has CLOSE_WITHIN to take this
 
     def _shake_hands(self, event: Request) -> None:
         refusal = self._hearer.refusal(event)
@@ -362,8 +381,10 @@ class AskingConnection(Connection):
             self._open()
 
 
-def origin_of(connected: socket.socket) -> int | str | None:
+def origin_of(connected: socket.socket | None) -> int | str | None:
     """Return the number of the user that has connected a Unix socket, or the address of a peer of the network."""
+    if connected is None:  # a transport without a socket
+        return None
     try:
         if connected.family == socket.AF_UNIX:
             size = CREDENTIALS.size

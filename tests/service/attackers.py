@@ -31,6 +31,7 @@ from busmaster import BusError, InvalidCommand, Priority, RemoteBus, connect
 from busmaster.bus.points import Point
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters, WriteRegisters
+from tests.service import floods
 
 UNIT, ABSENT, PERIOD = 1, 99, 1.0
 READER, WRITER = "reader-" * 4, "writer-" * 4
@@ -198,8 +199,15 @@ KINDS = {
 }
 
 
+KINDS |= {name: Kind(READER, floods.on_service(raw, READER)) for name, raw in floods.SERVICE.items()}
+KINDS |= {"write: stopped holder of a sequence": Kind(WRITER, floods.stopped_holder)}
+KINDS |= {name: Kind("", idle) for name in floods.PAGE}
+
+
 async def attack(name: str, address: str, connections: int) -> None:
     """Be the attackers, until this process is ended."""
+    if name in floods.PAGE:
+        await floods.at(floods.PAGE[name], address, WRITER)
     kind = KINDS[name]
 
     async def come(number: int) -> None:
@@ -236,17 +244,25 @@ async def run(name: str, connections: int, seconds: float) -> Outcome:
             sys.executable, "-m", "busmaster", "serve", file, env=environment, stdout=DEVNULL, stderr=PIPE
         )
         address = f"unix:{folder}/busmaster/line.sock"
+        attacked, target = owner, f"tcp://127.0.0.1:{tcp}"
         attackers: Process | None = None
+        page: Process | None = None
         try:
             async with await _entered(owner, address) as bus:
+                if name in floods.PAGE:
+                    page, target = await floods.page(address, f"{folder}/tokens")
+                    attacked = page
                 attackers = await asyncio.create_subprocess_exec(
                     *(sys.executable, "-m", "tests.service.attackers", "--attack", name),
-                    *("--address", f"tcp://127.0.0.1:{tcp}", "--connections", str(connections)),
+                    *("--address", target, "--connections", str(connections)),
                     stderr=DEVNULL,
+                    env={**os.environ, "HOLDER": WRITER},
                 )
                 await asyncio.sleep(2.0)
                 measured = await _measure(bus, f"tcp://127.0.0.1:{tcp}", seconds)
-                megabytes = _resident(owner.pid)
+                megabytes = _resident(attacked.pid)
+                if page is not None:
+                    measured["others"] = await floods.page_answers(target)
             began = time.monotonic()
             owner.send_signal(signal.SIGTERM)
             assert owner.stderr is not None
@@ -264,7 +280,7 @@ async def run(name: str, connections: int, seconds: float) -> Outcome:
                 measured["others"],
             )
         finally:
-            for process in (attackers, owner):
+            for process in (attackers, page, owner):
                 if process is not None and process.returncode is None:
                     process.kill()
                     await process.wait()

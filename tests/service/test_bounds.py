@@ -229,6 +229,26 @@ def test_one_that_says_nothing_for_ten_seconds_is_let_go(tmp_path: Path, monkeyp
     on_a_line(tmp_path, story)
 
 
+@pytest.mark.parametrize("flood", [b"\x89\x80" + bytes(4), b"\x00\x80" + bytes(4)], ids=["pings", "pieces"])
+def test_a_client_that_floods_the_owner_with_pings_or_pieces_of_messages_is_closed(
+    tmp_path: Path, flood: bytes
+) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with raw(line) as client:
+            if flood[0] == 0:
+                client.connection.transport.write(b"\x01\x80" + bytes(4))  # the first piece
+            client.connection.transport.write(flood * (bounds.MOST_FRAMES - 2))
+            await until(lambda: not client.connection.transport.get_write_buffer_size())
+            if flood[0] != 0:
+                assert "result" in await client.ask("now")  # so many may come
+            client.connection.transport.write(flood * bounds.MOST_FRAMES)
+            with pytest.raises(ConnectionClosed, match=r"1008.*50 pings and pieces of messages in a second at most"):
+                await client.hear()
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_one_message_of_each_program_is_taken_before_the_second_of_any() -> None:
     class Queue:
         """Some messages of one program."""
