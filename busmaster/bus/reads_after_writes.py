@@ -66,22 +66,19 @@ class ReadsAfterWrites:
         self._start(self._read(point, node, within))
 
     async def _read(self, point: Point[Any], node: Node, within: float) -> None:
-        """Read a point until its value is younger than the last write to it."""
+        """Read a point once, and give its value to the groups that poll it."""
         options = RequestOptions(priority=Priority.POLL, start_within=within)
         try:
-            while True:
-                future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-                reading = node.begin_reading(point.command, future, options)
-                try:
-                    await future
-                except asyncio.CancelledError:
-                    node.give_up(reading)
-                    raise
-                self.read += 1
-                for group in self._groups.values():
-                    group.take_reading(point, reading)
-                if not self._line.is_stale(point, reading.started):
-                    return  # a write that was confirmed before this task woke relied on this read
+            future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+            reading = node.begin_reading(point.command, future, options)
+            try:
+                await future
+            except asyncio.CancelledError:
+                node.give_up(reading)
+                raise
+            self.read += 1
+            for group in self._groups.values():
+                group.take_reading(point, reading)
         except (BusError, InvalidCommand):  # InvalidCommand: the bus was closed, or the node given back, meanwhile
             self.failed += 1
         finally:
