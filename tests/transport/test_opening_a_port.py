@@ -22,6 +22,7 @@ from serial.rs485 import RS485Settings
 
 from busmaster.errors import LineDown
 from busmaster.transport import serial_port
+from busmaster.transport.marks import MarkingSerial
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from tests.patience import PATIENCE
@@ -287,6 +288,44 @@ async def test_while_one_port_is_being_closed_another_is_in_use_by_whoever_has_i
             await opened(other_master.path)
         holding_driver.set()
         await closed(other, of_other)
+
+
+@pytest.mark.asyncio
+async def test_a_port_whose_closing_ends_while_its_opening_fails_is_opened(
+    pty_master: PtyMaster, holding_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport, recorder = await opened(pty_master.path)
+    transport.close()
+    await recorder.lost()
+    [closing] = serial_port._closings
+    really_open = MarkingSerial.open
+
+    def fail(device: MarkingSerial) -> None:
+        monkeypatch.setattr(MarkingSerial, "open", really_open)
+        holding_driver.set()
+        assert closing.over.wait(PATIENCE)
+        raise OSError(errno.EBUSY, "Device or resource busy")
+
+    monkeypatch.setattr(MarkingSerial, "open", fail)
+    transport, recorder = await opened(pty_master.path)
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_is_refused_for_another_reason_says_so_at_once_whatever_is_being_closed(
+    pty_master: PtyMaster, holding_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "CLOSING_PATIENCE", 0.001)
+    transport, recorder = await opened(pty_master.path)
+    transport.close()
+    await recorder.lost()
+
+    def fail(device: MarkingSerial) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(MarkingSerial, "open", fail)
+    with pytest.raises(LineDown, match="there is no hardware behind"):
+        await opened(pty_master.path)
 
 
 @pytest.mark.asyncio
