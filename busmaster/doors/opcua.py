@@ -75,6 +75,8 @@ class Shown:
     row: Row
     variable: Variable
     writable: bool = False
+    labelled: bool = False
+    """Whether its values have names, by which it can be written."""
     read: float = -inf
     asked: float = -inf
     """When it was asked for."""
@@ -202,6 +204,7 @@ class LineServer:
         shown.row = row
         named = self._keys[row.key] == identity  # what has the name of another would be written there
         shown.writable = named and row.writable and self._rules.may_be_written(row.key)
+        shown.labelled = bool(details["labels"])
         await shown.variable.describe(unit=row.unit, range_=range_of(details, row.item), writable=shown.writable)
 
     def _key_of(self, row: Row, identity: Identity) -> str:
@@ -302,8 +305,8 @@ class LineServer:
         if refusal := self._rules.refusal(user):
             self._tell(f"{who}: {row.key} was not written: {refusal}")
             return ACCESS_DENIED
-        value = _value(told.Value)
-        if not _fits(told.Value, value, shown.variable.kind):
+        value = _converted(told.Value, shown.variable.kind, shown.labelled)
+        if value is None:
             return TYPE_MISMATCH
         said = cut(str(value))
         try:
@@ -332,17 +335,32 @@ def _value(variant: ua.Variant | None) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _fits(variant: ua.Variant | None, value: Any, kind: ua.VariantType | None) -> bool:
-    """Return whether a value is of the type of its variable: of any that is a value, where that is not known yet."""
-    if variant is None or value is None:
-        return False
-    if kind is not None:
-        return bool(variant.VariantType is kind)
+def _converted(variant: ua.Variant | None, kind: ua.VariantType | None, labelled: bool) -> Any:
+    """Return a written value as one of the type of its variable, or None where that would change it.
+
+    Many clients have one numeric type, or write a coil as 0 or 1. A point with labels takes their names too.
+    """
+    value = _value(variant)
+    if isinstance(value, str):
+        return value if labelled or kind in (None, ua.VariantType.String) else None
     try:
-        type_of(value)
+        written = type_of(value)
     except TypeError:
-        return False
-    return True
+        return None
+    if kind is None or written is kind:
+        return value
+    values = value if isinstance(value, tuple) else (value,)
+    numbers = ua.VariantType.Int64, ua.VariantType.Double
+    converted: tuple[Any, ...]
+    if kind is ua.VariantType.Boolean and written in numbers and set(values) <= {0, 1}:
+        converted = tuple(map(bool, values))
+    elif kind is ua.VariantType.Int64 and written is ua.VariantType.Double and all(map(float.is_integer, values)):
+        converted = tuple(map(int, values))
+    elif kind is ua.VariantType.Double and written is ua.VariantType.Int64 and values == tuple(map(float, values)):
+        converted = tuple(map(float, values))
+    else:
+        return None
+    return converted if isinstance(value, tuple) else converted[0]
 
 
 def _format_of(path: str) -> str:

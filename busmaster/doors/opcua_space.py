@@ -14,6 +14,13 @@ POINTS = "urn:busmaster:points"
 """The namespace of points: there an identifier is a point's key, "winder/force"."""
 HEALTH = "urn:busmaster:line"
 """The namespace of the rest: the line's own state, its groups and nodes."""
+_ANALOG_TYPES = {
+    (False, False): ua.ObjectIds.DataItemType,
+    (True, False): ua.ObjectIds.AnalogUnitType,
+    (False, True): ua.ObjectIds.AnalogItemType,
+    (True, True): ua.ObjectIds.AnalogUnitRangeType,
+}
+"""Variable types of numbers, by whether EngineeringUnits and EURange are there: each type requires its properties."""
 UNKNOWN = ua.DataValue(StatusCode=ua.StatusCode(CODES.BadWaitingForInitialData))
 
 
@@ -29,6 +36,8 @@ class Variable:
         """When its value was read, in seconds since 1970."""
         self._space = space
         self._value: Any = None
+        self._analog_type: int = ua.ObjectIds.DataItemType
+        """Its variable type if its values are numbers."""
 
     async def put(self, value: Any, status: int, when: float) -> None:
         """Have clients told a value. Of a Bad status they are told no value, and `when` is since when it is so.
@@ -42,6 +51,7 @@ class Variable:
             if kind is not self.kind:
                 await self._space.retype(self.place, kind, is_list=isinstance(value, tuple))
                 self.kind = kind
+                self._show_type()
             self._value = value
         self.status, self.when = status, when
         await self._space.put(self.place, variant, status, when)
@@ -57,10 +67,17 @@ class Variable:
             await self.put(value, CODES.Good, time.time())
 
     async def describe(self, *, unit: str, range_: ua.Range | None, writable: bool) -> None:
-        """Say in which unit its values are, between which they are to be, and whether they may be written."""
+        """Show the unit of its values, their range, and whether they can be written."""
         await self._space.give_property(self.place, "EngineeringUnits", unit_of(unit) if unit else None)
         await self._space.give_property(self.place, "EURange", range_)
         await self._space.give_access(self.place, writable)
+        self._analog_type = _ANALOG_TYPES[bool(unit), range_ is not None]
+        self._show_type()
+
+    def _show_type(self) -> None:
+        """Give it the variable type of OPC UA (Part 8, 5.3) that its properties and the type of its values allow."""
+        is_number = self.kind in (ua.VariantType.Int64, ua.VariantType.Double)
+        self._space.set_type(self.place, self._analog_type if is_number else ua.ObjectIds.DataItemType)
 
 
 class Space:
@@ -103,7 +120,7 @@ class Space:
         """Make the variable of a point."""
         place = ua.NodeId(key, self._points)
         attributes = _attributes(name, described)
-        await self._add(place, name, parent, ua.NodeClass.Variable, attributes, ua.ObjectIds.BaseAnalogType)
+        await self._add(place, name, parent, ua.NodeClass.Variable, attributes, ua.ObjectIds.DataItemType)
         return self._unknown(place)
 
     async def put(self, place: ua.NodeId, value: ua.Variant | None, status: int, when: float) -> None:
@@ -115,6 +132,20 @@ class Space:
             ServerTimestamp=datetime.now(UTC),
         )
         await self._server.write_attribute_value(place, told)
+
+    def set_type(self, place: ua.NodeId, type_: int) -> None:
+        """Change the variable type of a variable. Clients cannot do this, so asyncua has no service for it."""
+        space, wanted = self._server.iserver.aspace, ua.NodeId(type_)
+        for reference in space[place].references:
+            if reference.ReferenceTypeId.Identifier != ua.ObjectIds.HasTypeDefinition:
+                for back in space[reference.NodeId].references:  # a browse of its parent shows the type, too
+                    if back.NodeId == place:
+                        back.TypeDefinition = wanted
+            elif reference.NodeId != wanted:
+                reference.NodeId = wanted
+                names = space[wanted].attributes
+                reference.BrowseName = names[ua.AttributeIds.BrowseName].value.Value.Value
+                reference.DisplayName = names[ua.AttributeIds.DisplayName].value.Value.Value
 
     async def retype(self, place: ua.NodeId, kind: ua.VariantType, *, is_list: bool) -> None:
         """Give a variable another type."""

@@ -46,6 +46,13 @@ class OtherClient:
     def property(self, name: str, property_: str) -> Any:
         return self.node(name).get_child(f"0:{property_}").get_value()
 
+    def type_of(self, name: str) -> tuple[str, str]:
+        """Return the name of a variable's type, as the variable says and as a browse of its parent does."""
+        node = self.node(name)
+        own = self.client.get_node(node.get_type_definition()).get_browse_name().Name
+        [seen] = [one for one in node.get_parent().get_references() if one.IsForward and one.NodeId == node.nodeid]
+        return own, self.client.get_node(seen.TypeDefinition).get_browse_name().Name
+
     def user_access(self, name: str) -> int:
         """Return what this user may do with a point: a mask of bits."""
         return int(self.node(name).get_attribute(ua.AttributeIds.UserAccessLevel).Value.Value)

@@ -15,7 +15,8 @@ import pytest
 import pytest_asyncio
 from opcua import ua
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, Service
+from busmaster import Bus, Hcp2Controller, MemoryPort, ModbusUnit, Service
+from busmaster.bus.meaning import Meaning
 from busmaster.bus.polling import PollGroup
 from busmaster.doors import following
 from busmaster.doors import opcua as door
@@ -117,7 +118,7 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
         patch.setattr(door, "OpcuaServer", made)
         folder, said = tmp_path_factory.mktemp("opcua"), list[str]()
         line = Following(lambda: f"unix:{folder}/line.sock")
-        async with serving(line, Rules(allow=("5/1*",)), ("127.0.0.1", 0), said.append) as url:
+        async with serving(line, Rules(allow=("5/1*", "1/*")), ("127.0.0.1", 0), said.append) as url:
             entered = other_client(url)
             client = await asyncio.to_thread(entered.__enter__)
             yield Opened(url, client, folder, said, line, servers[0])
@@ -170,6 +171,60 @@ async def test_a_point_has_its_unit_range_status_and_time(opened: Opened) -> Non
         assert (await opened.is_("Line Connected", "Good")).value is True
 
 
+@pytest.mark.parametrize(
+    ("unit", "limit", "type_"),
+    [
+        ("", False, "DataItemType"),
+        ("mm", False, "AnalogUnitType"),
+        ("", True, "AnalogItemType"),
+        ("mm", True, "AnalogUnitRangeType"),
+    ],
+)
+async def test_a_point_is_an_analog_item_only_with_what_that_type_requires(
+    opened: Opened, unit: str, limit: bool, type_: str
+) -> None:
+    async with opened.owned() as line:
+        group = line.poll("10", unit=unit)
+        if limit:
+            group.points[0].limit(minimum=-5, maximum=250)
+        await opened.is_("5/10", "Good")
+        assert await asyncio.to_thread(opened.client.type_of, "5/10") == (type_, type_)
+
+
+@pytest.mark.parametrize(
+    ("item", "value", "kind", "status", "stored"),
+    [
+        ("holding:5", 7, ua.VariantType.Int64, "Good", 7),
+        ("holding:5", 7.0, ua.VariantType.Double, "Good", 7),
+        ("holding:5", 7, ua.VariantType.Int16, "Good", 7),
+        ("holding:5", 7.5, ua.VariantType.Double, "BadTypeMismatch", 0),
+        ("holding:5", True, ua.VariantType.Boolean, "BadTypeMismatch", 0),
+        ("holding:5", "jog", ua.VariantType.String, "BadTypeMismatch", 0),
+        ("coil:5", True, ua.VariantType.Boolean, "Good", True),
+        ("coil:5", 1, ua.VariantType.Int64, "Good", True),
+        ("coil:5", 1.0, ua.VariantType.Float, "Good", True),
+        ("coil:5", 2, ua.VariantType.Int64, "BadTypeMismatch", False),
+        ("coil:5", "on", ua.VariantType.String, "BadTypeMismatch", False),
+        ("holding:6", 1, ua.VariantType.Int64, "Good", 1),
+        ("holding:6", "jog", ua.VariantType.String, "Good", 1),
+        ("holding:6", "fast", ua.VariantType.String, "BadRequestNotAllowed", 0),
+    ],
+)
+async def test_a_value_is_written_in_each_type_that_means_it(
+    opened: Opened, item: str, value: object, kind: Any, status: str, stored: object
+) -> None:
+    line = Line(ModbusUnit.profile.line, [make_device("modbus", 1)], paced=False)
+    async with Bus(MemoryPort(line)) as bus, Service(bus, path=opened.folder / "line.sock"):
+        unit = ModbusUnit(bus, 1)
+        mode = replace(unit.point("holding:6"), meaning=Meaning(labels={0: "off", 1: "jog"}))
+        bus.poll_group("press", period=0.02, points=[unit.point("holding:5"), unit.point("coil:5"), mode])
+        await opened.is_(f"1/{item}", "Good")
+        assert await opened.write(f"1/{item}", value, kind) == status
+        assert await unit.read(item) == stored
+        if item == "coil:5":
+            assert await asyncio.to_thread(opened.client.type_of, "1/coil:5") == ("DataItemType", "DataItemType")
+
+
 async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
     opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,7 +258,7 @@ async def test_a_write_passes_the_owners_gate_and_is_good_only_when_it_is_confir
         await opened.shows("5/10", lambda told: told.value == 12.5)
         assert await opened.write("5/10", 251.0) == "BadOutOfRange"
         assert "above its maximum of 250" in opened.said[-1]
-        assert await opened.write("5/10", 3, ua.VariantType.Int64) == "BadTypeMismatch"
+        assert await opened.write("5/10", "3", ua.VariantType.String) == "BadTypeMismatch"
         assert await opened.write("5/20", 1.0) == "BadNotWritable"  # it is not on the list
         assert await opened.write("Line Backlog", 1, ua.VariantType.Int64) == "BadNotWritable"
         assert line.audit() == [("5/10", "written"), ("5/10", "refused")]
