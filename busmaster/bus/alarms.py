@@ -29,6 +29,13 @@ class AlarmChanged:
     active: bool
 
     @property
+    def name(self) -> str:
+        """What is the alarm: "high" or "low" for a number; "set" or "clear" for a bit."""
+        if isinstance(self.bound, bool):
+            return "set" if self.limit == "high" else "clear"
+        return self.limit
+
+    @property
     def text(self) -> str:
         """Say in a sentence what began or ended, with the value and its unit."""
         if isinstance(self.bound, bool):
@@ -40,7 +47,8 @@ class AlarmChanged:
         return f"{self.point.key} {how}, was {crossed}"
 
     def _text_of_bit(self) -> str:
-        alarming, calm = ("set", "clear") if self.limit == "high" else ("clear", "set")
+        alarming = self.name
+        calm = "clear" if alarming == "set" else "set"
         if self.active:
             return f"{self.point.key} is {alarming}"
         how = "is watched no more" if self.value is None else f"is {calm} again"

@@ -5,7 +5,7 @@
     PREFIX/cycles/GROUP       a whole cycle, as `busmaster run --json` prints it (messages = "cycle")
     PREFIX/health/NODE        {"time": ..., "health": "up"}, retained
     PREFIX/line               {"time": ..., "line": "ready", "reason": null}, retained; "offline" while the port is gone
-    PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of points with limits; retained
+    PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of a bit "set", "clear" or null; retained
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
 
@@ -362,7 +362,7 @@ class MqttOutput(SpillingOutput):
             self._alarms = alarms
             now |= {topic: ("alarm", None) for topic in self._published if topic.startswith(ALARMS)}
             for point, alarm in alarms.items():
-                now[f"{ALARMS}{topic_part(point.key)}"] = ("alarm", None if alarm is None else alarm.limit)
+                now[f"{ALARMS}{topic_part(point.key)}"] = ("alarm", None if alarm is None else alarm.name)
         for topic, (name, state) in now.items():
             if self._published.get(topic, "") != state:
                 self._published[topic] = state

@@ -280,16 +280,7 @@ def _said_value(
     sample = bus.as_of_now(point, sample)
     asked = sample.finished if sample.started is None else sample.started
     error = "" if sample.error is None else sample.error.what
-    return [shown(point, sample.value), sample.quality.value, asked, error, alarm_text(alarm)]
-
-
-def alarm_text(alarm: AlarmChanged | None) -> str:
-    """Return the limit that a value has left, low or high; of a bit its state that is an alarm: set or clear."""
-    if alarm is None:
-        return ""
-    if isinstance(alarm.bound, bool):
-        return "set" if alarm.limit == "high" else "clear"
-    return alarm.limit
+    return [shown(point, sample.value), sample.quality.value, asked, error, alarm.name if alarm else ""]
 
 
 def shown(point: Point[Any], value: Any) -> Any:

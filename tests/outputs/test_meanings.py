@@ -115,6 +115,23 @@ def test_a_database_of_a_version_before_labels_goes_on_and_gets_them(tmp_path: P
 
 
 @needs_mosquitto
+@pytest.mark.parametrize(("options", "value", "alarm"), [("alarm_if_set", 8, "set"), ("alarm_if_clear", 0, "clear")])
+@pytest.mark.asyncio
+async def test_mqtt_has_the_alarm_of_a_bit_as_set_or_clear(
+    tmp_path: Path, options: str, value: int, alarm: str
+) -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)])))
+    drive = Hcp2Controller(bus, 5)
+    meaning: dict[str, Any] = {"bits": {"FAULT": 3}, options: ("FAULT",)}
+    word = replace(drive.point("11"), meaning=Meaning(**meaning))
+    with running(tmp_path) as broker:
+        async with bus, publishing(broker, bus), listening(broker, "line/alarms/#") as client:
+            await drive.write(11, value)
+            bus.poll_group("axes", period=0.02, points=list(word.bits))
+            assert await told(client) == [("line/alarms/5/11.FAULT", alarm)]
+
+
+@needs_mosquitto
 @pytest.mark.asyncio
 async def test_mqtt_has_bits_labels_and_alarms_under_their_names(tmp_path: Path) -> None:
     device = make_device("hcp2", 5)
@@ -156,7 +173,7 @@ async def polled(group: PollGroup, point: Point[Any], value: float) -> Snapshot:
 
 
 async def told(client: Any) -> list[tuple[str, str | None]]:
-    """Return the next alarm that is published, and what it is."""
+    """Return the next alarm that is published, and its name."""
     return [(topic, payload["alarm"]) for topic, payload, _ in await heard(client, 1)]
 
 

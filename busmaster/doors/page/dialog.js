@@ -73,7 +73,7 @@ export class PointDialog {
     by("point-value").textContent = reading;
     by("point-reading").classList.toggle("long", reading.length > LONG_TEXT);
     draw_trend(by("point-trend"), row, { ...this.colours(), bounds: true, precision: row.precision });
-    const facts = [["group", row.group], ["protocol", `${row.protocol}, address ${row.address}`]];
+    const facts = [["group", row.group], ["protocol", `${row.kind}, address ${row.address}`]];
     if (this.details) facts.push(["asked as", this.details.command]);
     if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", alarms_text(this.details, row)]);
     if (row.error) facts.push(["last cycle", row.error + (this.details?.hint ? `; ${this.details.hint}` : "")]);

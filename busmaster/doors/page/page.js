@@ -117,8 +117,10 @@ function is_lost() {
 const HEALTH = { offline: "✕ offline", up: "✓ up", suspect: "? suspect", down: "✕ down", suspended: "‖ suspended", unknown: "… not asked yet" };
 
 function draw_nodes() {
-  replace(by("node-list"), line.all_nodes, (item, node) => {
-    const health = is_lost() ? "offline" : node.health;
+  // a card is drawn again when its node changes, so the loss of line or owner is a change of the node
+  const nodes = is_lost() ? line.all_nodes.map((node) => ({ ...node, health: "offline" })) : line.all_nodes;
+  replace(by("node-list"), nodes, (item, node) => {
+    const { health } = node;
     item.className = health;
     const late = node.late ? `, ${node.late} late` : "";
     item.replaceChildren(element("b", `${node.label}: ${HEALTH[health] ?? health}`),
