@@ -9,6 +9,8 @@ business.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
@@ -125,9 +127,9 @@ class Arbiter(LineMachine):
         # A loop that stood still may look at its timers before it reads: what lies unread came in time.
         return self.state is EXCHANGE and now >= self._deadlines.expiry
 
-    def add_client(self, share: float = 1.0, owner_time: float = 0.0) -> LineClient:
+    def add_client(self, share: float = 1.0, owner_time: float = 0.0, user: Hashable = None) -> LineClient:
         """Return a client with whom the line's owner and other clients take turns from now on (R9)."""
-        client = LineClient(share)
+        client = LineClient(share, user=user)
         self.dispatcher.share().admit(client, owner_time)
         return client
 

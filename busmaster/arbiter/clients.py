@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from math import inf
 
 from busmaster.arbiter.health import NodeRecord
@@ -10,14 +11,15 @@ LEAST_SHARE, MOST_SHARE = 0.1, 10.0
 
 
 class Account:
-    """What a client has used of its part of the line.
+    """What a user has used of its part of the line, with all its connections: `clients` is how many it has.
 
     `used_until`: until when it has used that part; until then the owner goes first.
     """
 
-    __slots__ = ("used_until",)
+    __slots__ = ("clients", "used_until")
 
     def __init__(self) -> None:
+        self.clients = 0
         self.used_until = -inf
 
 
@@ -25,17 +27,27 @@ class LineClient:
     """One program, as the line knows it. `share` weighs its line time against that of the others, who have 1 each.
 
     `owner_time`: seconds of the line that the owner may use, while it waits, for each second of all clients with the
-    same number together. 0: the client takes turns with the owner.
+    same number together. 0: the client takes turns with the owner. `user`: clients with the same one have one part of
+    the line together; None: the client has a part of its own.
     """
 
-    __slots__ = ("account", "over", "owner_time", "share")
+    __slots__ = ("account", "over", "owner_time", "role", "share", "user")
 
-    def __init__(self, share: float = 1.0, owner_time: float = 0.0) -> None:
+    def __init__(self, share: float = 1.0, owner_time: float = 0.0, user: Hashable = None) -> None:
         self.share = share
         self.owner_time = owner_time
+        self.user = user
         self.account = Account()
+        self.role = self.account
+        """The account of all clients with its `owner_time`."""
         self.over = False
         """Whether nothing of it is sent any more."""
+
+    def is_entitled(self, now: float, urgent: bool) -> bool:
+        """Return whether it may go before the owner, if that is its turn: it has not used up its part of the line, nor
+        have the others of its role used up theirs, unless its request is `urgent`."""
+        # Without the second, each of many users would have an exchange as it comes, one behind the other.
+        return self.account.used_until <= now and (urgent or self.role.used_until <= now)
 
     @property
     def turn(self) -> LineClient:

@@ -112,8 +112,11 @@ class Dispatcher:
         if waiting >= self._capacity and (waiting := self.writes.waiting_of(transaction)) >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return True
-        if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
-            return True
+        if node.health is DOWN or now < node.suspended_until:
+            if not self._may_ask(transaction, now):
+                return True
+            if node.budgeted and transaction.client is not None and not isinstance(transaction.client, Hold):
+                transaction.client = self.share().new_nodes()
         if changed:
             self.writes.queues[node].append(transaction)
         if transaction.start_by < inf:
@@ -410,6 +413,8 @@ class Dispatcher:
         if probe is not None:
             self._waits(probe)
             probe.deadline = now + RETRY_PATIENCE
+            if probe.node.budgeted:
+                probe.client = self.share().new_nodes()
             self.backlog.push(probe)
 
     def check(self, node: NodeRecord, command: Command[Any], now: float) -> Transaction:

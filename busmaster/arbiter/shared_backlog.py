@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from math import inf
-from operator import attrgetter
 
 from busmaster.arbiter.backlog import SHARE, Backlog, new_queues
 from busmaster.arbiter.clients import OWN, Account, Hold, LineClient, turn_of
@@ -21,26 +20,33 @@ such limit."""
 
 MOST_USED = 1.0
 """Seconds for which a client lets the owner go first at most, unless its last exchange alone costs more."""
+NEW_NODES_OWNER_TIME = 127.0
+"""`owner_time` of all requests together to nodes that only clients named and that have never replied. Each can take a
+whole lateness, and one too many in a cycle of the owner makes it miss the next: so few go before a waiting owner."""
+MOST_BEFORE_URGENT = 8
+"""How many times its part behind one urgent exchange the owner may use at once. With less it would not get its part
+where many users have their first urgent exchanges; with more a stop would wait longer."""
 MOST_LEFT = 64
-"""Accounts of clients that have gone which are kept."""
-
-_used_until: Callable[[Account], float] = attrgetter("used_until")
+"""Accounts of users without a connection that are kept. The oldest is discarded first."""
 
 
 class SharedBacklog(Backlog):
     """A backlog in each of whose classes clients take turns. `hold` is for whom the line is held."""
 
     __slots__ = (
+        "_accounts",
         "_attempts",
+        "_before_urgent",
         "_deadlines",
         "_last",
         "_left_accounts",
         "_members",
+        "_new_nodes",
         "_payer",
+        "_roles",
         "_since",
         "_turns",
         "_writes",
-        "_yielded",
         "hold",
     )
 
@@ -49,12 +55,19 @@ class SharedBacklog(Backlog):
         super().__init__()
         self.hold: Hold | None = None
         self._members: dict[float, int] = {}
-        """How many clients there are of each `owner_time` but 0."""
-        self._left_accounts: dict[float, list[Account]] = {}
-        """The accounts of clients that have gone, by `owner_time`; a new client takes one of those over. Else a program
-        that connects anew for each request would always be entitled. The last exchange is charged when it is over."""
-        self._yielded = False
-        """Whether an urgent request let another go first: the next one passes."""
+        """How many users are connected with each `owner_time` but 0."""
+        self._roles: dict[float, Account] = {}
+        """The account of all clients together with each `owner_time` but 0."""
+        self._accounts: dict[tuple[float, Hashable], Account] = {}
+        """By `owner_time` and user. One per user and not per connection, or a user with many connections would have
+        most of what the users have together."""
+        self._left_accounts: dict[tuple[float, Hashable], Account] = {}
+        """Accounts of users without a connection. A user that connects again takes its account over: otherwise a
+        program with a connection for each request would always be entitled."""
+        self._new_nodes: LineClient | None = None
+        self._before_urgent = 0.0
+        """Seconds of the line that the owner may use before the next urgent request of a client that has used its
+        part. Below 0, the owner had more than that."""
         self._writes = writes
         self._deadlines = deadlines
         self._streak, self._rotated = before._streak, before._rotated
@@ -97,23 +110,29 @@ class SharedBacklog(Backlog):
         return self._taken(transaction, now)
 
     def _entitled(self, transaction: Transaction, now: float) -> Transaction:
-        """Return the same, or what goes first because the client of this one has used up its part of the line.
+        """Return the same, or what goes first because the client of this one has used up its part of the line."""
+        urgent = transaction.priority is URGENT
+        if turn_of(transaction.client).is_entitled(now, urgent):
+            return transaction
+        if not urgent:
+            other = next((found for turns in self._turns if (found := turns.pop_entitled(now)) is not None), None)
+        elif (other := self._turns[URGENT].pop_entitled(now, urgent=True)) is None and self._before_urgent > 0:
+            # Urgent requests are not held back until their client is entitled: a stop passes. They alternate with the
+            # owner, by time and not by number, or long writes would take most of the line from short polls.
+            other = self._pop_lower(now)
+        if other is None:
+            return transaction
+        self._turns[transaction.priority].put_back(transaction)
+        return other
 
-        An urgent request lets one other go first and passes then: a stop of a client that asked too much waits for one
-        exchange more, and urgent requests without end leave the owner every second exchange.
-        """
-        if turn_of(transaction.client).account.used_until <= now:
+    def _pop_lower(self, now: float) -> Transaction | None:
+        """Take out what goes next below URGENT, if a client that has not used its part waits there."""
+        self._urgent_yields = True
+        transaction = super().pop(now)
+        if transaction is None or turn_of(transaction.client).is_entitled(now, urgent=False):
             return transaction
-        if transaction.priority is URGENT and self._yielded:
-            self._yielded = False
-            return transaction
-        for turns in self._turns:
-            other = turns.pop_entitled(now)
-            if other is not None:
-                self._turns[transaction.priority].put_back(transaction)
-                self._yielded = True
-                return other
-        return transaction
+        self._turns[transaction.priority].put_back(transaction)
+        return next((found for turns in self._turns[1:] if (found := turns.pop_entitled(now)) is not None), None)
 
     def _pop_within(self, hold: Hold, now: float) -> Transaction | None:
         urgent, *lower = self._turns
@@ -190,17 +209,29 @@ class SharedBacklog(Backlog):
             turns.charge(client, now - self._since)
             if client.owner_time:
                 self._use(client, now)
+                if turns is self._turns[URGENT]:
+                    self._delay_urgent(client, now)
+            elif client is OWN and self._before_urgent > 0:
+                self._before_urgent -= now - self._since
         self._begin_hold()
         self._since = now
 
     def _use(self, client: LineClient, now: float) -> None:
         """Note until when a client has used its part of the line: all of its `owner_time` have equal parts."""
-        parts = (1 + client.owner_time) * self._members.get(client.owner_time, 1)
-        used = (now - self._since) * parts
+        used = (now - self._since) * (1 + client.owner_time)
+        self._charge(client.role, used, now)
+        self._charge(client.account, used * self._members.get(client.owner_time, 1), now)
+
+    def _charge(self, account: Account, used: float, now: float) -> None:
         # Bounded, since what it used while the line was idle took nothing from the others; but more than one exchange
         # costs, or a client would be entitled again as soon as all others had their turns.
-        account = client.account
         account.used_until = min(max(account.used_until, self._since) + used, now + max(2 * used, MOST_USED))
+
+    def _delay_urgent(self, client: LineClient, now: float) -> None:
+        """Give the owner its time behind an urgent exchange. What it had beyond its time before is taken off."""
+        # Bounded: a stop of a client that has used its part waits no longer than this, whatever others have used.
+        time = client.owner_time * (now - self._since)
+        self._before_urgent = min(self._before_urgent + time, MOST_BEFORE_URGENT * time)
 
     def _begin_hold(self) -> None:
         last = self._last
@@ -254,17 +285,39 @@ class SharedBacklog(Backlog):
         """Count a client among those of this `owner_time` from now on."""
         self._dismiss(client)
         client.owner_time, client.account = owner_time, Account()
-        if owner_time:
-            self._members[owner_time] = self._members.get(owner_time, 0) + 1
-            left = self._left_accounts.get(owner_time)
-            if left:
-                client.account = max(left, key=_used_until)
-                left.remove(client.account)
-
-    def _dismiss(self, client: LineClient) -> None:
-        owner_time = client.owner_time
+        client.role = client.account
         if not owner_time:
             return
+        client.role = self._roles.setdefault(owner_time, Account())
+        key = _account_of(client)
+        account = self._accounts.get(key)
+        if account is None:
+            account = self._accounts[key] = self._left_accounts.pop(key, client.account)
+            self._members[owner_time] = self._members.get(owner_time, 0) + 1
+        account.clients += 1
+        client.account = account
+
+    def new_nodes(self) -> LineClient:
+        """Return the client that has the requests of all clients to new nodes, until such a node replies."""
+        client = self._new_nodes
+        if client is None:
+            client = self._new_nodes = LineClient()
+            self.admit(client, NEW_NODES_OWNER_TIME)
+        return client
+
+    def _dismiss(self, client: LineClient) -> None:
+        account = client.account
+        if not account.clients:
+            return
+        account.clients -= 1
+        if account.clients:
+            return
+        key, owner_time = _account_of(client), client.owner_time
+        del self._accounts[key]
+        if client.user is not None:  # the client itself comes no more
+            self._left_accounts[key] = account
+            if len(self._left_accounts) > MOST_LEFT:
+                del self._left_accounts[next(iter(self._left_accounts))]
         self._members[owner_time] -= 1
         if not self._members[owner_time]:
             del self._members[owner_time]
@@ -272,11 +325,6 @@ class SharedBacklog(Backlog):
     def forget(self, client: LineClient) -> None:
         """Keep nothing of a client that has gone, and has nothing waiting."""
         self._dismiss(client)
-        if client.owner_time:
-            left = self._left_accounts.setdefault(client.owner_time, [])
-            left.append(client.account)
-            if len(left) > MOST_LEFT:
-                left.remove(min(left, key=_used_until))
         for turns in self._turns:
             turns.forget(client)
 
@@ -289,3 +337,7 @@ class SharedBacklog(Backlog):
         self._begin_hold()  # before what is known of the request that has left is forgotten
         self._payer = self._last = None
         return drained
+
+
+def _account_of(client: LineClient) -> tuple[float, Hashable]:
+    return client.owner_time, client if client.user is None else client.user

@@ -91,9 +91,9 @@ class Turns:
         self.live -= 1
         return turn.queue.pop()
 
-    def pop_entitled(self, now: float) -> Transaction | None:
+    def pop_entitled(self, now: float, *, urgent: bool = False) -> Transaction | None:
         """Take out the first of a client that has not used up its part of the line, or return None."""
-        entitled = [turn for turn in self._waiting() if turn.client.account.used_until <= now]
+        entitled = [turn for turn in self._waiting() if turn.client.is_entitled(now, urgent)]
         if not entitled:
             return None
         turn = min(entitled, key=_had)

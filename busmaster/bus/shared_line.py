@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from math import inf
 from threading import current_thread, get_ident
 from typing import Any
@@ -196,10 +196,10 @@ class SharedLine:
         for touched in [what for what in self._touched if node in (what if isinstance(what, tuple) else (what,))]:
             del self._touched[touched]
 
-    def add_client(self, share: float, owner_time: float = 0.0) -> LineClient:
+    def add_client(self, share: float, owner_time: float = 0.0, user: Hashable = None) -> LineClient:
         """Return a client, a program with which this one takes turns from now on; see `LineClient`."""
         self.clients += 1
-        return self.arbiter.add_client(share, owner_time)
+        return self.arbiter.add_client(share, owner_time, user)
 
     def remove_client(self, client: LineClient) -> None:
         """Forget a client: nothing is asked for it any more."""

@@ -54,11 +54,11 @@ class Rights:
 
 RIGHTS = {
     READ: Rights(
-        # One slot in eight goes to BACKGROUND while higher classes wait (R9); 7 says the same in line time, so that
-        # long exchanges gain nothing.
+        # So that nothing of them starves on a line that the owner keeps busy, and no more: an eighth, the slots of
+        # BACKGROUND (R9), made cycles miss where polls and the writes of an operator use more than 7/8 of the line.
         reads=BACKGROUND,
         polls=BACKGROUND,
-        owner_time=7.0,
+        owner_time=31.0,
         new_nodes=16,
         budgeted=True,
         own_times=False,

@@ -83,7 +83,7 @@ class Client:
         self._role = self.permission.role
         self.reads = _reads_of(self._role)
         """The options of its reads that say none."""
-        self.turn = line.bus.shared.add_client(line.share, self.rights.owner_time)
+        self.turn = line.bus.shared.add_client(line.share, self.rights.owner_time, peer.account)
         """What its requests take turns by, with those of the others."""
         self._holds: dict[int, Hold | str] = {}
         """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""

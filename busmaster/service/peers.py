@@ -6,6 +6,7 @@ import asyncio
 import pwd
 import socket
 import struct
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -24,6 +25,11 @@ class Peer(Protocol):
     @property
     def short(self) -> str:
         """What his poll groups are called after."""
+        ...
+
+    @property
+    def account(self) -> Hashable:
+        """What is equal for all connections of one user or token, which have one part of the line together."""
         ...
 
     def may_stay(self, access: Access, /) -> bool:
@@ -58,6 +64,10 @@ class Process:
     def short(self) -> str:
         return f"{self.program} {self.pid}"
 
+    @property
+    def account(self) -> Hashable:
+        return self.uid
+
     def may_stay(self, _: Access) -> bool:
         """Return True: the socket's mode says which processes come."""
         return True
@@ -82,6 +92,10 @@ class Holder:
     @property
     def short(self) -> str:
         return f"{self.token} {self.address}".strip()
+
+    @property
+    def account(self) -> Hashable:
+        return self.token
 
     def may_stay(self, access: Access) -> bool:
         """Return whether the token still holds; without one, whether none is needed."""

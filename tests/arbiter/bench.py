@@ -97,6 +97,11 @@ class Bench:
         self.listen()
         return transaction
 
+    def submit(self, transaction: Transaction) -> Transaction:
+        self.arbiter.submit(transaction, self.now)
+        self.listen()
+        return transaction
+
     def poll(self, node: NodeRecord, period: float, *elements: int) -> Poll:
         poll = Poll("group", period, phase=0.0)
         set_members(poll, [Transaction(node, hcp2.Read(e)) for e in elements], Priority.POLL)
