@@ -107,6 +107,12 @@ class HttpConnection(_Taken, H11Protocol):
         super().__init__(*args, **options)
         self._crowd = crowd
         self._request: asyncio.TimerHandle | None = None
+        self._upgraded = False
+        """Whether the connection is a page's, which another object serves: this one hears no more of it."""
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        self._upgraded = True
+        super().handle_websocket_upgrade(event)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -126,7 +132,7 @@ class HttpConnection(_Taken, H11Protocol):
 
     def _look(self) -> None:
         """Begin to wait for a request, or have one."""
-        if self.conn.their_state not in WAITING or self.transport.is_closing():
+        if self._upgraded or self.conn.their_state not in WAITING or self.transport.is_closing():
             self._have_request()
         elif self._request is None:
             self._request = self.loop.call_later(REQUEST_WITHIN, self.transport.abort)

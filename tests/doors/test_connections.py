@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import resource
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import httpx2 as httpx
 import pytest
@@ -26,6 +27,17 @@ JSON = "Content-Type: application/json\r\n"
 
 async def end_of(url: str) -> End:
     return await asyncio.open_connection(*url.removeprefix("http://").strip("/").split(":"))
+
+
+def _noted(crowds: list[Crowd]) -> Callable[[Crowd], dict[str, Any]]:
+    """What a Crowd's `protocols` does, and notes which one it was."""
+    protocols = Crowd.protocols
+
+    def noted(crowd: Crowd) -> dict[str, Any]:
+        crowds.append(crowd)
+        return protocols(crowd)
+
+    return noted
 
 
 async def closed(end: End) -> bytes:
@@ -74,6 +86,38 @@ async def test_requests_one_after_the_other_may_take_longer_than_one(
             end[1].write(b"HEAD / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             assert b" 200 " in await asyncio.wait_for(end[0].readuntil(b"\r\n\r\n"), PATIENCE)
         end[1].close()
+
+
+UPGRADE = (
+    b"GET /api/stream HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("more", [b"", b"\xc1\x80" + bytes(4)], ids=["alone", "with a frame behind it"])
+async def test_a_connection_that_became_a_pages_waits_for_no_request_and_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: bytes
+) -> None:
+    crowds: list[Crowd] = []
+    waiting: list[Any] = []
+    monkeypatch.setattr(connections.Crowd, "protocols", _noted(crowds))
+    note_waiting = Crowd.note_waiting
+
+    def noting(crowd: Crowd, connection: Any, count: int) -> None:
+        waiting.append(connection)
+        note_waiting(crowd, connection, count)
+
+    monkeypatch.setattr(connections.Crowd, "note_waiting", noting)
+    async with page(tmp_path) as of:
+        end = await end_of(of.url)
+        await until(lambda: len(waiting) == 1)  # it was made
+        end[1].write(UPGRADE + more)
+        assert await asyncio.wait_for(end[0].readuntil(b"\r\n\r\n"), PATIENCE)
+        [connection] = waiting
+        assert connection._request is None  # nothing closes it later
+        assert not crowds[0]._waiting
+        end[1].transport.abort()
 
 
 @pytest.mark.slow
