@@ -239,7 +239,7 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
     while head := file.read(8):
         if len(head) < 8 or (first and head[:4] != struct.pack("<I", _SECTION)):
             raise CaptureError("not a pcapng file") if first else CutOff("the file is cut in mid-block")
-        if not any(head):
+        if not any(head[4:]):
             raise CutOff("the file is cut in mid-block")  # a loss of power may leave zeros
         mark = b""
         if head[:4] == struct.pack("<I", _SECTION):
@@ -249,7 +249,7 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
         if length < 12 + len(mark) or length % 4 or length > _LONGEST_BLOCK:
             raise CaptureError(f"a block of {length} bytes: the file is damaged")
         rest = mark + file.read(length - 8 - len(mark))
-        if len(rest) != length - 8:
+        if len(rest) != length - 8 or rest[-4:] != head[4:]:  # zeros behind the cut may make up the length
             raise CutOff("the file is cut in mid-block")
         first = False
         yield kind, rest[:-4], order

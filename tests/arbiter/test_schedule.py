@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 import busmaster.arbiter.phases as phases_module
 import busmaster.arbiter.schedule as schedule_module
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.phases import KINKS, STRIDE, common_divisor, quietest_offset
+from busmaster.arbiter.phases import KINKS, ROUNDING, STRIDE, common_divisor, quietest_offset
 from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule, begin_cycle, set_members
 from busmaster.arbiter.transaction import LONGEST_PATIENCE, Poll, Priority, Transaction
 from busmaster.contract.profile import LineSettings
@@ -271,7 +271,8 @@ def test_no_offset_is_quieter_than_the_one_chosen(others: list[tuple[float, floa
     assert 0 <= offset < period
     chosen = overlap(poll, offset, polls, 2.0)
     tried = [overlap(poll, n / 40 * period, polls, 2.0) for n in range(40)]
-    assert chosen <= min(tried) + 1e-6
+    cycles = 2.0 / period
+    assert chosen <= min(tried) + cycles * ROUNDING + 1e-6
 
 
 def test_the_common_divisor_of_two_periods() -> None:

@@ -131,6 +131,7 @@ def test_who_guesses_tokens_of_the_page_is_slowed_down_counted_and_reported(
             door.communicate(timeout=PATIENCE)
 
 
+@pytest.mark.slow
 def test_who_guesses_passwords_of_opcua_is_slowed_down_counted_and_reported(
     busmaster: Command, file: Path, metrics: int
 ) -> None:

@@ -140,6 +140,7 @@ async def test_none_of_60_reads_after_60_writes_is_the_old_value_as_good(opened:
         assert (await opened.is_("5/10", "Good")).value == 60.0
 
 
+@pytest.mark.slow
 async def test_with_read_after_write_none_of_60_reads_is_the_old_value_as_good(opened: Opened) -> None:
     async with opened.owned() as line:
         point = replace(Hcp2Controller(line.bus, 5).point("10"), read_after_write=True)
