@@ -135,6 +135,7 @@ class Dispatcher:
         if transaction.phase is QUEUED:
             self.backlog.discard(transaction, PARKED)
         if transaction.phase is not ON_WIRE:
+            self._release_stops(transaction)
             self.probes.budget.refund(transaction.probe_cost)
             self._end(transaction, now)
 
@@ -178,10 +179,42 @@ class Dispatcher:
             if poll is not None and poll.started == -inf:
                 poll.started = now
                 poll.jitter.record(now - poll.due)
+            if transaction.stop:
+                self._take_stops(transaction, now)
         transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
         transaction.late = transaction.overdue = False  # an earlier attempt may have been: its value is not this one's
+
+    def _take_stops(self, stop: Transaction, now: float) -> None:
+        """Have equal stops that wait for the same node get the outcome of the one that is sent now.
+
+        Not those behind a write that is no stop: sent once, they would be overtaken by it.
+        """
+        alike: list[Transaction] = []
+        for write in self.writes.queues[stop.node]:
+            if write is stop or write.phase is ON_WIRE:
+                continue
+            if not write.stop:
+                break
+            if write.attempts or type(write.command) is not type(stop.command) or write.command != stop.command:
+                continue
+            if write.priority is not stop.priority or isinstance(write.client, Hold):
+                continue
+            if write.phase is QUEUED:
+                self.backlog.discard(write, PARKED)
+            write.phase = ON_WIRE  # it is not sent itself, and runs out as this one does
+            write.attempts, write.started = 1, now
+            alike.append(write)
+        stop.stops_alike = tuple(alike)
+
+    def _release_stops(self, stop: Transaction) -> None:
+        """Have the stops that wait for the outcome of this one be sent themselves, as it is not sent again."""
+        alike, stop.stops_alike = stop.stops_alike, ()
+        for other in alike:
+            if other.phase is ON_WIRE:
+                other.unsure = True
+                self.backlog.push(other)
 
     # what came of an attempt
 
@@ -489,6 +522,9 @@ class Dispatcher:
             self.probes.over(transaction)
         if not transaction.wanted and not transaction.check:
             transaction.node.counters.unheard += transaction.attempts > 0
+        for other in transaction.stops_alike:
+            other.value, other.last_byte, other.unsure = transaction.value, transaction.last_byte, transaction.unsure
+            self._end(other, now, error and make_error(type(error), error.what, other, error.hint))
         poll = transaction.poll
         if poll is not None:
             if poll.group is not None and poll.active:

@@ -99,6 +99,8 @@ class Transaction:
         "settling_ahead",
         "start_by",
         "started",
+        "stop",
+        "stops_alike",
         "superseded",
         "tag",
         "touches",
@@ -127,6 +129,10 @@ class Transaction:
     """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
     touches: object
     """What a write changes, for its owner to know."""
+    stop: bool
+    """It stops its node, or is of its safe state: writing it once is as good as writing it twice."""
+    stops_alike: tuple[Transaction, ...]
+    """Equal stops that waited when this one was sent, and get its outcome."""
     unsure: bool
     """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
 
@@ -144,6 +150,7 @@ class Transaction:
         client: LineClient | None = None,
         tag: Any = None,
         poll: Poll | None = None,
+        stop: bool = False,
     ) -> None:
         self.node = node
         self.command = command
@@ -161,6 +168,8 @@ class Transaction:
             self.start_by = min(start_by, nextafter(finish_by, -inf))
         self.tag = tag
         self.poll = poll
+        self.stop = stop
+        self.stops_alike: tuple[Transaction, ...] = ()
         self.client = client
         self.probe = probe
         self.check = False

@@ -270,8 +270,8 @@ class Node:
         limiter = self.shared.limiter
         if limiter is not None and getattr(command, "writes", False):
             async with limiter.passing(self, command, chosen, stop or chosen.safe) as left:
-                return (await self._timed(command, left, touches, stops_seen))[0]
-        transaction = self._prepared(command, chosen, False, touches, stops_seen)
+                return (await self._timed(command, left, touches, stops_seen, stop=stop))[0]
+        transaction = self._prepared(command, chosen, False, touches, stops_seen, None, stop)
         future = self.shared.pump.transact(transaction)
         try:
             value: T = await future
@@ -304,9 +304,9 @@ class Node:
         within = self._within(client, command)
         chosen, limiter = self._options(options), self.shared.limiter
         if limiter is None or not command.writes:
-            return (await self._timed(command, chosen, touches, stops_seen, journey, client))[0]
+            return (await self._timed(command, chosen, touches, stops_seen, journey, client, stop))[0]
         async with limiter.passing(self, command, chosen, stop or chosen.safe, within) as left:
-            return (await self._timed(command, left, touches, stops_seen, journey, client))[0]
+            return (await self._timed(command, left, touches, stops_seen, journey, client, stop))[0]
 
     @asynccontextmanager
     async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
@@ -361,8 +361,9 @@ class Node:
         stops_seen: int | None = None,
         journey: Journey | None = None,
         client: LineClient | None = None,
+        stop: bool = False,
     ) -> tuple[T, Timeline]:
-        transaction = self._prepared(command, options, False, touches, stops_seen, client)
+        transaction = self._prepared(command, options, False, touches, stops_seen, client, stop)
         if journey is not None:
             journey.transaction = transaction
         future = self.shared.pump.transact(transaction)
@@ -386,6 +387,7 @@ class Node:
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
         client: LineClient | None = None,
+        stop: bool = False,
     ) -> Transaction:
         """Return the transaction of a request. Raises what says that it cannot be begun."""
         record, line = self.record, self.shared
@@ -416,6 +418,9 @@ class Node:
             inf if options.finish_within is None else line.now() + options.finish_within,
             self if touches is None else (self, touches),
             client,
+            None,
+            None,
+            command.writes and (stop or options.safe),
         )
 
     def give_up(self, transaction: Transaction) -> None:
