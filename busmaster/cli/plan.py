@@ -15,6 +15,7 @@ from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import columns, emit, emit_all, json_line
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.contract.profile import LineSettings
+from busmaster.gate.rights import line_parts
 from busmaster.planning import GroupPlan, Losses, Plan
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
@@ -39,16 +40,21 @@ def command(path: str, as_json: bool) -> int:
     line = ConfiguredLine(file, outputs=False)
     emulated_line(file)  # made for its complaints alone, as `emulate` says them
     plan = line.plan()
+    section = line.file.service
+    shared = bool(section.users or section.groups or section.tokens or section.listen)
     assumed = [name for name, node in line.file.nodes.items() if node.reply_time is None]
     if as_json:
         emit(json_line(**fields(plan), assumed_reply_times=assumed))
     else:
-        emit_all(page(f"{line.file.title}: {port_text(line.bus.endpoint, plan.line)}", plan, assumed))
+        emit_all(page(f"{line.file.title}: {port_text(line.bus.endpoint, plan.line)}", plan, assumed, shared=shared))
     return OK if plan.fits else FAILED
 
 
-def page(head: str, plan: Plan, assumed: Sequence[str]) -> list[str]:
-    """Return what a person wants to know: a table of the groups, the waits, what would fit, and what is `assumed`."""
+def page(head: str, plan: Plan, assumed: Sequence[str], *, shared: bool = False) -> list[str]:
+    """Return what a person wants to know: a table of the groups, the waits, what would fit, and what is `assumed`.
+
+    `shared`: the file says which programs may use the line, so that it also prints what those can take of it.
+    """
     table = columns([HEAD, *(row(group) for group in plan.groups)], right=range(1, len(HEAD)))
     verdict = "it fits" if plan.fits and not plan.advice else "it fits, barely" if plan.fits else "it does not fit"
     share = f"the schedule asks for {plan.utilisation:.0%} of the line"
@@ -57,6 +63,7 @@ def page(head: str, plan: Plan, assumed: Sequence[str]) -> list[str]:
         *(table if plan.groups else ["no poll groups"]),
         *((f"{verdict}:", *plan.advice) if plan.advice else (f"{verdict}: {share}",)),
         *(waits_text(plan) if plan.groups else ()),
+        *(parts_text(plan) if shared and plan.groups else ()),
         *assumed_text(assumed),
         *([losses_text(plan.losses)] if plan.groups else []),
     ]
@@ -70,6 +77,16 @@ def waits_text(plan: Plan) -> Iterator[str]:
     )
     bounds = ", ".join(f"{priority.name.lower()} {time_text(plan.worst_waits[priority])}" for priority in SHOWN)
     yield f"the bounds (R9), if every exchange took the longest that one can: {bounds}"
+
+
+def parts_text(plan: Plan) -> Iterator[str]:
+    """Yield what programs of each role can take of the line from the owner."""
+    parts = ", ".join(f"{role} {part:.0%}" for role, part in line_parts().items())
+    wait = time_text(plan.worst_waits[Priority.URGENT])
+    yield (
+        f"while polls wait, all programs of a role together can take of the line: {parts}; a safe write or another "
+        f"urgent write of the owner waits for the exchange on the wire, at most {wait}"
+    )
 
 
 def assumed_text(nodes: Sequence[str]) -> Iterator[str]:
@@ -154,6 +171,7 @@ def fields(plan: Plan) -> dict[str, Any]:
         "typical_wait": plan.typical_wait,
         "dead_wait": plan.dead_wait,
         "worst_waits": {priority.name.lower(): finite(wait) for priority, wait in plan.worst_waits.items()},
+        "role_parts": line_parts(),
         "fitting_baudrate": plan.fitting_baudrate,
         "losses": {
             "share": plan.losses.share,

@@ -94,6 +94,11 @@ RIGHTS = {
 }
 
 
+def line_parts() -> dict[str, float]:
+    """Return by role, where it has one, the part of the line of all its programs together while the owner waits."""
+    return {role.value: 1 / (1 + rights.owner_time) for role, rights in RIGHTS.items() if rights.owner_time}
+
+
 def table() -> list[str]:
     """Return the lines of the table for the documentation."""
     rows: dict[str, Callable[[Rights], str]] = {

@@ -322,3 +322,11 @@ def test_the_example_runs_on_its_own_emulation(tmp_path: Path) -> None:
     assert ran.status == 130
     assert "axes: " in ran.err
     assert (tmp_path / "line.sqlite").exists()
+
+
+def test_plan_prints_what_programs_can_take_of_a_line_whose_file_has_roles(busmaster: Command, line: Path) -> None:
+    assert "programs of a role" not in busmaster("plan", str(line)).out
+    line.write_text(line.read_text() + '\n[service.users.root]\nrole = "read"\n')
+    text = next(text for text in busmaster("plan", str(line)).lines if "programs of a role" in text)
+    assert "read 3%, write 50%; a safe write" in text
+    assert json.loads(busmaster("plan", str(line), "--json").out)["role_parts"] == {"read": 1 / 32, "write": 0.5}
