@@ -69,9 +69,10 @@ def showing(situation: str) -> str:
     rows = "document.querySelectorAll('#point-rows td.value').length > 20"
     health = "document.getElementById('health').textContent"
     state = "document.documentElement.dataset.state"
+    bad = "[...document.querySelectorAll('td.quality')].filter((one) => one.textContent.includes('bad')).length"
     facts = {
         CALM: f"{state} === 'ready' && {health}.includes('none down')",
-        NODE_DOWN: f"{state} === 'ready' && {health}.includes('1 of 8 nodes down')",
+        NODE_DOWN: f"{state} === 'ready' && {health}.includes('1 of 8 nodes down') && {bad} > 2",
         LINE_LOST: f"{state} === 'offline'",
     }
     return f"{rows} && {facts[situation]}"
