@@ -222,12 +222,15 @@ class WatchedLine(Line):
         """Is told what devices say, and what becomes of it."""
         self.on_request: Callable[[float], None] = lambda now: None
         self._request = self._said = b""
+        self._replied: list[Device] = []
+        """The devices that have said something since the last request."""
         self._exchanges: deque[Spoken] = deque([Spoken(-inf, -inf)], maxlen=REMEMBERED)
 
     def send(self, data: bytes, now: float) -> None:
         if len(data) > 1:
             self.on_request(now)
             self._request = data
+            self._replied.clear()
             self._exchanges.append(Spoken(now, now))
         super().send(data, now)
         self._exchanges[-1].asked_until = now + len(data) * self.settings.byte_time
@@ -258,6 +261,10 @@ class WatchedLine(Line):
     def tell(self, talker: Device, start: float, end: float, data: bytes) -> None:
         """Have the ledger know what a device is going to say."""
         asked = self.repeats or self._request.startswith(talker.routes)
+        if asked and not self.repeats:
+            # noise can look like a request to a device that has replied already, and cause a second reply
+            asked = talker not in self._replied or not self.ledger.damaged(start - RECENT, start)
+            self._replied.append(talker)
         if self.record is not None:
             self.record(f"{self.ledger.now():.6f} {talker!r} says {data.hex(' ')} from {start:.6f} to {end:.6f}")
         self.ledger.said(start, end, asked)

@@ -130,6 +130,13 @@ def test_the_same_seed_gives_the_same_transcript_byte_for_byte_in_any_process() 
 
 
 @pytest.mark.slow
+def test_a_reply_to_noise_is_not_a_reply_that_the_line_has_to_wait_for() -> None:
+    """Noise looked like a request to a drive that was replying to a true one: no master can expect its second reply."""
+    hunt = Hunt("dc104", "noise", 40001, learned=True)
+    hunt.run(700)
+    assert not hunt.totals.problems
+
+
 def test_nothing_grows_without_bound() -> None:
     """What is remembered is full after some thousand transactions; then twice as many leave no more objects."""
 
