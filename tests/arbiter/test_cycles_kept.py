@@ -141,7 +141,7 @@ def test_the_line_is_three_quarters_busy_and_keeps_its_cycles_without_attackers(
 def test_r9_the_owner_keeps_its_cycles_against_clients_that_may_read(attack: Attack, every: float) -> None:
     """`every`: a request to an absent node needs a gap, and polls and the operator's writes must leave one."""
     plant = Plant(READ, every=every)
-    assert plant.run(attack) >= 0.95
+    assert plant.run(attack) >= 0.98  # 95 % is promised; an eighth of the line for the clients would just keep that
     assert max(plant.waits) < 0.25
 
 
@@ -159,3 +159,14 @@ def test_r9_an_urgent_write_of_an_operator_waits_for_two_exchanges_whatever_othe
     plant = Plant(WRITE, every=15.0)
     plant.run(attack)
     assert max(plant.waits) < 2 * 0.0755
+
+
+def test_r9_requests_of_all_clients_to_new_nodes_share_one_small_part_of_the_line() -> None:
+    plant = Plant(READ)
+    plant.bench.until_ready()
+    asked: list[Transaction] = []
+    for number, client in enumerate(plant.clients[:2]):
+        node = plant.bench.node(2 + number)
+        plant.bench.arbiter.ask_within_budget(node, plant.bench.now)
+        asked.append(plant.bench.submit(Transaction(node, hcp2.Read(1), BACKGROUND, client=client)))
+    assert {each.client for each in asked} == {plant.bench.arbiter.dispatcher.share().new_nodes()}
