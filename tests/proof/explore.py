@@ -250,9 +250,10 @@ def prepare(setup: Setup) -> None:
 
 
 def world_of(setup: Setup) -> type[World]:
-    if setup.clients or setup.longest_hold:
-        return SharingWorld
-    return MscWorld if setup.kind.startswith("msc") else World
+    is_msc, is_shared = setup.kind.startswith("msc"), bool(setup.clients or setup.longest_hold)
+    if is_msc and is_shared:
+        raise ValueError(f"{setup.name}: there is no world of programs that share a line of MSC units")
+    return SharingWorld if is_shared else MscWorld if is_msc else World
 
 
 def constrained(zone: Zone, earliest: list[Instant], latest: list[Instant], before: list[Instant]) -> Zone | None:

@@ -81,7 +81,7 @@ def quick() -> Iterator[Setup]:
     yield replace(_line("msc"), lost_acknowledgements=1)
     yield replace(_line(commands=(WRITE,)), clients=1, depth=1)
     yield replace(_line("hcp2", LOST, commands=(WRITE,)), clients=1, depth=1, retries=1)
-    for kind in ("hcp", "microflex", "mentor", "ct-ansi", "dc104"):
+    for kind in ("hcp", "microflex", "mentor", "ct-ansi", "dc104", "msc"):
         yield _late(kind, commands=(READ,))
     for kind in ("hcp2", "modbus", "msc"):  # with refusals: a NAK, an exception, and a resend within the exchange
         yield _late(kind, NAKS, commands=(WRITE,))
