@@ -9,7 +9,7 @@ import pytest
 
 from tests.proof.explore import Explorer
 from tests.proof.history import retell, told
-from tests.proof.setups import Setup
+from tests.proof.setups import NAKS, Setup
 from tests.proof.worlds import GROUPS, quick, worlds
 
 LIMIT = 600.0
@@ -19,7 +19,7 @@ LIMIT = 600.0
 def in_tiers() -> Iterator[Any]:
     """The first world by default, and the largest ones before a release."""
     for number, setup in enumerate(quick()):
-        large = setup.kind == "msc" and setup.in_step
+        large = setup.kind == "msc" and setup.may(NAKS)
         yield pytest.param(setup, marks=[pytest.mark.exhaustive] if large else [pytest.mark.slow] if number else [])
 
 
