@@ -248,6 +248,8 @@ def holding_driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]
     monkeypatch.setattr(serial_port, "CLOSE_DEADLINE", 0.001)
     yield lets_go
     lets_go.set()
+    for closing in tuple(serial_port._closings):  # the next test may get a pty with the same number
+        assert closing.over.wait(PATIENCE)
 
 
 @pytest.mark.asyncio
