@@ -156,7 +156,8 @@ async def returns(made: Machine, name: str, away: float, node_after: float) -> f
         made.make_node()
         async with asyncio.timeout(PATIENCE):
             await line.up.wait()
-        return line.connected_at - begun
+        connected: float = line.connected_at
+        return connected - begun
 
 
 @contextlib.asynccontextmanager

@@ -53,7 +53,12 @@ export class Wire {
     this.canvas.style.height = `${SCALE + LINE_LANE + nodes.length * LANE + 4}px`;
     const { pen, width, height } = fit(this.canvas);
     const style = getComputedStyle(document.documentElement);
-    const colour = (name) => style.getPropertyValue(`--${name}`).trim();
+    this.drawn = new Map(); // the last block of each lane, by its place
+    const colours = new Map(); // each look into the style costs as much as four blocks
+    const colour = (name) => {
+      if (!colours.has(name)) colours.set(name, style.getPropertyValue(`--${name}`).trim());
+      return colours.get(name);
+    };
     const begin = this.end - this.span;
     this.x = (when) => LEFT + ((when - begin) / this.span) * (width - LEFT - 4);
     const lane_of = new Map(nodes.map((node, number) => [`${node.protocol}/${node.address}`, number]));
@@ -116,6 +121,10 @@ export class Wire {
 
   block(pen, one, top, height, colour) {
     const kind = kind_of(one), x = this.x(one.begun), wide = this.wide(one);
+    // where several exchanges share a pixel, one block of each kind is drawn there
+    const plain = !one.writes && one.attempt <= 1 ? kind : "", drawn = this.drawn.get(top);
+    if (plain && wide <= 1.5 && drawn?.plain === plain && x - drawn.x >= 0 && x - drawn.x < 0.5) return;
+    this.drawn.set(top, { plain, x });
     const high = kind === "bad" ? height * 0.45 : kind === "late" ? height * 0.7 : height;
     pen.fillStyle = colour(kind);
     pen.fillRect(x, top + height - high, wide, high);
