@@ -17,6 +17,7 @@ const line = new Line();
 const wire = new Wire(by("wire-canvas"), by("tip"), by("wire-said"));
 const shown_rows = new Map();
 let may = { read_only: true, wants_token: false };
+let asked_what_may_be = false; // until then it is not known whether the page is read-only
 let connected = false;
 let stale = true; // something was heard since it was drawn
 let known = false; // the first picture of the line was complete
@@ -57,6 +58,7 @@ function connect() {
 async function ask_what_may_be() {
   try {
     may = await (await fetch("/api/line")).json();
+    asked_what_may_be = true;
     stale = true;
   } catch { /* the door has gone: asked again when it is back */ }
 }
@@ -69,7 +71,7 @@ function allowed() {
 
 function is_complete() {
   const { frame } = line;
-  return Boolean(frame) && line.rows.length >= frame.points && line.all_nodes.length >= frame.nodes && line.all_groups.length >= frame.groups;
+  return Boolean(frame) && asked_what_may_be && line.rows.length >= frame.points && line.all_nodes.length >= frame.nodes && line.all_groups.length >= frame.groups;
 }
 
 // Nothing is shown of a picture that is still arriving: each part of it would move the parts below.
@@ -96,7 +98,7 @@ function draw_head(wrong) {
   by("trouble").hidden = !wrong;
   if (by("trouble").textContent !== wrong) by("trouble").textContent = wrong;
   document.documentElement.dataset.state = state;
-  by("mode").textContent = allowed().read_only ? "read-only" : "";
+  by("mode").textContent = asked_what_may_be && allowed().read_only ? "read-only" : "";
   if (!frame) return;
   by("title").textContent = frame.title;
   document.title = `${state === "ready" ? "" : "✕ "}${frame.title}`;
