@@ -277,7 +277,7 @@ async def test_forty_nodes_fit_any_width_light_and_dark(
         browser.prefer(scheme)
         await asyncio.to_thread(browser.open, of.url)
         await asyncio.to_thread(browser.until, "document.querySelectorAll('#node-list li').length === 40")
-        await asyncio.to_thread(browser.until, "document.querySelectorAll('#point-rows tr').length === 80")
+        await asyncio.to_thread(browser.until, "document.querySelectorAll('#point-rows tr.point').length === 80")
         await asyncio.to_thread(
             browser.until, "document.querySelector('#node-list li.down')?.textContent.includes('✕ down')"
         )
