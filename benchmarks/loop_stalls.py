@@ -61,7 +61,7 @@ def run(options: Options) -> Outcome:
         if name.partition("(")[0] != HELD_BY_DESIGN:
             outcome.claims.append(Claim(f"longest hold of the loop, ms: {name}", own, WANTED_MS))
     table.notes.append("hold: processor time without the garbage collector, median of the rounds")
-    table.notes.append("plan() reckons at once and says so; plan_in_steps() does the same while the line goes on")
+    table.notes.append("plan() calculates at once and says so; plan_in_steps() does the same while the line goes on")
     outcome.tables.append(table)
     outcome.series = {name: [hold.own for hold in holds] for name, holds in calls.items()}
     _running_line(options, outcome)
@@ -98,15 +98,15 @@ class Round:
         self.watch = watch
         self.calls = calls
 
-    async def hold(self, name: str, call: Callable[[], Any], settle: float = 0.05) -> Any:
-        """What the call returns, or what it brings if it is awaited. `settle`: seconds for what comes of it."""
+    async def hold(self, name: str, call: Callable[[], Any], resynchronise: float = 0.05) -> Any:
+        """What the call returns, or what it brings if it is awaited. `resynchronise`: seconds for what comes of it."""
         await asyncio.sleep(0)
         self.watch.take()
         result = call()
         if asyncio.iscoroutine(result):
             with contextlib.suppress(BusError):  # on a machine that is busy with other things
                 result = await result
-        await asyncio.sleep(settle)
+        await asyncio.sleep(resynchronise)
         self.calls.setdefault(name, []).append(self.watch.take())
         return result
 
@@ -152,7 +152,7 @@ async def _all_fail(watch: Watch, calls: Holds, what: str, fail: Callable[[Bus],
 
 
 def _lose(bus: Bus) -> None:
-    bus.pump.connection_lost(OSError("unplugged"))
+    bus._pump.connection_lost(OSError("unplugged"))
 
 
 def _close(bus: Bus) -> Awaitable[None]:
@@ -175,7 +175,7 @@ async def _one_large_group(turn: Round, values: dict[Point[Any], float]) -> int:
     await turn.hold(f"Stream.close(), {STREAMS} times", lambda: [stream.close() for stream in streams])
     await asyncio.gather(*readers)
     await turn.hold("plan() of 500 points", bus.plan)
-    await turn.hold("plan_in_steps() of 500 points", bus.plan_in_steps)
+    await turn.hold("plan_in_steps() of 500 points", bus._plan_in_steps)
     await turn.hold("worst_case_wait() of 500 points", bus.worst_case_wait)
     wrong = wrong_in(group, values)
     await turn.hold("PollGroup.close() of 500 points", group.close)
@@ -192,7 +192,7 @@ async def _many_groups(turn: Round, values: dict[Point[Any], float]) -> int:
     groups.append(await turn.hold("poll_group(), the 200th", lambda: _group(bus, "last", 0.3, some), 2.0))
     await turn.hold("cycles of 200 groups", lambda: None, 1.0)
     await turn.hold("plan() of 200 groups", bus.plan)
-    await turn.hold("plan_in_steps() of 200 groups", bus.plan_in_steps)
+    await turn.hold("plan_in_steps() of 200 groups", bus._plan_in_steps)
     await turn.hold("worst_case_wait() of 200 groups", bus.worst_case_wait)
     await turn.hold("Bus.statistics()", bus.statistics)
     await turn.hold("Bus.reset_statistics()", bus.reset_statistics)
@@ -251,14 +251,22 @@ def _running_line(options: Options, outcome: Outcome) -> None:
     hold = median(tally.holds)
     table = Table(
         f"{GROUPS} groups added in one callback to a line of {SETTINGS.baudrate} baud with traffic",
-        ("replies", "wrong", "failed", "lateness raised", "slowest before ms", "slowest while ms", "longest hold ms"),
+        (
+            "replies",
+            "wrong",
+            "failed",
+            "maximum reply delay raised",
+            "slowest before ms",
+            "slowest while ms",
+            "longest hold ms",
+        ),
     )
     table.row(tally.right, tally.wrong, tally.failed, tally.raised, tally.slowest[False], tally.slowest[True], hold)
     table.notes.append(f"slowest: from asking to the value, of two callers; {placed} groups polled in the end")
     outcome.tables.append(table)
     outcome.claims += [
         Claim(f"failed replies while {GROUPS} groups are added to a healthy line", tally.failed, 0),
-        Claim("nodes whose lateness was raised by that", tally.raised, 0),
+        Claim("nodes whose maximum reply delay was raised by that", tally.raised, 0),
         Claim(f"longest hold of the loop, ms: after {GROUPS} groups were added", hold, WANTED_MS),
         Claim("groups that were polled in the end", placed, GROUPS, at_most=False),
     ]
@@ -296,7 +304,9 @@ async def _add_to_traffic(watch: Watch, tally: Traffic, seconds: float) -> int:
             await asyncio.gather(*callers, return_exceptions=True)
             tally.placed.append(sum(group.poll.placed for group in groups))
             tally.failed += sum(group.statistics().bad for group in groups)
-            tally.raised += sum(node.statistics().lateness > hcp2.PROFILE.timings.read.lateness for node in bus.nodes)
+            tally.raised += sum(
+                node.statistics().max_reply_delay > hcp2.PROFILE.timings.read.max_reply_delay for node in bus.nodes
+            )
     return 0
 
 

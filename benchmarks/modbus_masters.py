@@ -27,12 +27,18 @@ from busmaster.transport.endpoints import Endpoint, endpoint
 T = TypeVar("T")
 
 WINDOW = 0.1
-LATENESS = 0.15
+MAX_REPLY_DELAY = 0.15
 RETRIES = 2
 LONGEST_REPLY = 8
 PROFILE = replace(modbus.PROFILE, line=SETTINGS)
 TIMINGS = Timings.uniform(
-    ReplyTiming(nominal=0.05, window=WINDOW, lateness=LATENESS, byte_gap=0.02, turnaround=SILENCE)
+    ReplyTiming(
+        late_after=0.05,
+        window=WINDOW,
+        max_reply_delay=MAX_REPLY_DELAY,
+        inter_byte_timeout=0.02,
+        driver_release_time=SILENCE,
+    )
 )
 
 
@@ -54,7 +60,7 @@ class ModbusMaster(Protocol):
 
 class Busmaster:
     name = "busmaster"
-    settings = f"window {WINDOW * 1000:g} ms, lateness {LATENESS * 1000:g} ms, {RETRIES} retries"
+    settings = f"window {WINDOW * 1000:g} ms, maximum reply delay {MAX_REPLY_DELAY * 1000:g} ms, {RETRIES} retries"
 
     def __init__(self, timings: Timings = TIMINGS, learned: bool = False) -> None:
         self.bus: Bus | None = None
@@ -99,7 +105,7 @@ class Busmaster:
     def longest_hold(self) -> float:
         """Seconds for which one exchange can keep an urgent one waiting, in the worst case (W_urgent)."""
         assert self.bus is not None
-        return longest_hold(ReadRegisters(0).open(1, self._timings), self.bus.byte_time)
+        return longest_hold(ReadRegisters(0).open(1, self._timings), self.bus._byte_time)
 
     async def close(self) -> None:
         assert self.bus is not None
@@ -238,7 +244,7 @@ class Anymodbus:
     async def open(self, path: str) -> None:
         anymodbus = import_module("anymodbus")
         estimate = import_module("anymodbus.config").estimate_late_reply_window
-        window = estimate(baudrate=SETTINGS.baudrate, max_turnaround=LATENESS, max_reply_bytes=LONGEST_REPLY)
+        window = estimate(baudrate=SETTINGS.baudrate, max_turnaround=MAX_REPLY_DELAY, max_reply_bytes=LONGEST_REPLY)
         config = anymodbus.BusConfig(
             request_timeout=WINDOW,
             retries=anymodbus.RetryPolicy(retries=RETRIES),

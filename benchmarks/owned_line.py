@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any, cast
 
 from benchmarks.watch import Watch, watched
-from busmaster import Bus, PollGroup, Requester, SerialPort, Service
-from busmaster.bus.node import Node
+from busmaster import Bus, PollGroup, SerialPort, Service
+from busmaster.bus.node import Node, Request
 from busmaster.bus.points import Point
+from busmaster.bus.requester import Requester
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters
 
 READ = ReadRegisters(7, 1)
@@ -65,7 +66,7 @@ class Bare(asyncio.BufferedProtocol):
         return self._buffer
 
     def buffer_updated(self, count: int) -> None:
-        self._node.begin_reading(READ, self)
+        self._node._start(Request(READ), self)
 
     def done(self) -> bool:
         return False

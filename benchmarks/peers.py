@@ -22,7 +22,7 @@ from busmaster.protocols.modbus.codec import ReadRegisters, with_crc
 
 DELAY = 0.002
 CALLERS = 4
-NO_GAP = Timings.uniform(replace(TIMINGS.read, turnaround=0.0))
+NO_GAP = Timings.uniform(replace(TIMINGS.read, driver_release_time=0.0))
 NAMED = [(unit, register) for unit in range(1, 5) for register in (0, 7, 99)]
 COLUMNS = ("master", "wrong", "failed", "/s", "us each", "x ours", "CPU us", "x ours")
 

@@ -114,8 +114,8 @@ def _obey(order: dict[str, Any], line: Line, now: float) -> Any:
 
 def delay_of(options: Mapping[str, Any]) -> Delay:
     """From its parameters, as JSON has them."""
-    straggle = options.get("straggle")
-    return Delay(**{**options, "straggle": tuple(straggle)}) if straggle else Delay(**options)
+    late_reply_delay = options.get("late_reply_delay")
+    return Delay(**{**options, "late_reply_delay": tuple(late_reply_delay)}) if late_reply_delay else Delay(**options)
 
 
 def main() -> None:

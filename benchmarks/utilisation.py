@@ -55,7 +55,7 @@ async def _measure(
 ) -> None:
     settings = LineSettings(baudrate)
     limit = 1 / mean(wire_time(ask, settings, delay) for ask in questions)
-    ours, bare = Ours(profile, questions), Bare(questions, profile.timings.read.turnaround)
+    ours, bare = Ours(profile, questions), Bare(questions, profile.timings.read.driver_release_time)
     round_length = options.pick(0.5, 0.05)
     transactions = max(1, round(round_length * limit / len(questions))) * len(questions)
     replies = {ask.request: ask.reply for ask in questions}

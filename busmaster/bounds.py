@@ -71,6 +71,14 @@ has not requested it."""
 MOST_STRANGERS = 64
 """Connections from which no first message has arrived: one more closes the oldest of the user or the address that has
 most of them."""
+FREE_CONNECTIONS = 128
+"""Connections of a peer that are let in one behind the other: a process by the Unix socket, or an address by TCP."""
+CONNECTIONS_A_SECOND = 20
+"""Connections of a peer, from then on, that are let in within a second: the others wait before their login is read."""
+MOST_DELAYED = 32
+"""Connections of a peer that wait so: one more is closed at once."""
+MOST_CONNECTING_PEERS = 1024
+"""Peers whose connections are counted: one more has the one forgotten whose last connection is oldest."""
 MOST_FRAMES = 50
 """Frames of a client within a second that are not a whole message: pings, pongs and pieces of messages. Each takes as
 long to understand as a request, and no client needs so many: the connection of one that sends more is closed."""

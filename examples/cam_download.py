@@ -26,7 +26,7 @@ async def main(port: Endpoint) -> None:
         # The address step is not in the manual: 4 where addresses count bytes. `find_address_step` finds it.
         press = MscController(bus, 3, symbols={"cam": 3000}, address_step=4)
         await press.load_cam("cam", TABLE, progress=show)  # what was written and what was verified both count
-        print("the first values are", await press.read_block("cam", 8))
+        print("the first values are", await press.read("cam", 8))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ async def main(port: Endpoint) -> None:
         drive = CtAnsiDrive(bus, 12, decimals={"1.21": 1})  # values written to 01.21 are rounded to one decimal
         await drive.write("1.21", -47.64, verify=True)
         print("01.21 is", await drive.read("1.21"))
-        print("01.21 to 01.23 are", await drive.read_run("1.21", 3))
+        print("01.21 to 01.23 are", await drive.read("1.21", 3))
         try:
             await drive.read("17.23")
         except NoSuchParameter as error:

@@ -9,8 +9,9 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, MemoryPort, MscController, ProgramStatus, endpoint
+from busmaster import Bus, Endpoint, MemoryPort, MscController, endpoint
 from busmaster.emulator.line import Line
+from busmaster.protocols.msc import ProgramStatus
 from busmaster.registry import make_device
 
 

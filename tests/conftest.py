@@ -24,7 +24,8 @@ settings.load_profile("ci" if os.environ.get("CI") else "busmaster")
 
 # Tests start some hundred interpreters. Where the environment forbids cached bytecode, each of them would compile all
 # that it imports, a third of the processor time of a short command: bytecode is cached for this run. Programs that
-# change code between two runs (tests.mutation) set PYTHONPYCACHEPREFIX too: then the environment is left as it is.
+# change code between two runs (tests.verification.mutation) set PYTHONPYCACHEPREFIX too: then the environment is left
+# as it is.
 if "PYTHONPYCACHEPREFIX" not in os.environ and os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
     os.environ["PYTHONPYCACHEPREFIX"] = tempfile.mkdtemp(prefix="busmaster-bytecode-")
     atexit.register(shutil.rmtree, os.environ["PYTHONPYCACHEPREFIX"], ignore_errors=True)

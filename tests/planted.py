@@ -5,27 +5,27 @@ from __future__ import annotations
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.on_wire import Step
 from busmaster.arbiter.transaction import Transaction
-from busmaster.arbiter.unasked import QUIET
+from busmaster.arbiter.unexpected import QUIET
 
 
-def without_lateness(patch: Any) -> None:
+def without_max_reply_delay(patch: Any) -> None:
     """The line goes on as soon as a window is over, or an attempt has failed."""
     for name in ("past", "last_begin"):
-        patch.setattr(Leg, name, lambda leg: leg.end)
+        patch.setattr(Step, name, lambda step: step.end)
 
 
 def without_the_byte_time(patch: Any) -> None:
-    patch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.latency)
+    patch.setattr(Step, "_past", lambda step, end, timing: end + timing.max_reply_delay + step.latency)
 
 
-def without_the_adapter_in_the_lateness(patch: Any) -> None:
-    patch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.byte_time)
+def without_the_adapter_in_the_max_reply_delay(patch: Any) -> None:
+    patch.setattr(Step, "_past", lambda step, end, timing: end + timing.max_reply_delay + step.byte_time)
 
 
 def without_the_adapter_in_the_silence(patch: Any) -> None:
-    patch.setattr(Leg, "quiet", lambda leg: max(QUIET, leg.timing.byte_gap) + leg.byte_time)
+    patch.setattr(Step, "quiet", lambda step: max(QUIET, step.timing.inter_byte_timeout) + step.byte_time)
 
 
 def with_a_cancellation_that_clears_the_exchange(patch: Any) -> None:

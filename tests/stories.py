@@ -49,7 +49,7 @@ def in_use(line: Bus | World) -> None:
     """Take the line for one that has been in use: no node holds a part of an earlier master's frame, which the first
     write would otherwise wait for (R15). Once the line is up."""
     arbiter = line._arbiter if isinstance(line, Bus) else line.arbiter
-    arbiter._in_step.lone_bytes_until = -inf
+    arbiter._in_sync.lone_bytes_until = -inf
 
 
 async def cycles(group: PollGroup, count: int) -> list[Snapshot]:

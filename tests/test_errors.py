@@ -11,9 +11,8 @@ import pytest
 
 from busmaster import Bus, BusClosed, BusError, Hcp2Controller, LineDown, NoReply, Refused, SerialPort
 from busmaster import errors as public
-from busmaster.arbiter.endings import make_error
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Transaction, make_error
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.stories import on_a_bus

@@ -53,9 +53,9 @@ def bus_of(*protocols: str, delay: float = 0.002) -> Bus:
         lambda: TcpPort("host", cast("Any", "x")),
         lambda: SerialPort("/dev/ttyUSB0", baudrate=cast("Any", "57600")),
         lambda: SerialPort("/dev/ttyUSB0", baudrate=True),
-        *(lambda wrong=wrong: replace(TIMING, nominal=wrong) for wrong in (-0.01, nan, True, "0.05")),
-        *(lambda wrong=wrong: replace(TIMING, lateness=wrong) for wrong in (inf, nan, None)),
-        *(lambda wrong=wrong: replace(TIMING, byte_gap=wrong) for wrong in (0.0, -1.0, True)),
+        *(lambda wrong=wrong: replace(TIMING, late_after=wrong) for wrong in (-0.01, nan, True, "0.05")),
+        *(lambda wrong=wrong: replace(TIMING, max_reply_delay=wrong) for wrong in (inf, nan, None)),
+        *(lambda wrong=wrong: replace(TIMING, inter_byte_timeout=wrong) for wrong in (0.0, -1.0, True)),
     ],
 )
 def test_a_wrong_kind_of_value_for_a_port_or_a_time_is_refused_in_words(mistake: Callable[[], object]) -> None:

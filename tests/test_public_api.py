@@ -16,10 +16,17 @@ from types import ModuleType
 import pytest
 
 import busmaster
-from busmaster import errors
+from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, ModbusUnit, MscController, errors
+from busmaster.bus.handle import Handle
+from busmaster.emulator.line import Line
+from busmaster.renames import ROOT as MOVED
 from tests.patience import PATIENCE
 
 OPTIONAL = ("click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib", "websockets")
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "public-api.md"
+PUBLIC = re.findall(r"^\| `(busmaster\.[\w.]+)` \|", PAGE.read_text(), re.MULTILINE)
 
 
 def order(name: str) -> tuple[object, ...]:
@@ -52,6 +59,28 @@ def test_whatever_a_public_class_offers_says_what_it_is(name: str) -> None:
 def is_called_or_asked(member: object) -> bool:
     """Whether it is a method or a property: what a field is, the docstring of its class says."""
     return isinstance(member, property | classmethod | staticmethod) or inspect.isfunction(member)
+
+
+def test_dir_lists_every_public_name_before_it_is_imported() -> None:
+    code = "import busmaster; print(*dir(busmaster))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE, capture_output=True, text=True)
+    listed = {name for name in done.stdout.split() if not name.startswith("__")}
+    assert listed == set(busmaster.__all__)
+
+
+@pytest.mark.parametrize(("old", "now"), MOVED.items())
+def test_a_name_that_has_moved_says_where_it_is(old: str, now: tuple[str, str]) -> None:
+    module, new = now
+    assert new in importlib.import_module(module).__all__
+    assert module in PUBLIC
+    with pytest.raises(ImportError, match=f"from {module} import {new}"):
+        exec(f"from busmaster import {old}")
+    with pytest.raises(ImportError, match=f"from {module} import {new}"):
+        getattr(busmaster, old)
+
+
+def test_a_name_that_never_was_is_no_attribute() -> None:
+    assert not hasattr(busmaster, "Buss")
 
 
 def test_every_error_is_public() -> None:
@@ -116,9 +145,6 @@ def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
     )
 
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "public-api.md"
-PUBLIC = re.findall(r"^\| `(busmaster\.[\w.]+)` \|", PAGE.read_text(), re.MULTILINE)
 OUTSIDERS = sorted(
     path
     for folder in ("busmaster/protocols", "examples", "tests/registry/installed")
@@ -151,3 +177,35 @@ def test_protocols_and_examples_use_only_what_is_public(path: Path) -> None:
         assert name in importlib.import_module(module).__all__, (
             f"{path.name} imports {module}.{name}, which is not public"
         )
+
+
+SHOWN = {
+    "bus": """alarms as_of_now condition endpoint events groups latest node nodes now plan poll_group reset_statistics
+        running state statistics wall_time worst_case_wait""",
+    "node": """address check exclusive health label latest lift limit limits line merge_reads note_stop now of on_return
+        planned probe profile request statistics stops suspend suspended timed_request timings use_sync_reads""",
+    "handle": "bus exclusive items node point profile read use_sync_reads write",
+    "controller": "axis element elements io named",
+    "drive": "write_all",
+    "unit": "",
+    "msc": """address_step clear_flag find_address_step flag flags load_cam model set_flag status symbols
+        write_block""",
+}
+"""What users need; what the program `busmaster` needs beside it is in `busmaster.ext`."""
+
+
+def test_the_objects_of_a_user_show_what_users_need_and_nothing_else() -> None:
+    def shown(thing: object) -> set[str]:
+        return {name for name in dir(thing) if not name.startswith("_")}
+
+    def own(kind: type[Handle]) -> set[str]:
+        bus = Bus(MemoryPort(Line(kind.profile.line)))
+        return shown(kind(bus, 14)) - set(SHOWN["handle"].split())
+
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    assert shown(bus) == set(SHOWN["bus"].split())
+    assert shown(Hcp2Controller(bus, 5).node) == set(SHOWN["node"].split())
+    assert own(Hcp2Controller) == set(SHOWN["controller"].split())
+    assert own(MentorDrive) == set(SHOWN["drive"].split())
+    assert own(ModbusUnit) == set(SHOWN["unit"].split())
+    assert own(MscController) == set(SHOWN["msc"].split())

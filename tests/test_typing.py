@@ -19,18 +19,17 @@ from busmaster import (
     MscController,
     Node,
     Point,
-    ProgramStatus,
-    Requester,
     Sample,
-    StatusWord,
     open_line,
 )
 from busmaster.bus.handle import Handle
-from busmaster.bus.requester import NodeSource
+from busmaster.bus.requester import NodeSource, Requester
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
+from busmaster.protocols.hcp2 import StatusWord
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
+from busmaster.protocols.msc import ProgramStatus
 from tests.handles.fake_bus import FakeBus
 from tests.stories import on_a_bus
 
@@ -58,7 +57,7 @@ async def every_handles_values(bus: NodeSource) -> None:
     """Never run."""
     assert_type(await Hcp2Controller(bus, 5).read(1, priority=None), float)
     assert_type(await Dc104Drive(bus).read(1, finish_within=1), int)
-    assert_type(await MentorDrive(bus, 14).read_run("1.17", 2), tuple[float, ...])
+    assert_type(await MentorDrive(bus, 14).read("1.17", 2), tuple[float, ...])
     assert_type(await MscController(bus, 3).status(), ProgramStatus)
     assert_type(await Hcp2Controller(bus, 5).node.request(hcp2.Read(1)), float)
 
@@ -91,13 +90,13 @@ def test_handles_need_only_what_has_nodes_and_a_bus_is_one() -> None:
         Node.of(Hcp2Controller(fake, 5))
 
 
-def test_a_handle_that_cannot_read_write_and_name_its_items_cannot_be_made() -> None:
+def test_a_handle_that_cannot_name_its_items_cannot_be_made() -> None:
     class Half(Handle):
         profile = hcp2.PROFILE
 
         def point(self, item: str) -> Point[Any]:
             raise NotImplementedError
 
-    assert Half.__abstractmethods__ == {"read", "write", "items"}
+    assert Half.__abstractmethods__ == {"items"}
     with pytest.raises(TypeError, match="abstract"):
         Half(FakeBus(lambda _: 1.0), 5)  # type: ignore[abstract]  # that is what is tried

@@ -38,6 +38,7 @@ class LineClient:
         self.owner_time = owner_time
         self.user = user
         self.account = Account()
+        # Its own account until a client is admitted with an `owner_time`: then all of that role share one.
         self.role = self.account
         """The account of all clients with its `owner_time`."""
         self.over = False
@@ -62,16 +63,19 @@ class Hold(LineClient):
     most, to the end of the exchange that is on the wire then. The line alone changes it.
     """
 
-    __slots__ = ("client", "holds", "longest", "node", "priority")
+    __slots__ = ("began", "client", "holds", "longest", "node", "priority")
 
     priority: int
     """The class in which it has begun."""
+    began: float
+    """When it began to hold the line, in seconds, if its client has an `owner_time`."""
 
     def __init__(self, node: NodeRecord, client: LineClient, longest: float) -> None:
         super().__init__(client.share)
         self.node = node
         self.client = client
         self.longest = longest
+        self.began = -inf
         self.holds = False
         """Whether the line is held for it."""
 

@@ -3,30 +3,32 @@
 The arbiter says when the line is free and what came of an attempt; the dispatcher never knows what is on the line.
 It queues, orders the writes of a node, retries, confirms refusals, parks the polls of dead nodes, pays for probes,
 and ends every transaction exactly once.
+
+If the line can no longer be used, whatever waits is taken out at once, so that none of it is sent any more, whatever
+becomes of the line meanwhile. But a thousand callers told in one callback would hold up the loop that owns the line,
+and perhaps others: it ends in bounded pieces. What remains is due at once, so that the owner calls again when it has
+seen to its other ports.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from itertools import count
 from math import inf
 from typing import Any
 
-from busmaster.arbiter.backlog import Backlog
+from busmaster.arbiter.backlog import Backlog, Writes
 from busmaster.arbiter.clients import Hold
-from busmaster.arbiter.counters import LineCounters
-from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.endings import hold_ended, make_error, name_error, too_late
+from busmaster.arbiter.counters import RESYNCHRONISING, LineCounters
+from busmaster.arbiter.deadlines import Deadlines, Expiries
+from busmaster.arbiter.eligibility import IF_PAID, OK, WAITS, Eligible, Rejected, eligibility, unpaid
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
-from busmaster.arbiter.expiries import Expiries
-from busmaster.arbiter.failing_transactions import FailingTransactions, take_out
 from busmaster.arbiter.health import DOWN, UP, NodeRecord
-from busmaster.arbiter.node_watch import NodeWatch
-from busmaster.arbiter.probes import Probes
+from busmaster.arbiter.probes import NodeWatch, Probes
 from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.shared_backlog import SharedBacklog
-from busmaster.arbiter.state import SETTLING
-from busmaster.arbiter.tap import Attempt
+from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.arbiter.transaction import (
     BACKGROUND,
     ENDED,
@@ -40,34 +42,138 @@ from busmaster.arbiter.transaction import (
     Poll,
     Priority,
     Transaction,
+    hold_ended,
+    make_error,
+    name_error,
+    too_late,
 )
-from busmaster.arbiter.writes import Writes
+from busmaster.arbiter.trust import SPOILING
 from busmaster.contract.exchange import Command, FrameError
 from busmaster.errors import (
     BacklogFull,
     BusError,
     GarbledReply,
-    NodeDown,
     NoReply,
     Refused,
     Superseded,
     WriteUnconfirmed,
 )
 
+AT_ONCE = 32
+"""Transactions that fail in one call."""
+
+
+class FailingTransactions:
+    """The transactions of one line that are to fail. Each gets the fault for which it was added, however late."""
+
+    __slots__ = ("_deadlines", "_left")
+
+    def __init__(self, deadlines: Deadlines) -> None:
+        self._deadlines = deadlines
+        self._left: deque[tuple[Transaction, BusError]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._left)
+
+    def add(self, transactions: Iterable[Transaction], fault: BusError) -> None:
+        """Have `next` hand these transactions out with `fault`, behind those that are there."""
+        for transaction in transactions:
+            transaction.phase = FAILING
+            self._left.append((transaction, fault))
+
+    def next(self, now: float) -> Iterator[tuple[Transaction, BusError]]:
+        """Hand out at most AT_ONCE transactions, each with an error of its own, and set the deadline of the others.
+
+        A transaction that has ended meanwhile, since its caller has gone, is left out.
+        """
+        left = self._left
+        piece = [left.popleft() for _ in range(min(AT_ONCE, len(left)))]
+        self._deadlines.failing = now if left else inf
+        for transaction, fault in piece:
+            if transaction.phase is FAILING:
+                yield transaction, make_error(type(fault), fault.what, transaction)
+
+
+def take_out(queues: Iterable[deque[Transaction]], backlog: Backlog) -> list[Transaction]:
+    """Empty the backlog and each node's queue of writes, except for what is on the wire. Returns what was taken out."""
+    taken: list[Transaction] = []
+    for writes in queues:
+        if writes:
+            taken += (write for write in writes if write.phase is PARKED)
+            on_wire = [write for write in writes if write.phase is ON_WIRE]
+            writes.clear()
+            writes += on_wire
+    return taken + backlog.drain()
+
+
 REFUSED_POLL_PAUSE = 10.0
 """Seconds between polls of a point that was refused again and again."""
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
-SUSPENDED = "suspended for maintenance"
 NOT_DONE = (Refused, Superseded)
 """Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
 
 
+class Tapped:
+    """Tells whoever taps the line of each attempt, from now on; of one that is on the wire already, nothing is told."""
+
+    def __init__(self, events: deque[Event], counters: LineCounters) -> None:
+        self.attempt: Attempt | None = None
+        """What is on the wire."""
+        self._events = events
+        self._counters = counters
+        self._order_of_transactions = count(1)
+        self._numbers: dict[Transaction, int] = {}
+
+    def started(self, transaction: Transaction) -> None:
+        """Begin the attempt that goes out now, with the number of its transaction."""
+        if transaction.attempts == 1 or transaction not in self._numbers:
+            self._numbers[transaction] = next(self._order_of_transactions)
+        node = transaction.node
+        self.attempt = Attempt(
+            node.profile.name,
+            node.address,
+            transaction.command,
+            node.timings,
+            transaction=self._numbers[transaction],
+            number=transaction.attempts,
+            purpose=_purpose(transaction),
+            quiet_time=self._counters.spent[RESYNCHRONISING],
+        )
+
+    def over(self, transaction: Transaction, verdict: Verdict, result: Any, now: float) -> None:
+        """Tell how the attempt ended."""
+        attempt, self.attempt = self.attempt, None
+        if attempt is None:  # it was on the wire before anybody listened
+            return
+        attempt.late = transaction.late
+        attempt.heard = transaction.wanted or transaction.check
+        attempt.end(verdict, result, now)
+        self._events.append(attempt)
+
+    def forget(self, transaction: Transaction) -> None:
+        """Forget the number of a transaction that has ended."""
+        self._numbers.pop(transaction, None)
+
+
+def _verdict(no_reply: bool, what: str, ambiguous: bool) -> Verdict:
+    if ambiguous:
+        return Verdict.AMBIGUOUS
+    if no_reply:
+        return Verdict.NO_REPLY
+    return Verdict.SPOILT if what in SPOILING else Verdict.GARBLED
+
+
+def _purpose(transaction: Transaction) -> str:
+    if transaction.check:
+        return "check"
+    if transaction.probe:
+        return "probe"
+    return "" if transaction.poll is None else f"poll {transaction.poll.name}".rstrip()
+
+
 class Dispatcher:
     """The transactions of one line. Times are the caller's clock, in seconds."""
-
-    attempt: Attempt | None = None
-    """What is on the wire, where somebody taps the line (tapped.py)."""
 
     def __init__(
         self, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
@@ -90,6 +196,8 @@ class Dispatcher:
         self._watch = NodeWatch(self.nodes, self.probes, self.events, jitter)
         self._expiries = Expiries(deadlines)
         self.failing = FailingTransactions(deadlines)
+        self.tapped: Tapped | None = None
+        """Where somebody taps the line: a line that nobody listens to pays a comparison for it."""
 
     # requests
 
@@ -99,9 +207,9 @@ class Dispatcher:
         transaction.queued = now
         transaction.deadline = now + RETRY_PATIENCE
         transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
-        transaction.settling_ahead = counters.spent[SETTLING]
+        transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING]
         if self.fault is not None:
-            self._end(transaction, now, name_error(self.fault(), transaction))
+            self._admitted(transaction, now)
             return True
         changed = transaction.writes  # it may have superseded others, which is to be told
         queue = self.backlog.queues[transaction.priority]
@@ -113,10 +221,11 @@ class Dispatcher:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return True
         if node.health is DOWN or now < node.suspended_until:
-            if not self._may_ask(transaction, now):
+            if self._admitted(transaction, now) is None:
                 return True
             if node.budgeted and transaction.client is not None and not isinstance(transaction.client, Hold):
                 transaction.client = self.share().new_nodes()
+        # Behind the check above, so that a rejected write never blocks the writes behind it.
         if changed:
             self.writes.queues[node].append(transaction)
         if transaction.start_by < inf:
@@ -130,6 +239,7 @@ class Dispatcher:
         """Note that a caller has gone: its transaction is not sent if still queued, unheard if on the wire (R6)."""
         if not transaction.wanted or transaction.phase in (ENDED, IDLE):
             return
+        # On the wire it stays until its reply has come or its window is over: cancelling saves no line time (R6).
         transaction.wanted = False
         self.counters.cancelled += 1
         if transaction.phase is QUEUED:
@@ -142,39 +252,53 @@ class Dispatcher:
     def next(self, now: float) -> Transaction | None:
         """Take out the transaction that may be sent now, or return None."""
         while (transaction := self.backlog.pop(now)) is not None:
-            node = transaction.node
-            if transaction.start_by < now and (  # queued right now, it is in time: its caller's clock was read earlier
-                transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
-            ):
-                self._end(transaction, now, too_late(transaction, now))
-            elif transaction.writes and not self.writes.is_first(transaction):
-                self.writes.park(transaction)
-            elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
-                transaction, now
-            ):
+            verdict = self._admitted(transaction, now)
+            if verdict is OK:
                 return transaction
+            if verdict is WAITS:
+                self.writes.park(transaction)
+            self.backlog.keep_turn(transaction)
         return None
 
     def urgent_waits(self) -> bool:
         """Return whether something of the class URGENT waits."""
         return self.backlog.waiting(URGENT) > 0
 
-    def may_go(self, transaction: Transaction, now: float) -> bool:
-        """Return whether a read that waits may be sent before the first transaction; nothing is changed."""
-        node = transaction.node
-        if node.health is DOWN or node.holds or node.suspended_until > now:
-            return False
-        return transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
+    def eligibility(self, transaction: Transaction, now: float) -> Eligible | Rejected:
+        """Return whether a transaction may be sent now; nothing is changed."""
+        return eligibility(transaction, now, self.writes, None if self.fault is None else self.fault())
+
+    def proves(self, read: Transaction, now: float) -> bool:
+        """Return whether a read that waits may be sent in place of a sync read: its node is not known to be down."""
+        return read.node.health is not DOWN and self.eligibility(read, now) is OK
+
+    def _admitted(self, transaction: Transaction, now: float) -> Eligible | None:
+        """Return OK or WAITS, and have the budget of probes pay for what is asked of a dead node; or end the
+        transaction, and return None."""
+        verdict = self.eligibility(transaction, now)
+        if verdict is IF_PAID:
+            cost = transaction.node.max_reply_delay
+            if self.probes.spare(cost, now):
+                transaction.probe_cost = cost
+                transaction.retries = 0
+                verdict = self.eligibility(transaction, now)
+            else:
+                verdict = unpaid(transaction)
+        if isinstance(verdict, Rejected):
+            self._end(transaction, now, verdict.error)
+            return None
+        return verdict
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Note that the next attempt of a transaction goes out now."""
         counters = self.counters
+        # Waits are those of the first attempt: a retry waits because of the line, not because of its class.
         if transaction.attempts:
             transaction.first_byte = -inf
         elif not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
             transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
-            transaction.settling_ahead = counters.spent[SETTLING] - transaction.settling_ahead
+            transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING] - transaction.quiet_time_ahead
             poll = transaction.poll
             if poll is not None and poll.started == -inf:
                 poll.started = now
@@ -185,6 +309,8 @@ class Dispatcher:
         transaction.attempts += 1
         transaction.started = now
         transaction.late = transaction.overdue = False  # an earlier attempt may have been: its value is not this one's
+        if self.tapped is not None:
+            self.tapped.started(transaction)
 
     def _take_stops(self, stop: Transaction, now: float) -> None:
         """Have equal stops that wait for the same node get the outcome of the one that is sent now.
@@ -220,6 +346,9 @@ class Dispatcher:
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
         """Note a success at once where it bears on what goes next; else with the events, when the next request left."""
+        if self.tapped is not None:
+            self.tapped.over(transaction, Verdict.OK, value, now)
+        # Still there if the owner has not pumped its events since the last success.
         if self.unnoted is not None:
             self.note_success()
         transaction.value = value
@@ -243,30 +372,34 @@ class Dispatcher:
         node.last_reply = now
         if node.health is not UP:
             self._watch.heard(node, now)
-        if node.lateness_until < inf:
-            self._watch.lower_lateness(transaction, now)
+        if node.max_reply_delay_until < inf:
+            self._watch.lower_max_reply_delay(transaction, now)
         if transaction.probe_cost:
             self.probes.budget.refund(transaction.probe_cost - (now - transaction.started))
         transaction.refused_cycles = 0
         self._end(transaction, now)
 
     def attempt_failed(
-        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, doubted: bool = False
+        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, ambiguous: bool = False
     ) -> None:
-        """Ask again or fail. A `doubted` answer came and was not believed, which says nothing of the node (R15)."""
+        """Ask again or fail. A `ambiguous` answer came and was not believed, which says nothing of the node (R15)."""
+        if self.tapped is not None:
+            self.tapped.over(transaction, _verdict(no_reply, failure.what, ambiguous), failure.what, now)
         node = transaction.node
         transaction.unsure = True
         if no_reply:
             node.counters.no_reply += 1
         else:
             node.counters.garbled += 1
-        worth = doubted or self._watch.is_worth_a_retry(transaction)
+        # An ambiguous reply says nothing against the node, so the attempt is repeated even to one that fails.
+        worth = ambiguous or self._watch.is_worth_a_retry(transaction)
         if transaction.retried < transaction.retries and worth and self.is_wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
             return
-        if not (doubted or transaction.check):
+        # A sync read may be refused or unknown to the node: its failure says nothing about the node.
+        if not (ambiguous or transaction.check):
             self._watch.failed(node, now)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
@@ -275,6 +408,8 @@ class Dispatcher:
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Fail a transaction over which the protocol's reader failed: a bug there. To ask again would meet it again."""
+        if self.tapped is not None:
+            self.tapped.over(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
         transaction.node.counters.garbled += 1  # but no failure of the node: a bug says nothing of its health
         kind = WriteUnconfirmed if transaction.writes else BusError
@@ -286,6 +421,8 @@ class Dispatcher:
     def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
         """Ask once more after a NAK or EOT where that can tell something new; then it is final (R7). Where it is not
         `certain`, it may be an earlier request's (R15): a read is asked once more; a write was perhaps carried out."""
+        if self.tapped is not None:
+            self.tapped.over(transaction, Verdict.REFUSED, refusal.what, now)
         node = transaction.node
         node.counters.refused += 1
         transaction.unsure = transaction.unsure or not certain
@@ -294,12 +431,13 @@ class Dispatcher:
             transaction.refusals += 1
             self._requeue(transaction, now)
             return
-        # A NAK that may be noise, or another request's, takes nothing away that could prove that the line is in step.
+        # A NAK that may be noise, or another request's, takes nothing away that could prove that the line is in sync.
         if certain and not transaction.writes and (transaction.refusals or not refusal.confirm):
             node.note_refused(transaction.command)
         node.last_reply = now  # a refusal is an answer too (R11)
         if node.health is not UP:
             self._watch.heard(node, now)
+        # Once may be noise that looks like a NAK; twice in a row is a point that the node does not have.
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
             transaction.refused_until = now + REFUSED_POLL_PAUSE
@@ -311,6 +449,8 @@ class Dispatcher:
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """Fail a transaction under which the line was lost: a write may have been carried out."""
+        if self.tapped is not None:
+            self.tapped.over(transaction, Verdict.CUT_OFF, error.what, now)
         transaction.node.counters.cut_off += 1
         self._end(transaction, now, name_error(error, transaction))
 
@@ -356,6 +496,8 @@ class Dispatcher:
             self.expire(now)
         if now >= deadlines.hold:
             self.end_hold(now)
+        if now >= deadlines.sequence:
+            deadlines.sequence = inf  # the line, if it is free, asks the backlog next
 
     def fail_more(self, now: float) -> None:
         """End a bounded piece of what was taken out: the deadline has passed already while there is more."""
@@ -366,6 +508,7 @@ class Dispatcher:
         """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12). What is on
         the wire runs out unheard, as when its caller is cancelled; what has come by now has come in time."""
         self.note_success()
+        # First the success above: a reply that has arrived in time must not be reported as too late.
         for transaction in self._expiries.due(now):
             if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
                 continue  # its caller has gone, or it was started in time: then only its `finish_by` ends it
@@ -408,26 +551,9 @@ class Dispatcher:
         """Start what is due, a bounded piece of it: the deadline has passed already while there is more."""
         for transaction in self.schedule.begin(now):
             self._waits(transaction)
-            error = self._reason_to_park(transaction, now)
-            if error is None:
+            if self._admitted(transaction, now) is not None:
                 self.backlog.push(transaction)
-            else:
-                self._end(transaction, now, error)
         self._deadlines.schedule = self.schedule.next_due()
-
-    def _reason_to_park(self, transaction: Transaction, now: float) -> BusError | None:
-        node = transaction.node
-        if self.fault is not None:
-            return name_error(self.fault(), transaction)
-        if now < node.suspended_until:
-            return make_error(NodeDown, SUSPENDED, transaction)
-        if node.health is DOWN:
-            return make_error(NodeDown, "down: it is probed, its polls wait", transaction)
-        if node.holds:
-            return make_error(NodeDown, "back, and its on_return hook is still running", transaction)
-        if now < transaction.refused_until:
-            return make_error(Refused, "refused again and again: polled every 10 s", transaction)
-        return None
 
     # dead nodes
 
@@ -451,32 +577,14 @@ class Dispatcher:
             self.backlog.push(probe)
 
     def check(self, node: NodeRecord, command: Command[Any], now: float) -> Transaction:
-        """Make a read by which the line proves that it is in step (R15). It goes at once; nobody waits for it."""
-        self.counters.checks += 1
+        """Make a read by which the line proves that it is in sync (R15). It goes at once; nobody waits for it."""
+        self.counters.sync_reads += 1
         check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
         check.check = True
         check.wanted = False
         check.queued, check.deadline = now, inf
         self._waits(check)
         return check
-
-    def _may_ask(self, transaction: Transaction, now: float) -> bool:
-        """Return whether a node that is down, back or suspended is worth this request's line time; if not, end it."""
-        node = transaction.node
-        error: BusError | None = None
-        if transaction.poll is not None:
-            error = self._reason_to_park(transaction, now)
-        elif now < node.suspended_until:
-            error = make_error(NodeDown, SUSPENDED, transaction)
-        elif node.health is DOWN and not (transaction.probe_cost or transaction.probe):
-            if self.probes.spare(node.lateness, now):
-                transaction.probe_cost = node.lateness
-                transaction.retries = 0
-            else:
-                error = make_error(NodeDown, "down: no answer for a while", transaction)
-        if error is not None:
-            self._end(transaction, now, error)
-        return error is None
 
     # the ways of one transaction
 
@@ -489,12 +597,14 @@ class Dispatcher:
     def _requeue(self, transaction: Transaction, now: float) -> None:
         """Put a transaction at the back of its class; a poll's key becomes failure time + period (R7)."""
         poll = transaction.poll
+        # From now on and not from the first deadline: a retry that keeps its place would delay the polls behind it.
         transaction.deadline = now + (poll.patience if poll is not None else RETRY_PATIENCE)
         self.backlog.push(transaction)
 
     def _supersede(self, node: NodeRecord, why: str, now: float, above: Priority | None = None) -> None:
         """End a node's writes, those below the class `above` if one is given: what is overtaken is never sent after
         what overtakes it, nor if that cannot be sent itself (R7)."""
+        # A copy, since ending a write removes it from the queue.
         for write in list(self.writes.queues[node]):
             if write.phase is ON_WIRE:
                 write.superseded = True  # it runs out, but is not repeated behind what overtakes it
@@ -505,6 +615,8 @@ class Dispatcher:
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """End it exactly once (R8). A write sent before something else ended it may have been carried out."""
+        if self.tapped is not None:
+            self.tapped.forget(transaction)
         if transaction.writes:
             unsure = transaction.unsure or (transaction.attempts > 0 and not isinstance(error, NOT_DONE))
             if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
@@ -512,7 +624,7 @@ class Dispatcher:
             self.writes.over(transaction)
         if not transaction.attempts:
             transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
-            transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
+            transaction.quiet_time_ahead = self.counters.spent[RESYNCHRONISING] - transaction.quiet_time_ahead
         transaction.phase = ENDED
         transaction.ended_at = now
         transaction.error = error
@@ -527,6 +639,7 @@ class Dispatcher:
             self._end(other, now, error and make_error(type(error), error.what, other, error.hint))
         poll = transaction.poll
         if poll is not None:
+            # A group that was removed meanwhile has no reader any more.
             if poll.group is not None and poll.active:
                 self.events.append(Sampled(poll, transaction))
             poll.remaining -= 1
@@ -540,4 +653,4 @@ class Dispatcher:
     def _waits(self, transaction: Transaction) -> None:
         """Note what the line has counted so far, for which it does not wait: it is taken off when it has waited."""
         transaction.exchanges_ahead = self.counters.exchanges
-        transaction.settling_ahead = self.counters.spent[SETTLING]
+        transaction.quiet_time_ahead = self.counters.spent[RESYNCHRONISING]

@@ -52,20 +52,20 @@ class NodeChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class LatenessRaised:
-    """A straggler of this node was seen, so its lateness was raised (R3)."""
+class MaxReplyDelayRaised:
+    """An overdue reply of this node was seen, so its maximum reply delay was raised (R3)."""
 
     node: NodeRecord
     age: float
-    lateness: float
+    max_reply_delay: float
 
 
 @dataclass(frozen=True, slots=True)
-class LatenessLowered:
-    """An hour of prompt replies: this node's lateness is what it was before it was raised."""
+class MaxReplyDelayLowered:
+    """An hour of prompt replies: this node's maximum reply delay is what it was before it was raised."""
 
     node: NodeRecord
-    lateness: float
+    max_reply_delay: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class PortFailed:
 
 
 @dataclass(frozen=True, slots=True)
-class CameUnasked:
+class CameUnexpected:
     """Bytes came that nobody had asked for, or an echo did not match (`collision`)."""
 
     data: bytes
@@ -124,11 +124,11 @@ Event: TypeAlias = (
     | Sampled
     | Polled
     | NodeChanged
-    | LatenessRaised
-    | LatenessLowered
+    | MaxReplyDelayRaised
+    | MaxReplyDelayLowered
     | RepliesLate
     | LineChanged
     | PortFailed
-    | CameUnasked
+    | CameUnexpected
     | Attempt
 )

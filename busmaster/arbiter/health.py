@@ -32,10 +32,10 @@ BUDGET_CAPACITY = 0.5
 """Seconds of line time that may be saved up."""
 LONGEST_BUDGET_WAIT = 1.0
 
-CALM_LATENESS = 3600.0
-"""Seconds of prompt replies after which a lateness that was raised comes down again."""
+CALM_MAX_REPLY_DELAY = 3600.0
+"""Seconds of prompt replies after which a maximum reply delay that was raised comes down again."""
 SILENT = 2
-"""Attempts in a row without a byte after which a node is not asked whether it is in step."""
+"""Attempts in a row without a byte after which a node is not asked whether it is in sync."""
 MOST_ANSWERED = 3
 """Commands that are remembered of a node because it has answered them."""
 SLOWER, SLOWER_BY = 1.25, 0.001
@@ -77,9 +77,9 @@ class NodeRecord:
         "holds",
         "label",
         "last_reply",
-        "lateness_until",
         "learning",
         "line",
+        "max_reply_delay_until",
         "probe_at",
         "probe_delay",
         "probed_at",
@@ -140,8 +140,8 @@ class NodeRecord:
         """Seconds to the first byte of about the slowest of its last replies."""
         self.usual: float | None = None
         """Seconds to the first byte of its usual reply, in runs of answers that are alike; None until there was one."""
-        self.lateness_until = inf
-        """When a lateness that was raised comes down again, if all replies are prompt until then."""
+        self.max_reply_delay_until = inf
+        """When a maximum reply delay that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
         self.told_late = 0.0
         """Seconds to the first byte of the latest of its replies that was told as a late one."""
@@ -172,39 +172,42 @@ class NodeRecord:
 
     def note_refused(self, command: Command[Any]) -> None:
         """Stop using a sync read that was refused for certain. If the node has refused all of them, use all again."""
-        if command in self.profile.checks:
+        if command in self.profile.sync_reads:
             self._refused.add(command)
-        if self._refused.issuperset(self.profile.checks):
+        # A node that refuses all of them is still better asked than not: a refusal is a reply, too.
+        if self._refused.issuperset(self.profile.sync_reads):
             self._refused.clear()
         self.answered = {key: read for key, read in self.answered.items() if read != command}
 
-    def checks(self) -> Iterator[Command[Any]]:
+    def sync_reads(self) -> Iterator[Command[Any]]:
         """Yield cheap reads of this node: those that it has answered, then those of its protocol that it does not
         refuse."""
         yield from self.answered.values()
-        for check in self.profile.checks:
+        for check in self.profile.sync_reads:
             if check not in self._refused:
                 yield check
 
-    def raise_lateness(self, lateness: float, now: float) -> None:
-        """Raise the node's lateness to at least `lateness` seconds: it was slower than was believed."""
+    def raise_max_reply_delay(self, max_reply_delay: float, now: float) -> None:
+        """Raise the node's maximum reply delay to at least `max_reply_delay` seconds: it was slower than was
+        believed."""
+        # The first timings are kept, however often it is raised: prompt replies for an hour restore those.
         if self._before_raised is None:
             self._before_raised = self.timings
-        self.timings = self.timings.with_lateness(lateness)
-        self.lateness_until = now + CALM_LATENESS
+        self.timings = self.timings.with_max_reply_delay(max_reply_delay)
+        self.max_reply_delay_until = now + CALM_MAX_REPLY_DELAY
 
-    def restore_lateness(self) -> None:
-        """Set the lateness back to what it was before it was raised."""
+    def restore_max_reply_delay(self) -> None:
+        """Set the maximum reply delay back to what it was before it was raised."""
         if self._before_raised is not None:
             self.timings = self._before_raised
         self._before_raised = None
-        self.lateness_until = inf
+        self.max_reply_delay_until = inf
 
     @property
-    def lateness(self) -> float:
-        """The longest lateness of its timings, in seconds."""
+    def max_reply_delay(self) -> float:
+        """The longest maximum reply delay of its timings, in seconds."""
         timings = self.timings
-        return max(timings.read.lateness, timings.write.lateness, timings.packet.lateness)
+        return max(timings.read.max_reply_delay, timings.write.max_reply_delay, timings.packet.max_reply_delay)
 
 
 class ProbeBudget:
@@ -241,6 +244,7 @@ class ProbeBudget:
     def take(self, cost: float, now: float, beside: float = 0.0) -> bool:
         """Pay for a probe and return True, if the bucket holds it `beside` so much (a full one pays for anything)."""
         self._earn(now)
+        # A full bucket pays for any probe: one that costs more than the capacity would otherwise never be sent.
         if self.tokens < min(cost + beside, BUDGET_CAPACITY):
             return False
         self.tokens -= cost
@@ -253,6 +257,7 @@ class ProbeBudget:
     def wait_for(self, cost: float, now: float) -> float:
         """Return the seconds until the bucket holds `cost` at the current share; asked again by then at the latest."""
         share = BUDGET_SHARE_AFTER_RETURN if now < self._generous_until else BUDGET_SHARE
+        # At most a second, because the share may rise meanwhile: a node has returned, or the line was idle.
         missing = min(cost, BUDGET_CAPACITY) - self.tokens
         return min(max(missing / share, 0.001), LONGEST_BUDGET_WAIT)
 
@@ -272,9 +277,11 @@ def flaps(node: NodeRecord, now: float) -> bool:
 def note_success(node: NodeRecord, now: float) -> None:
     """Note that a reply of the node came. The caller reports the change of health."""
     node.failures = 0
+    # A drive that was away may have been replaced, or may answer slower after power-up.
     if node.health is DOWN and node.learning is not None and node.up_since > -inf:
         node.learning.was_away()
     if node.health is SUSPECT:
+        # Three replies and five seconds: a node that flaps would otherwise report UP and SUSPECT at every cycle.
         node.replies += 1
         if node.replies < UP_AFTER_REPLIES or now - node.failed_at < UP_AFTER_CALM:
             return
@@ -291,10 +298,12 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
     """
     if node.address == node.profile.broadcast:
         return  # its probe cannot be sent, and would be chosen and paid for again and again
+    # Counted per transaction, after its retries: a single lost frame does not count.
     node.failures += 1
     node.failed_at = now
     node.replies = 0
     if node.health is DOWN:
+        # Only a failed probe doubles the delay; requests of callers to a dead node do not postpone its probe.
         if now >= node.probe_at:
             _probe_later(node, min(2 * node.probe_delay, LONGEST_PROBE_DELAY), now, jitter)
         return

@@ -4,13 +4,13 @@ The documents' windows are made for the slowest node that there may be: a reply 
 in 2 ms as much as one which takes 100 ms. Where learning is asked for, a read that will be repeated is awaited for only
 as long as this node has needed of late, with a good margin; then the line goes on, though the reply may still come.
 
-What makes that safe is R15, not the window: the reply is *owed* from then on, for as long as the document's lateness
-and beyond it, and nothing that it could counterfeit is believed, no write and no broadcast is sent, until the node has
-answered something else. Nothing that is told to a caller rests on a learned time, either: writes and the last attempt
-of a read have the document's window, and go only when nothing is awaited any more; probes and all that is asked of a
-node that has failed, and not answered since, have the document's times altogether.
+What makes that safe is R15, not the window: the reply is *overdue* from then on, for as long as the document's maximum
+reply delay and beyond it, and nothing that it could counterfeit is believed, no write and no broadcast is sent, until
+the node has answered something else. Nothing that is told to a caller rests on a learned time, either: writes and the
+last attempt of a read have the document's window, and go only when nothing is awaited any more; probes and all that is
+asked of a node that has failed, and not answered since, have the document's times altogether.
 
-The rule, for each kind of command (its type) and each of the node's two legs (the answer; MSC's packet after its
+The rule, for each kind of command (its type) and each of the node's two steps (the answer; MSC's packet after its
 ACK) on its own: the window is one and a half times the largest reply time of the last 500 to 1000 replies, or the
 largest until the first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus
 2 ms; at least 5 ms, at most the document's. It is trusted after 200 replies.
@@ -59,14 +59,14 @@ LEAST_SILENCE = 17
 class LearnedTimes:
     """What is known of the replies of one node to one kind of command; in seconds.
 
-    `slowest` is the largest reply time of the last 500 to 1000 replies, to the first byte; `heard` the largest until
+    `slowest` is the largest reply time of the last 500 to 1000 replies, to the first byte; `received` the largest until
     the first bytes were handed over; `pause` the longest within a reply. `window` is what is awaited, once `trusted`.
     """
 
     kind: str
     packet: bool
     slowest: float
-    heard: float
+    received: float
     pause: float
     window: float
     trusted: bool
@@ -95,8 +95,8 @@ class _Largest:
         self.before, self.now = self.now, 0.0
 
 
-class LegTimes:
-    """The reply times of one leg of one kind of command."""
+class StepTimes:
+    """The reply times of one step of one kind of command."""
 
     __slots__ = ("_left", "doubts", "heard", "pause", "slowest")
 
@@ -112,6 +112,7 @@ class LegTimes:
         """Note one reply. Returns whether what is known has changed."""
         slowest, whole, pauses = self.slowest, self.heard, self.pause
         changed = False
+        # Compared one by one, without `max`: this runs for every reply, and seldom changes anything.
         if begun > slowest.now:
             changed = begun > slowest.before
             slowest.now = begun
@@ -124,6 +125,7 @@ class LegTimes:
         if self.doubts:
             self.doubts -= 1
             changed = changed or not self.doubts
+        # Two epochs and not a sliding window: the largest of the last 500 to 1000 replies costs two numbers.
         self._left -= 1
         if not self._left:
             self._left = EPOCH
@@ -142,8 +144,12 @@ class LegTimes:
         window = min(patience * self.window, document.window)
         if self.doubts:
             return document
-        gap = min(document.byte_gap, max(LEAST_SILENCE * byte_time, 2 * self.pause.value))
-        return replace(document, nominal=min(document.nominal, window), window=window, byte_gap=gap, silence=gap)
+        # Twice the longest pause seen, since a pause depends on the scheduler of the adapter more than a reply time
+        # does.
+        gap = min(document.inter_byte_timeout, max(LEAST_SILENCE * byte_time, 2 * self.pause.value))
+        return replace(
+            document, late_after=min(document.late_after, window), window=window, inter_byte_timeout=gap, silence=gap
+        )
 
 
 class Kind:
@@ -152,8 +158,8 @@ class Kind:
     __slots__ = ("_byte_time", "_document", "_given", "first", "packet")
 
     def __init__(self) -> None:
-        self.first = LegTimes()
-        self.packet = LegTimes()
+        self.first = StepTimes()
+        self.packet = StepTimes()
         self._byte_time = 0.0
         self._document: Timings | None = None
         self._given: dict[int, Timings] | None = None
@@ -162,26 +168,29 @@ class Kind:
         """Return what an exchange is to be opened with: AT_FIRST, AGAIN, AT_LAST or NEVER."""
         if self._given is None or document is not self._document:
             self._document = document
-            own = replace(document, packet=replace(document.packet))  # so that a packet's leg can be told by its timing
+            own = replace(
+                document, packet=replace(document.packet)
+            )  # so that a packet's step can be told by its timing
             self._given = {patience: self._learned(own, patience) for patience in (AT_FIRST, AGAIN, AT_LAST)}
             self._given[NEVER] = own
         return self._given[hurry]
 
     def note(self, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
-        """Note the reply to one of its legs."""
-        leg = self.packet if packet else self.first
-        if leg.note(begun, heard, pause) or byte_time != self._byte_time:
+        """Note the reply to one of its steps."""
+        step = self.packet if packet else self.first
+        if step.note(begun, heard, pause) or byte_time != self._byte_time:
             self._byte_time = byte_time
             self._given = None
 
     def doubt(self, replies: int) -> None:
         """Go back to the document's times for at least so many replies."""
-        for leg in (self.first, self.packet):
-            leg.doubts = max(leg.doubts, replies)
+        for step in (self.first, self.packet):
+            step.doubts = max(step.doubts, replies)
         self._given = None
 
     def _learned(self, own: Timings, patience: int) -> Timings:
         first = self.first.timing(own.read, self._byte_time, patience)
+        # Longer for a write: when its window is over it is unconfirmed, while a read is only sent again.
         write = self.first.timing(own.write, self._byte_time, AT_LAST)
         return Timings(first, write, self.packet.timing(own.packet, self._byte_time, patience))
 
@@ -206,6 +215,7 @@ class Learning:
 
     def note(self, command: object, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
         """Note a reply: begun after so many seconds, its first bytes handed over after `heard`, with that `pause`."""
+        # A kind that was never opened with `timings` cannot have a reply.
         kind = self.kinds.get(type(command))
         if kind is not None:
             kind.note(packet, begun, heard, pause, byte_time)
@@ -216,18 +226,19 @@ class Learning:
 
     def was_away(self) -> None:
         """Go back to the document's times until enough is known of what may be another device."""
+        # Another device may answer at this address now, so the times of an earlier run are void too.
         self._known = {}
         self._doubt(TRUSTED_AFTER)
 
     def times(self, document: Timings) -> tuple[LearnedTimes, ...]:
-        """Return what is known, a leg at a time."""
+        """Return what is known, a step at a time."""
         found = []
         for command, kind in self.kinds.items():
-            for leg, limit, packet in ((kind.first, document.read, False), (kind.packet, document.packet, True)):
-                if leg.heard.value:
-                    slowest, heard, pause = leg.slowest.value, leg.heard.value, leg.pause.value
-                    window = min(leg.window, limit.window)
-                    trusted = not leg.doubts
+            for step, limit, packet in ((kind.first, document.read, False), (kind.packet, document.packet, True)):
+                if step.heard.value:
+                    slowest, heard, pause = step.slowest.value, step.heard.value, step.pause.value
+                    window = min(step.window, limit.window)
+                    trusted = not step.doubts
                     found.append(LearnedTimes(command.__name__, packet, slowest, heard, pause, window, trusted))
         return tuple(found)
 
@@ -236,7 +247,8 @@ class Learning:
         self._known = {(times.kind, times.packet): times for times in known}
 
     def to_keep(self, document: Timings) -> tuple[LearnedTimes, ...]:
-        """Return what the next run may begin with: what is trusted, and what this one began with and never doubted."""
+        """Return what the next run may begin with: what is trusted, and what this one began with and never
+        ambiguous."""
         trusted = {(times.kind, times.packet): times for times in self.times(document) if times.trusted}
         return tuple({**self._known, **trusted}.values())
 
@@ -247,10 +259,10 @@ class Learning:
 
     def _begin(self, name: str) -> Kind:
         kind = Kind()
-        for leg, packet in ((kind.first, False), (kind.packet, True)):
+        for step, packet in ((kind.first, False), (kind.packet, True)):
             times = self._known.get((name, packet))
-            if times is not None and times.trusted and max(times.slowest, times.heard, times.pause) < inf:
+            if times is not None and times.trusted and max(times.slowest, times.received, times.pause) < inf:
                 # As the epoch before: it counts until this run has an epoch of its own, and is forgotten then.
-                leg.slowest.before, leg.heard.before, leg.pause.before = times.slowest, times.heard, times.pause
-                leg.doubts = TRUSTED_AGAIN_AFTER
+                step.slowest.before, step.heard.before, step.pause.before = times.slowest, times.received, times.pause
+                step.doubts = TRUSTED_AGAIN_AFTER
         return kind

@@ -1,11 +1,17 @@
-"""When a dead node is asked whether it is back (R11)."""
+"""When a dead node is asked whether it is back; and what each attempt says of its node: its health, its maximum reply
+delay, and what follows of them (R3, R11).
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
 from math import inf
 
+from busmaster.arbiter import health
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.health import DOWN, NodeRecord, ProbeBudget
+from busmaster.arbiter.events import Event, MaxReplyDelayLowered, NodeChanged
+from busmaster.arbiter.health import DOWN, UNKNOWN, Health, NodeRecord, ProbeBudget
 from busmaster.arbiter.transaction import BACKGROUND, Transaction
 
 IDLE_PROBE_EVERY = 0.8
@@ -29,9 +35,9 @@ class Probes:
             self._deadlines.health = inf
             return
         down = self._down()
-        # A probe of a dead node is expected to fail, and a failed attempt costs the lateness: that, not the window, is
-        # what it takes of the line.
-        self.budget.probe = max((node.lateness for node in down), default=0.0)
+        # A probe of a dead node is expected to fail, and a failed attempt costs the maximum reply delay: that, not the
+        # window, is what it takes of the line.
+        self.budget.probe = max((node.max_reply_delay for node in down), default=0.0)
         due = min(map(_due, down), default=inf)
         free = min((max(self._free_at, node.suspended_until) for node in down), default=inf)
         self._deadlines.health = min(due, free)
@@ -44,7 +50,7 @@ class Probes:
             return None
         # Of those that are due the one that has waited longest, so that none is forgotten when the budget is short.
         node = min(down, key=lambda node: (node.probe_at > now, node.probed_at))
-        cost = node.lateness
+        cost = node.max_reply_delay
         if self._is_free(node, now, idle):
             self._free_at = now + IDLE_PROBE_EVERY
             cost = 0.0
@@ -62,17 +68,19 @@ class Probes:
         whether it did."""
         # The probe that is due keeps its share: else a caller that asks a dead node again and again would spend all
         # there is, and the other dead ones would never be found to be back.
-        due = max((n.lateness for n in self.nodes if n.health is DOWN and n.probe_at <= now), default=0.0)
+        due = max((n.max_reply_delay for n in self.nodes if n.health is DOWN and n.probe_at <= now), default=0.0)
         return self.budget.take(cost, now, due)
 
     def alive(self, node: NodeRecord, now: float) -> None:
         """Note that a dead node was heard: it will answer its probe, which therefore costs nothing."""
         node.probe_at = min(node.probe_at, now)
-        self.budget.refund(node.lateness)
+        # The refund is what the probe costs while it is expected to fail.
+        self.budget.refund(node.max_reply_delay)
         self.plan()
 
     def over(self, probe: Transaction) -> None:
         """Note that this transaction has ended; it may have been the probe that was out."""
+        # Identity, not equality: a caller may have sent the same command to the same node.
         if probe is self._running:
             self._running = None
             self.plan()
@@ -81,7 +89,9 @@ class Probes:
         """Return whether nobody waits, nothing is due before the probe is over, or nobody lives whom it could delay."""
         if not idle or now < self._free_at:
             return False
-        return now + node.lateness < self._deadlines.schedule or all(other.health is DOWN for other in self.nodes)
+        return now + node.max_reply_delay < self._deadlines.schedule or all(
+            other.health is DOWN for other in self.nodes
+        )
 
     def _probe(self, node: NodeRecord, cost: float, now: float) -> Transaction:
         probe = Transaction(node, node.profile.probe, priority=BACKGROUND, retries=0, probe=True)
@@ -107,3 +117,61 @@ class Probes:
 def _due(node: NodeRecord) -> float:
     """Return when this dead node's probe is due, if it must be paid for."""
     return max(node.probe_at, node.suspended_until)
+
+
+class NodeWatch:
+    """Of one line: it tells changes by `events`, and has `probes` see to those that are dead."""
+
+    def __init__(
+        self, nodes: list[NodeRecord], probes: Probes, events: deque[Event], jitter: Callable[[], float]
+    ) -> None:
+        self._nodes = nodes
+        self._probes = probes
+        self._events = events
+        self._jitter = jitter
+
+    def failed(self, node: NodeRecord, now: float) -> None:
+        """Note that a transaction failed for want of its node's answer."""
+        before = node.health
+        health.note_failure(node, now, self._jitter)
+        self._report(node, before)
+
+    def heard(self, node: NodeRecord, now: float) -> None:
+        """Note an answer of a node that was not known to be well."""
+        before = node.health
+        flaps = health.flaps(node, now)
+        health.note_success(node, now)
+        new, node.budgeted = node.budgeted, False
+        # That a new node replies says nothing of the others: else a client that names one again and again would have
+        # the budget filled faster for ever.
+        if before is DOWN and not (flaps or new):
+            # the others may be back too; a flapping node tells nothing about them
+            self._probes.budget.node_returned(now)
+            for other in self._nodes:
+                if other.health is DOWN:
+                    other.probe_at = min(other.probe_at, now)
+        self._report(node, before)
+
+    def is_worth_a_retry(self, transaction: Transaction) -> bool:
+        """Return False while the node fails, or for a poll of one never heard, which may not hold up a line's start."""
+        node = transaction.node
+        if node.health is UNKNOWN:
+            return transaction.poll is None
+        return not node.failures and node.health is not DOWN
+
+    def lower_max_reply_delay(self, transaction: Transaction, now: float) -> None:
+        """Put a node's maximum reply delay back to what it was, when an hour of prompt replies has passed since it was
+        raised."""
+        node = transaction.node
+        if transaction.late:
+            node.max_reply_delay_until = now + health.CALM_MAX_REPLY_DELAY
+        elif now > node.max_reply_delay_until:
+            node.restore_max_reply_delay()
+            self._events.append(MaxReplyDelayLowered(node, node.max_reply_delay))
+
+    def _report(self, node: NodeRecord, before: Health) -> None:
+        if node.health is not before:
+            returning = before is DOWN and node.has_hook
+            node.holds += returning
+            self._events.append(NodeChanged(node, before, node.health, returning))
+        self._probes.plan()

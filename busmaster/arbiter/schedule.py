@@ -3,6 +3,8 @@
 No call does more than a bounded amount of work, however many polls there are and however much they read: the loop
 that owns the line is never held up. What is left over is due at once, so that the owner calls again when it has seen
 to the line.
+
+Where on its period a new poll meets the others least is found by a search that can be done a slice at a time.
 """
 
 from __future__ import annotations
@@ -12,12 +14,124 @@ from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from itertools import count, islice
 from math import ceil, floor, inf
-from typing import Any
+from typing import Any, Protocol
 
-from busmaster.arbiter.phases import STRIDE, quietest_offset
 from busmaster.arbiter.transaction import BACKGROUND, POLL, Poll, Priority, Transaction
 from busmaster.contract.exchange import Exchange
 from busmaster.errors import InvalidCommand
+
+KINKS = 2000
+"""Bounds the work of choosing one phase: some 2000 of them cost a millisecond."""
+STRIDE = 64
+"""Kinks, or other polls, that are looked at between two places at which the search can be interrupted."""
+MEETINGS = 8
+"""Two polls whose cycles take longer than so many common divisors of their periods meet anyway."""
+ROUNDING = 1e-7
+
+
+class Recurring(Protocol):
+    """What occupies the line for `cost` seconds from base + k x period on. All times are in seconds."""
+
+    @property
+    def base(self) -> float: ...
+    @property
+    def cost(self) -> float: ...
+    @property
+    def period(self) -> float: ...
+
+
+Pair = tuple[float, float, float, float]
+"""Of another poll: when it begins, for how long it lasts, both on a circle of a length, and how often it is there."""
+
+
+def quietest_offset(
+    poll: Recurring, others: Iterable[Recurring], now: float, stretch: float = 1.0
+) -> Generator[int, None, float]:
+    """Find the seconds from `now`, below the period, at which this poll's cycles meet the others' least.
+
+    It is a generator that returns the offset; between, it yields how much it has looked at since, never much more than
+    STRIDE. All costs are multiplied by `stretch`. The time in which two polls want the line at once is a function of
+    their offset modulo the common divisor of their periods, made of straight pieces; the least sum of all of them lies
+    at one of the kinks. Among equals the earliest wins. The search ends early where there would be too many kinks.
+    """
+    # Stretched over the time that there is: cycles that just fit one behind the other would meet as soon as one of them
+    # takes longer than it was calculated.
+    own = min(poll.cost * stretch, poll.period)
+    pairs: list[Pair] = []
+    divisors: dict[float, float] = {}
+    frequency = before = 0.0
+    nearest = inf
+    for number, other in enumerate(others, 1):
+        step = divisors.get(other.period)
+        if step is None:
+            step = divisors[other.period] = common_divisor(poll.period, other.period)
+        length = min(other.cost * stretch, other.period)
+        if own + length < MEETINGS * step:
+            pairs.append(((other.base - now) % step, length, step, step / other.period))
+            before += (own + length) / step + 1
+            frequency += 1 / step
+            nearest = min(nearest, step)
+        if number % STRIDE == 0:
+            yield STRIDE
+    if not pairs:
+        return 0.0
+    reach = min(poll.period, max((KINKS / 4 - before) / frequency, nearest))
+    return (yield from _least(pairs, own, reach, 1 + int(4 * reach * frequency / STRIDE)))
+
+
+def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Generator[int, None, float]:
+    """Add up the bends of the sum of overlaps, sorted into so many pieces of the way, then walk it to its least."""
+    overlap = slope = at = 0.0
+    bends: list[dict[float, float]] = [{} for _ in range(pieces)]
+    looked_at = 0
+    for pair in pairs:
+        for x, bend in _kinks(pair, own, reach):
+            looked_at += 1
+            if looked_at == STRIDE:
+                yield looked_at
+                looked_at = 0
+            if x <= 0:
+                overlap -= bend * x
+                slope += bend
+            elif x < reach:
+                piece = bends[min(int(x / reach * pieces), pieces - 1)]
+                piece[x] = piece.get(x, 0.0) + bend
+    best, least = 0.0, overlap
+    for piece in bends:
+        for x in sorted(piece):
+            if least <= ROUNDING:
+                return best  # it meets nobody there, and among equals the earliest wins
+            overlap += slope * (x - at)
+            slope += piece[x]
+            at = x
+            if overlap < least - ROUNDING:
+                best, least = x, overlap
+        yield len(piece)
+    return best
+
+
+def _kinks(pair: Pair, own: float, reach: float) -> Iterator[tuple[float, float]]:
+    """Yield where the overlap with one other poll changes its slope, from before 0 up to `reach`, and by how much."""
+    begin, length, step, weight = pair
+    shorter = min(own, length)
+    first = begin - own - step * floor((begin + length) / step)
+    for k in range(ceil((reach - first) / step)):
+        start = first + k * step
+        end = start + own + length
+        yield start, weight
+        yield start + shorter, -weight
+        yield end - shorter, -weight
+        yield end, weight
+
+
+def common_divisor(first: float, second: float) -> float:
+    """Return the greatest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
+    first, second = max(first, second), min(first, second)
+    least = 1e-4 * second
+    while second > least:
+        first, second = second, abs(first - second * round(first / second))
+    return first
+
 
 FILL = 0.9
 """Cycles are spread over this share of the time when phases are chosen: the rest is left for what varies."""
@@ -30,19 +144,20 @@ AT_ONCE = 32
 def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | None = None) -> float:
     """Return the seconds of the line that one undisturbed attempt takes.
 
-    These are bytes both ways, and the wait before each reply leg. `reply_time` is the node's measured time to its first
-    byte; where it is None, half of `nominal` is assumed.
-    This is the one function by which merging, phases and planning weigh exchanges.
+    These are bytes both ways, and the wait before each reply step. `reply_time` is the node's measured time to its
+    first byte; where it is None, half of `late_after` is assumed. This is the one function by which merging, phases and
+    planning weigh exchanges.
     """
     sent = len(exchange.request) + exchange.closing
     timing = exchange.timing
     if not exchange.answered:
-        return sent * byte_time + timing.turnaround
-    wait = timing.nominal / 2 if reply_time is None else reply_time
-    total = (sent + exchange.sizes.typical) * byte_time + wait + timing.turnaround
-    for leg in exchange.later:
-        wait = leg.timing.nominal / 2 if reply_time is None else reply_time
-        total += (leg.sent + leg.sizes.typical) * byte_time + wait
+        return sent * byte_time + timing.driver_release_time
+    wait = timing.late_after / 2 if reply_time is None else reply_time
+    # The typical size, not the longest: with the longest, a line of short values would look twice as busy.
+    total = (sent + exchange.sizes.typical) * byte_time + wait + timing.driver_release_time
+    for step in exchange.later:
+        wait = step.timing.late_after / 2 if reply_time is None else reply_time
+        total += (step.sent + step.sizes.typical) * byte_time + wait
     return total
 
 
@@ -83,6 +198,7 @@ class Schedule:
         if poll.preparation is None:
             self._prepared(poll, now)
             return
+        # A single group starts in the same call; many that are added together share the slices of later calls.
         left = 0 if self.unplaced() else SLICE
         if poll not in self._preparing:
             self._preparing.append(poll)
@@ -143,6 +259,7 @@ class Schedule:
         if self._work_at <= now:
             self.work(now)
         starting: list[Poll] = []
+        # Bounded, because a thousand cycles due at the same moment would block the loop of all other lines.
         heap = self._heap
         for _ in range(AT_ONCE):
             if not heap or heap[0][0] > now:
@@ -168,6 +285,7 @@ class Schedule:
         heapq.heapreplace(self._heap, (poll.next_due(), next(self._order), poll))
         if poll.paused:
             return False
+        # R10: a cycle that cannot start is missed and counted; it is never queued behind the running one.
         if poll.remaining:  # its last cycle still runs: a second one beside it would only make both late
             poll.missed += 1
             return False
@@ -206,6 +324,7 @@ class Schedule:
         return 1
 
     def _prepared(self, poll: Poll, now: float) -> None:
+        # A phase given by the user counts from the first poll of the line, so that phases of groups are comparable.
         if poll.phase is not None and not poll.placed:
             self._start(poll, self._epoch + poll.phase, now)
         elif not poll.placed:
@@ -232,6 +351,7 @@ class Schedule:
 
     def _search(self, poll: Poll, now: float) -> Generator[int, None, float]:
         """Find where it meets least those that have their place, if all spread over the time that there is."""
+        # The offsets are spread over the time that the load needs: a line that is nearly idle would leave long gaps.
         load = 0.0
         others = []
         for number, other in enumerate(tuple(self.polls), 1):  # a copy: polls come and go between two slices
@@ -255,6 +375,7 @@ def begin_cycle(poll: Poll, now: float) -> Iterator[Transaction]:
 
     A node that was never heard is read in BACKGROUND, so that absent nodes hold up nobody when a line starts.
     """
+    # Members change between two cycles only, so that one cycle never mixes the old and the new ones.
     if poll.fresh is not None:
         poll.results, poll.fresh = poll.fresh, None
     poll.remaining = len(poll.results)
@@ -269,6 +390,7 @@ def _made_fresh(poll: Poll, now: float) -> Iterator[Transaction]:
         transaction.reset()
         transaction.queued = now
         transaction.deadline = deadline
+        # Absent nodes would otherwise delay the first values of all others at start-up.
         transaction.priority = poll.priority if transaction.node.last_reply > -inf else BACKGROUND
         yield transaction
 

@@ -17,7 +17,7 @@ class Verdict(enum.Enum):
     NO_REPLY = "no reply"
     GARBLED = "garbled"
     REFUSED = "refused"
-    DOUBTED = "doubted"
+    AMBIGUOUS = "ambiguous"
     """A good answer came and was not believed: it may have been another request's (R15)."""
     SPOILT = "spoilt"
     """What came was not read at all: the port, or when and how it came, said that it is no answer."""
@@ -30,7 +30,8 @@ class Attempt:
 
     `protocol` is the name of its node's protocol. `transaction` numbers the requests of a line from 1, each cycle of a
     poll anew, and `number` the attempts at one of them. `purpose` says why it is asked, where no caller asks: a poll's
-    name, "probe" or "check" (R15). `settled` is for how many seconds the line had settled, ever, when it began.
+    name, "probe" or "check" (R15). `quiet_time` is for how many seconds the line had resynchronised, ever, when it
+    began.
     """
 
     __slots__ = (
@@ -42,8 +43,8 @@ class Attempt:
         "number",
         "protocol",
         "purpose",
+        "quiet_time",
         "result",
-        "settled",
         "timings",
         "transaction",
         "verdict",
@@ -59,7 +60,7 @@ class Attempt:
         transaction: int = 0,
         number: int = 1,
         purpose: str = "",
-        settled: float = 0.0,
+        quiet_time: float = 0.0,
     ) -> None:
         self.protocol = protocol
         self.address = address
@@ -68,12 +69,12 @@ class Attempt:
         self.transaction = transaction
         self.number = number
         self.purpose = purpose
-        self.settled = settled
+        self.quiet_time = quiet_time
         self.verdict: Verdict | None = None
         self.result: Any = None
         """The value of one that is OK, else what was wrong, in words."""
         self.late = False
-        """Its reply began after the nominal time, and counts all the same."""
+        """Its reply began after `late_after`, and is accepted."""
         self.heard = True
         """Somebody still waits for it: False once its caller has gone."""
         self.ended_at = -inf
@@ -100,8 +101,8 @@ class Tap(Protocol):
     """Sees what passes on a line (a capture). Must not block, nor raise. Times are of the clock of the line's owner.
 
     `attempt` is what is on the wire: None while nothing is asked. What is transmitted then closes the attempt before,
-    or answers what came unasked; with a new attempt its request comes last, behind what closes the one before. What is
-    received with none is nobody's answer.
+    or answers what came unexpected; with a new attempt its request comes last, behind what closes the one before. What
+    is received with none is nobody's answer.
     """
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:

@@ -1,4 +1,6 @@
-"""Transactions: a command with its caller, priority and retries; and polls, which run theirs once a period."""
+"""Transactions: a command with its caller, priority and retries; polls, which run theirs once a period; and the errors
+with which they end: a fresh one each, which says which node, which command and how often.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,14 @@ from collections.abc import Iterator, Sequence
 from math import inf, nextafter
 from typing import Any, NamedTuple
 
-from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.clients import Hold, LineClient
+from busmaster.arbiter.counters import Histogram
 from busmaster.arbiter.health import DOWN, UNKNOWN, NodeRecord
-from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER
 from busmaster.bounds import LONGEST_PERIOD, SHORTEST_PERIOD
 from busmaster.contract.exchange import Command
 from busmaster.contract.timing import Timings
-from busmaster.errors import BusError, InvalidCommand
+from busmaster.errors import BusError, HoldEnded, InvalidCommand, NoReply, NotStarted, WriteUnconfirmed
 
 LONGEST_PATIENCE = 10.0
 """Seconds after which a poll's cycle goes before those that came later, however long its period is."""
@@ -62,8 +64,8 @@ class Timeline(NamedTuple):
     attempts: int
     exchanges_ahead: int
     """Exchanges of others that went first while it waited."""
-    settling_ahead: float
-    """Seconds of that wait in which the line was settling after somebody's uncertain outcome."""
+    quiet_time_ahead: float
+    """Seconds of that wait in which the line was resynchronising after somebody's uncertain outcome."""
 
 
 class Transaction:
@@ -91,12 +93,12 @@ class Transaction:
         "probe",
         "probe_cost",
         "queued",
+        "quiet_time_ahead",
         "refusals",
         "refused_cycles",
         "refused_until",
         "retried",
         "retries",
-        "settling_ahead",
         "start_by",
         "started",
         "stop",
@@ -114,9 +116,9 @@ class Transaction:
     deadline: float
     """By which it wants to be answered."""
     exchanges_ahead: int
-    settling_ahead: float
+    quiet_time_ahead: float
     late: bool
-    """The reply to its last attempt began after the nominal time."""
+    """The reply to its last attempt began after `late_after`."""
     overdue: bool
     """It began after its window even."""
     # Those above are set when it is queued, or sent, and not before; and a string behind a statement of a function is
@@ -180,6 +182,7 @@ class Transaction:
 
     def reset(self) -> None:
         """Make it fresh for its (next) run: a poll's transaction lives as long as the poll."""
+        # `queued`, `deadline` and the counts of what went ahead are set anew whenever it is queued.
         self.phase = IDLE
         self.attempts = 0
         self.retried = 0
@@ -194,6 +197,7 @@ class Transaction:
 
     def timings(self) -> Timings:
         """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""
+        # AT_LAST unless a case below says otherwise: the last attempt uses the documented window (R15).
         node, hurry = self.node, AT_LAST
         if node.learning is None:
             return node.timings
@@ -219,7 +223,7 @@ class Transaction:
             known(self.last_byte),
             self.attempts,
             self.exchanges_ahead,
-            self.settling_ahead,
+            self.quiet_time_ahead,
         )
 
 
@@ -295,3 +299,47 @@ class Poll:
     def next_due(self) -> float:
         """Return when its next cycle is due on the grid."""
         return self.base + self.number * self.period
+
+
+TOO_LATE = "allow more time, or see bus.statistics(), or busmaster plan, for what holds it up"
+
+HELD = "flow control holds the port or the adapter is stuck; check CTS, replug"
+
+
+def make_error(kind: type[BusError], what: str, transaction: Transaction, hint: str | None = None) -> BusError:
+    """Return the error of this kind for a transaction, with the hint of the kind if none is given."""
+    return name_error(kind(what, hint=hint), transaction)
+
+
+def name_error(error: BusError, transaction: Transaction) -> BusError:
+    """Say in an error which node, which command and how often, and return it."""
+    error.name(transaction.node)
+    error.command = str(transaction.command)
+    error.attempts = transaction.attempts
+    return error
+
+
+def too_late(transaction: Transaction, now: float, *, held: bool = False) -> BusError:
+    """Return the error of a transaction whose caller's time is over: whether it was sent is what the error says.
+
+    `held`: the port has not sent all that it was handed, this request or the one before it, and may still do.
+    """
+    # In the error, because "too late" alone does not tell whether the line or the node was slow.
+    waited = (now - transaction.queued) * 1000
+    if not transaction.attempts:
+        what = f"not sent within its time: it waited {waited:.0f} ms for the line"
+        return make_error(NotStarted, what, transaction, HELD if held else None)
+    kind = WriteUnconfirmed if transaction.writes else NoReply
+    what = "the port did not send it within its time" if held else "sent, but not answered within its time"
+    error = make_error(kind, f"{what}: {waited:.0f} ms", transaction)
+    if kind is NoReply:
+        error.hint = HELD if held else TOO_LATE
+    return error
+
+
+def hold_ended(transaction: Transaction, hold: Hold) -> BusError:
+    """Return the error of what a sequence still waits for when the line is no longer held for it."""
+    over = f"the {hold.longest:g} s for which the line was held for it are over"
+    if transaction.attempts:
+        return make_error(NoReply, f"not answered, and {over}", transaction)
+    return make_error(HoldEnded, over, transaction)

@@ -14,11 +14,10 @@ import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import LineClient
-from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.counters import LineState, LineStatistics
+from busmaster.arbiter.events import CameUnexpected, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
@@ -78,6 +77,7 @@ class Bus:
             )
         self.endpoint = endpoint
         self._wait_for_port = wait_for_port
+        # Only probes are spread by it. A seed makes a test run repeatable.
         self._random = random.Random(seed)
         settings = endpoint.settings
         self._byte_time_known = settings is not None
@@ -92,7 +92,7 @@ class Bus:
         self._arbiter.name = endpoint.name
         self._line = line = SharedLine(endpoint.name, self._arbiter)
         line.alarms = Alarms(self._on_event)
-        self.pump = line.pump = Pump(
+        self._pump = line.pump = Pump(
             self._arbiter,
             on_sample=lambda poll, transaction: poll.group.sampled(transaction),
             on_cycle=lambda poll: poll.group.cycle_finished(),
@@ -101,12 +101,12 @@ class Bus:
             paced=lambda transport: is_paced(endpoint, transport),
             name=endpoint.name,
         )
-        self.taps = Taps(self.pump, tap)
+        self._taps = Taps(self._pump, tap)
         self._nodes: dict[tuple[str, int], Node] = {}
         self._profiles: dict[str, Profile] = {}
         """Of the protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
-        self.reads_after_writes = ReadsAfterWrites(line, self._groups, self._start)
+        self._reads_after_writes = ReadsAfterWrites(line, self._groups, self._start)
         """Counts of the reads of points with `read_after_write`."""
         line.on_touched.append(self._on_touched)
         self._outlook = Outlook(line, endpoint, self._nodes, self._groups)
@@ -127,15 +127,17 @@ class Bus:
                 "run the program by asyncio.run, or by anyio.run with its asyncio backend, not by trio"
             )
         self._line.bind(loop)
+        # Time that passed before the bus was entered is not time of the line.
         self._arbiter.reset_statistics(self.now())
-        connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
+        connection = Connection(self.endpoint, self._pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
         try:
             await (connection.try_open() if self._wait_for_port else connection.open())
         except BaseException as error:
+            # Everything is undone, so that the same bus can be entered again when the port is back.
             self._line.unbind()
             await connection.close()
-            self.pump.stop()
+            self._pump.stop()
             if isinstance(error, BusError):
                 error.line = self.endpoint.name
             raise
@@ -146,15 +148,17 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Close the bus: waiting callers get BusClosed at once; the exchange on the wire may end, in its own window."""
-        self.check_loop()
+        self._check_loop()
+        # First of all, so that callbacks of the groups that end cannot start a new request.
         self._line.closed = True
         for group in self.groups:
             group.close()
+        # At once: what waits fails now, and only the exchange on the wire runs out.
         self._arbiter.close(self.now())
-        self.pump.turn()
+        self._pump.turn()
         with anyio.CancelScope(shield=True):  # Task.cancel() comes through all the same
             try:
-                await self.pump.run_out()
+                await self._pump.run_out()
             finally:
                 await self._let_go()  # when cancelled too: the port would stay open and be opened again for ever
 
@@ -165,15 +169,16 @@ class Bus:
         try:
             await self._connection.close()
         finally:
-            self.pump.turn()
-            self.pump.stop()
+            self._pump.turn()
+            self._pump.stop()
             for stream in list(self._streams):
                 stream.close()
             for task in self._tasks:
                 task.cancel()
+        # Hooks of the application are cancelled, and their errors belong to the log, not to whoever closes the bus.
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def accept_device(self) -> None:
+    def _accept_device(self) -> None:
         """Let the next opening take whatever device has the port's name then, as if the program were started again.
 
         Without it, only the device that the line was opened on is opened again. A port that is named by a serial
@@ -182,16 +187,16 @@ class Bus:
         if self._connection is not None:
             self._connection.accept_device()
 
-    def take_only_safe_writes(self) -> Callable[[], None]:
+    def _take_only_safe_writes(self) -> Callable[[], None]:
         """End every write that waits as Superseded, and accept none from now on but those that say `safe=True`.
 
         A write that is on the wire runs out, and is not repeated. Reads and polls go on. What is returned,
         called once, takes writes again: not on a line that is about to be left.
         """
-        self.check_loop()
+        self._check_loop()
         self._line.only_safe += 1
         self._arbiter.supersede_writes(self.now())
-        self.pump.turn()
+        self._pump.turn()
         return self._line.take_writes_again
 
     # nodes and groups
@@ -206,10 +211,10 @@ class Bus:
         is None was left open.
         """
         node = self._find_or_add(profile, address, timings, retries)
-        node.kept = True
+        node._kept = True
         return node
 
-    def lend_node(
+    def _lend_node(
         self,
         profile: Profile,
         address: int,
@@ -224,28 +229,29 @@ class Bus:
         is new, until its first reply it is asked within the budget of probes only (R11), as a node that is down is.
         """
         node = self._find_or_add(profile, address, timings, retries)
-        if budgeted and not (node.kept or node.borrowers):
-            self._arbiter.ask_within_budget(node.record, self.now())
-        node.borrowers += 1
+        # A node that the owner or another client uses has proved itself; only a new one is limited.
+        if budgeted and not (node._kept or node._borrowers):
+            self._arbiter.ask_within_budget(node._record, self.now())
+        node._borrowers += 1
         return node
 
-    def has_node(self, profile: Profile, address: int) -> bool:
+    def _has_node(self, profile: Profile, address: int) -> bool:
         """Return whether the node at this address is on the line."""
         return (profile.name, address) in self._nodes
 
-    def give_back(self, node: Node) -> None:
+    def _give_back(self, node: Node) -> None:
         """Take back a node that was lent: nothing of it is polled or asked any more by whoever gives it back."""
-        node.borrowers -= 1
-        if not (node.kept or node.borrowers):
+        node._borrowers -= 1
+        if not (node._kept or node._borrowers):
             del self._nodes[node.profile.name, node.address]
-            self._line.forget_node(node, node.record)
+            self._line.forget_node(node, node._record)
             if not any(other.profile.name == node.profile.name for other in self._nodes.values()):
                 del self._profiles[node.profile.name]  # another protocol may be spoken on an empty line
 
     def _find_or_add(
         self, profile: Profile, address: int, timings: Timings | Learned | None, retries: int | None
     ) -> Node:
-        self.check_loop()
+        self._check_loop()
         profile.check_address(address)
         if timings is not None and not isinstance(timings, Timings | Learned):
             raise InvalidCommand(f"{profile.label(address)}: timings are a Timings or LEARNED, not {timings!r}")
@@ -254,11 +260,13 @@ class Bus:
                 retries = checked_retries(retries)
             except InvalidCommand as bad:
                 raise InvalidCommand(f"{profile.label(address)}: {bad}") from None
+        # Two handles of one node must share its health, queue of writes and limits.
         known = self._nodes.get((profile.name, address))
         if known is not None:
-            known.check_shared(profile, timings, retries)
+            known._check_shared(profile, timings, retries)
             return known
         if profile.name not in self._profiles:
+            # Checked once per protocol: nodes of the same one cannot disagree.
             check_company(profile, self._profiles.values())
             check_settings(profile, self.endpoint)
         if not self._byte_time_known:
@@ -273,21 +281,6 @@ class Bus:
     def nodes(self) -> tuple[Node, ...]:
         """Return the nodes that are on the line, in the order in which they were first asked for."""
         return tuple(self._nodes.values())
-
-    @property
-    def shared(self) -> SharedLine:
-        """Return what the nodes share: the line, and the programs that take turns on it."""
-        return self._line
-
-    @property
-    def on_stop(self) -> list[Callable[[NodeRecord], None]]:
-        """Return what is told, at once, when a node is told to stop."""
-        return self._line.on_stop
-
-    @property
-    def on_touched(self) -> list[Callable[[NodeRecord, float], None]]:
-        """Return those who are told, at once, of which node a write is over, and when it ended."""
-        return self._line.on_touched
 
     @property
     def groups(self) -> tuple[PollGroup, ...]:
@@ -314,7 +307,7 @@ class Bus:
         `client`, of `SharedLine.add_client`, is the program that pays for the line time; without it, this one does.
         Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
-        self.check_loop()
+        self._check_loop()
         if self._line.closed or not self.running:
             raise self._line.not_open()
         period = seconds(period, f"poll group {name!r}: a period")
@@ -334,9 +327,10 @@ class Bus:
             on_close=self._forget,
             client=client,
         )
+        # After all checks: an error must not leave half a group behind.
         self._arbiter.add_poll(group.poll, self.now())
         self._groups[name] = group
-        self.pump.turn()
+        self._pump.turn()
         return group
 
     def latest(self, point: Point[T]) -> Sample[T] | None:
@@ -347,7 +341,7 @@ class Bus:
 
     def now(self) -> float:
         """Return the time of the bus's clock, in seconds: all its times are of this clock."""
-        return self.pump.clock()
+        return self._pump.clock()
 
     def wall_time(self) -> float:
         """Return the same moment as `now` in seconds since 1970, by the machine's clock."""
@@ -359,13 +353,13 @@ class Bus:
         return self._line.running
 
     @property
-    def byte_time(self) -> float:
+    def _byte_time(self) -> float:
         """Return tau, the seconds per byte of this line."""
         return self._arbiter.byte_time
 
     @property
     def state(self) -> LineState:
-        """Return what the line does: OFFLINE, READY, in an EXCHANGE, in the HOLDOFF between two, or SETTLING."""
+        """Return what the line does: OFFLINE, READY, in an EXCHANGE, in the HOLDOFF between two, or RESYNCHRONISING."""
         return self._arbiter.state
 
     @property
@@ -374,7 +368,7 @@ class Bus:
         return self._line.condition
 
     @property
-    def lost_seconds(self) -> float:
+    def _lost_seconds(self) -> float:
         """Return for how long the line was lost since the bus was opened, in all."""
         return self._line.losses.seconds(self.now())
 
@@ -385,30 +379,30 @@ class Bus:
 
     def statistics(self) -> LineStatistics:
         """Return an immutable snapshot of the line's counts since it was opened or reset."""
-        self.check_loop()
-        return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
+        self._check_loop()
+        return replace(self._arbiter.statistics(self.now()), driver=self._pump.driver_errors())
 
     def reset_statistics(self) -> None:
         """Start all counts of line, nodes and groups again."""
-        self.check_loop()
+        self._check_loop()
         self._arbiter.reset_statistics(self.now())
-        self.pump.reset_driver_errors()
-        self.reads_after_writes.reset()
+        self._pump.reset_driver_errors()
+        self._reads_after_writes.reset()
         for group in self._groups.values():
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Reckon what becomes of the groups that run, and of `more`, by the reply times measured so far.
+        """Calculate what becomes of the groups that run, and of `more`, by the reply times measured so far.
 
-        It is reckoned at once: with hundreds of points that takes some ten milliseconds, in which no line of this
-        loop goes on. While a line runs, await `plan_in_steps`.
+        It is calculated at once: with hundreds of points that takes some ten milliseconds, in which no line of this
+        loop goes on. While a line runs, await `ext.plan_in_steps`.
         """
-        self.check_loop()
+        self._check_loop()
         return at_once(self._outlook.plan_steps(more, could_merge))
 
-    async def plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
+    async def _plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
         """Do what `plan` does, in steps of less than a millisecond between which exchanges go on."""
-        self.check_loop()
+        self._check_loop()
         steps = self._outlook.plan_steps(more, could_merge)
         done = 0
         while True:
@@ -424,12 +418,12 @@ class Bus:
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
         """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
 
-        It reckons with what is polled, what waits already, every node's probe, each kind of command that was asked or
-        polled so far, the programs that are connected, and the longest exclusive sequence that was begun; with nodes
+        It calculates with what is polled, what waits already, every node's probe, each kind of command that was asked
+        or polled so far, the programs that are connected, and the longest exclusive sequence that was begun; with nodes
         that are dead, late or trickling; not with a line that is never silent. Reply times that are learned do not
         shorten it: those of the document may come back at any moment.
         """
-        self.check_loop()
+        self._check_loop()
         return self._outlook.worst_case_wait(checked_priority(priority))
 
     @property
@@ -437,7 +431,7 @@ class Bus:
         """Return what each polled point with limits has left and is not back from; None for those within."""
         return self._line.alarms.states
 
-    def overheard(self, samples: Mapping[Point[Any], Sample[Any]]) -> None:
+    def _overheard(self, samples: Mapping[Point[Any], Sample[Any]]) -> None:
         """Take values that another master's requests have brought for what they begin and end of alarms."""
         self._line.alarms.look([point for point in samples if point.meaning.watched], samples)
 
@@ -446,11 +440,11 @@ class Bus:
 
         Line and nodes tell NodeChanged, LineChanged, PortFailed and others, what is polled tells AlarmChanged.
         """
-        self.check_loop()
+        self._check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
 
-    def check_loop(self) -> None:
+    def _check_loop(self) -> None:
         """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
         self._line.check_loop()
 
@@ -466,7 +460,7 @@ class Bus:
 
     def _on_written(self, write: Transaction, when: float) -> None:
         self._line.touched(write, when)
-        self.reads_after_writes.note(write, when)
+        self._reads_after_writes.note(write, when)
 
     def _on_touched(self, record: NodeRecord, when: float) -> None:
         for group in self._groups.values():
@@ -480,14 +474,16 @@ class Bus:
                 self._line.losses.found(self.now())
         if isinstance(event, NodeChanged):
             node = self._nodes.get((event.node.profile.name, event.node.address))
-            if node is None or node.record is not event.node:
+            if node is None or node._record is not event.node:
                 return  # it was given back while it was asked something
+            # A drive that was away may come back with other values: `max_step` must not trust the ones before.
             if event.after is Health.DOWN and self._line.limiter is not None:
                 self._line.limiter.forget(node)
             if event.returning:
                 self._start(self._run_hook(node))
         self._line.logbook.note(event, self.now())
-        if not isinstance(event, CameUnasked):
+        # Unexpected bytes can come thousands of times a second; they are counted and logged instead.
+        if not isinstance(event, CameUnexpected):
             for stream in self._streams:
                 stream.put(event)
 
@@ -507,10 +503,10 @@ class Bus:
         A node that comes back again while its hook still runs gets another run of it, after that one.
         """
         try:
-            async with node.returning:
+            async with node._returning:
                 if node.on_return is not None:
                     await node.on_return(node)
         except Exception as error:
             self._line.logbook.failed_hook(node.label, error)
         finally:
-            self._arbiter.dispatcher.release_node(node.record)
+            self._arbiter.dispatcher.release_node(node._record)

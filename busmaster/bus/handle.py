@@ -6,17 +6,21 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from copy import copy
-from typing import Any, ClassVar, Self, TypeAlias, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, overload
 
 from busmaster.bus.points import Point
-from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
-from busmaster.contract.arguments import guess, is_decimal
+from busmaster.bus.requester import NodeSource, ReadOptions, Requester, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import guess, is_decimal, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
 
+T = TypeVar("T")
+
+MOST_ITEMS = 65536
+"""As many as the largest address space of a protocol has."""
 Send: TypeAlias = Callable[[], Awaitable[None]]
 """Sends what was prepared."""
 
@@ -48,13 +52,41 @@ class Handle(ABC):
     def point(self, item: str) -> Point[Any]:
         """Return the point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
 
-    @abstractmethod
-    async def read(self, item: Any, /, **options: Unpack[ReadOptions]) -> Any:
-        """Return what an item holds now. `RequestOptions` says what the options are."""
+    @overload
+    async def read(self, item: Any, **options: Unpack[ReadOptions]) -> Any: ...
 
-    @abstractmethod
-    async def write(self, item: Any, value: Any, /, **options: Unpack[WriteOptions]) -> None:
-        """Write a value to an item. `RequestOptions` says what the options are."""
+    @overload
+    async def read(self, item: Any, count: int, **options: Unpack[ReadOptions]) -> Any: ...
+
+    async def read(self, item: Any, count: int | None = None, **options: Unpack[ReadOptions]) -> Any:
+        """Return the value of an item; with `count`, a tuple of the values of so many items from there on.
+
+        Several items can take several exchanges: their values are then not all of one moment. `RequestOptions` lists
+        the options; `start_within` is for each exchange. Raises InvalidCommand, before anything is sent, for an item
+        that does not exist.
+        """
+        if count is None:
+            return await self.point(item).read(**options)
+        points = [self.point(name) for name in self._run_items(item, checked_count(count))]
+        read = await read_each(self.node, [point.command for point in points], options)
+        return tuple(point.value_of(raw) for point, raw in zip(points, read, strict=True))
+
+    async def write(self, item: Any, *values: Any, **options: Unpack[WriteOptions]) -> None:
+        """Write a value to an item, or several values to this item and those after it.
+
+        Several values can take several exchanges: if one fails, the values before it are stored. `RequestOptions` lists
+        the options; `verify` reads back when all are written. Raises InvalidCommand, before anything is sent, for a
+        value that cannot be sent.
+        """
+        points = [self.point(name) for name in self._names(item, values)]
+        commands = [encoder(point)(value) for point, value in zip(points, values, strict=True)]
+        self.node.check(*commands, stop=options.get("safe"))
+        requests = SeveralRequests(self.node, options)
+        for point, command in zip(points, commands, strict=True):
+            await requests.request(command, touches=point.command)
+        for point, value in zip(points, values, strict=True) if requests.verify else ():
+            if (found := point.value_of(await requests.read_back(point.command))) != value:
+                raise VerifyFailed(f"{point.item} reads {found!r} after {value!r} was written", node=self.node)
 
     def use_sync_reads(self, *, probe: str | None = None, sync_reads: Sequence[str] = ()) -> None:
         """Set the probe and the sync reads of the node, by items, where the usual ones do not fit this device.
@@ -88,49 +120,66 @@ class Handle(ABC):
         """Return the names (not the numbers) that `point` knows."""
 
     @classmethod
-    def names_of_items(cls) -> Mapping[str, str]:
+    def _names_of_items(cls) -> Mapping[str, str]:
         """Return the names of those items that have one, by what a listener reads from the line."""
         return {}
 
     # what ITEM and VALUE mean where a person writes them
 
-    async def read_item(self, item: str, **options: Any) -> Any:
+    async def _read_item(self, item: str, **options: Any) -> Any:
         """Read what ITEM names on the command line, in the way that is best for a single reading."""
         return await self.point(item).read()
 
-    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
+    def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Return what writes the values to ITEM and those after it, once it is sure that all of them can be sent.
 
         `RequestOptions` says what the options are. Raises InvalidCommand.
         """
-        names = self.run_items(item, len(values)) if len(values) > 1 else (item,)
-        return [self.prepare_one(name, value, **options) for name, value in zip(names, values, strict=True)]
+        names = self._names(item, values)
+        return [self._prepare_one(name, value, **options) for name, value in zip(names, values, strict=True)]
 
-    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+    def _names(self, item: str, values: Sequence[Any]) -> tuple[str, ...]:
+        """Return the items to which values go. Raises InvalidCommand if there are no values."""
+        if not values:
+            raise InvalidCommand(f"{self.node.label}: there is no value to write to {item}")
+        return self._run_items(item, len(values)) if len(values) > 1 else (item,)
+
+    def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
-        point = self.point(item)
-        command = encoder(point)(value)
-        self.node.check(command, stop=options.get("safe"))
+        self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
+        # Not `self.write`: a handle may accept less there than it has points for (MSC: no flags).
+        return lambda: Handle.write(self, item, value, **options)
 
-        async def send() -> None:
-            requests = SeveralRequests(self.node, options)
-            await requests.request(command, touches=point.command)
-            if requests.verify and (found := point.value_of(await requests.read_back(point.command))) != value:
-                raise VerifyFailed(f"{item} reads {found!r} after {value!r} was written", node=self.node)
-
-        return send
-
-    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+    def _run_items(self, item: str, count: int) -> tuple[str, ...]:
         """Return what each of `count` values from ITEM on is called: 1.17, 1.18, ... Raises InvalidCommand."""
-        first, colon, kind = item.partition(":")
+        first, colon, kind = item_text(item).partition(":")
         suffix = f":{kind}" if colon and not is_decimal(kind) else ""
         menu, dot, number = first.rpartition(".")
         if not is_decimal(number):
             raise InvalidCommand(f"several values begin at a number, not at {item!r}")
         return tuple(f"{menu}{dot}{int(number) + i:0{len(number)}d}{suffix}" for i in range(count))
 
+    if not TYPE_CHECKING:  # a type checker would take every name for one of these
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what replaces a method of 0.2."""
+            if name in ("read_run", "read_block"):
+                raise AttributeError(f"{type(self).__name__}.{name} is now read: read(item, count)")
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.node.label}>"
+
+
+def checked_count(count: int) -> int:
+    """Return how many items to read. Raises InvalidCommand unless it is a whole number from 1 to 65536."""
+    return whole_number(count, 1, MOST_ITEMS, "a count of items")
+
+
+async def read_each(node: Requester, commands: Iterable[Command[T]], options: ReadOptions) -> tuple[T, ...]:
+    """Return the values of several reads, made one after the other as one call."""
+    requests = SeveralRequests(node, options)
+    return tuple([await requests.request(command) for command in commands])
 
 
 def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
@@ -155,7 +204,9 @@ def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
 __all__ = [
     "Handle",
     "Send",
+    "checked_count",
     "encoder",
     "item_text",
+    "read_each",
     "unknown_item",
 ]

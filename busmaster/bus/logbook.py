@@ -6,11 +6,11 @@ import logging
 from collections.abc import Hashable
 
 from busmaster.arbiter.events import (
-    CameUnasked,
-    LatenessLowered,
-    LatenessRaised,
+    CameUnexpected,
     LineChange,
     LineChanged,
+    MaxReplyDelayLowered,
+    MaxReplyDelayRaised,
     NodeChanged,
     PortFailed,
     RepliesLate,
@@ -32,7 +32,8 @@ class Logbook:
         self._written: dict[Hashable, tuple[float, int]] = {}
 
     def note(self, event: BusEvent, now: float) -> None:
-        """Write a line for a change of node or line, a collision, another lateness, a failed opening, an alarm."""
+        """Write a line for a change of node or line, a collision, another maximum reply delay, a failed opening, an
+        alarm."""
         if isinstance(event, NodeChanged):
             level = logging.WARNING if event.after is Health.DOWN else logging.INFO
             text = f"{event.node.label} is {event.after.value} (was {event.before.value})"
@@ -41,17 +42,18 @@ class Logbook:
             level = logging.WARNING if event.change in (LineChange.DOWN, LineChange.NOISY) else logging.INFO
             because = f": {event.cause}" if event.cause else ""
             self._write(event.change, level, f"the line is {event.change.value}{because}", now)
-        elif isinstance(event, LatenessRaised):
+        elif isinstance(event, MaxReplyDelayRaised):
             text = (
                 f"{event.node.label} answered {event.age * 1000:.0f} ms after its request: "
-                f"its lateness is now {event.lateness * 1000:.0f} ms"
+                f"its maximum reply delay is now {event.max_reply_delay * 1000:.0f} ms"
             )
-            self._write((event.node, LatenessRaised), logging.WARNING, text, now)
-        elif isinstance(event, LatenessLowered):
+            self._write((event.node, MaxReplyDelayRaised), logging.WARNING, text, now)
+        elif isinstance(event, MaxReplyDelayLowered):
             text = (
-                f"{event.node.label} has been prompt for an hour: its lateness is {event.lateness * 1000:.0f} ms again"
+                f"{event.node.label} has been prompt for an hour: "
+                f"its maximum reply delay is {event.max_reply_delay * 1000:.0f} ms again"
             )
-            self._write((event.node, LatenessLowered), logging.INFO, text, now)
+            self._write((event.node, MaxReplyDelayLowered), logging.INFO, text, now)
         elif isinstance(event, RepliesLate):
             text = (
                 f"{event.node.label} answers after {event.age * 1000:.0f} ms, later than its reply window of "
@@ -64,9 +66,9 @@ class Logbook:
         elif isinstance(event, AlarmChanged):
             level = logging.WARNING if event.active else logging.INFO
             self._write((AlarmChanged, event.point.key, event.limit, event.active), level, event.text, now)
-        elif isinstance(event, CameUnasked) and event.collision:
+        elif isinstance(event, CameUnexpected) and event.collision:
             text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"
-            self._write(CameUnasked, logging.WARNING, text, now)
+            self._write(CameUnexpected, logging.WARNING, text, now)
 
     def failed_hook(self, label: str, error: Exception) -> None:
         """Write that a user's on_return hook raised."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf
 from threading import get_ident
-from typing import Any, Protocol, TypeVar, Unpack
+from typing import Any, Generic, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.counters import NodeStatistics
@@ -36,7 +36,7 @@ T = TypeVar("T")
 PROBE = RequestOptions(retries=0)
 REPLIES_REMEMBERED = 256
 
-__all__ = ["Health", "Journey", "Node", "NodeStatistics", "Priority", "Timeline"]
+__all__ = ["Health", "Node", "NodeStatistics", "Priority", "Request", "Timeline"]
 
 
 class HasNode(Protocol):
@@ -46,10 +46,24 @@ class HasNode(Protocol):
     def node(self) -> Requester: ...
 
 
-class Journey:
-    """How far one request has come."""
+@dataclass(slots=True, eq=False)
+class Request(Generic[T]):
+    """One request to a node: what is to be done, how, and for whom; and what became of it once it is started.
 
+    `touches`, `stops_seen` and `stop` are those of `Requester.request`. `client` is the program that pays for the line
+    time, or the sequence that the request is part of; without it, the program that owns the line. `probe`: it is sent
+    to a node that is down, within the budget of probes.
+    """
+
+    command: Command[T]
+    options: RequestOptions = ORDINARY
+    touches: Command[Any] | None = None
+    stops_seen: int | None = None
+    stop: bool = False
+    client: LineClient | None = None
+    probe: bool = False
     transaction: Transaction | None = None
+    """What the line makes of it, from when it is started."""
 
     @property
     def sent(self) -> bool:
@@ -61,23 +75,23 @@ class Node:
     """One node, made by `Bus.node` or by a handle. Everything that is asked of it goes through `request`."""
 
     def __init__(self, line: SharedLine, record: NodeRecord, asked: Timings | Learned | None = None) -> None:
-        self.shared = line
-        self.record = record
+        self._shared = line
+        self._record = record
         self.timings = record.timings
-        """As they were asked for: its record's lateness may have been raised since."""
+        """As they were asked for: its record's maximum reply delay may have been raised since."""
         self._asked = Learned(record.timings) if isinstance(asked, Learned) else record.timings
-        self.kinds: dict[Hashable, Command[Any]] = {}
-        """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
-        self.reply_time: float | None = None
+        self._kinds: dict[Hashable, Command[Any]] = {}
+        """Of each kind of command that was asked of it, the first: the worst case calculates with them."""
+        self._reply_time: float | None = None
         """Seconds from a request to its reply, as poll groups measured them; before, as somebody said, or None."""
         self._measured = 0
         self._to_all = record.address == record.profile.broadcast
         """Nobody answers at its address."""
-        self.kept = False
+        self._kept = False
         """Whether the program that owns the line has named it itself."""
-        self.borrowers = 0
+        self._borrowers = 0
         """How many have it who will give it back."""
-        self.returning = asyncio.Lock()
+        self._returning = asyncio.Lock()
         """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
         self._sync_reads: tuple[Command[Any] | None, tuple[Command[Any], ...]] = (None, ())
@@ -96,66 +110,67 @@ class Node:
     @property
     def line(self) -> str:
         """Return the name of its line's port."""
-        return self.record.line
+        return self._record.line
 
     @property
     def profile(self) -> Profile:
         """Return the profile of the node's protocol."""
-        return self.record.profile
+        return self._record.profile
 
     @property
     def address(self) -> int:
         """Return the node's address in its protocol."""
-        return self.record.address
+        return self._record.address
 
     @property
     def label(self) -> str:
         """Return how messages call it: "node 5"."""
-        return self.record.label
+        return self._record.label
 
-    def rename(self, label: str) -> None:
+    def _rename(self, label: str) -> None:
         """Have messages call it so from now on."""
-        self.shared.arbiter.name_node(self.record, label)
+        self._shared.arbiter.name_node(self._record, label)
 
     @property
     def stops(self) -> int:
         """Return how often it was told to stop, by whatever handle."""
-        return self.record.stops
+        return self._record.stops
 
     def note_stop(self) -> None:
         """Tell the line that this node is being told to stop: what was decided before must not undo it."""
-        self.shared.note_stop(self.record)
+        self._shared.note_stop(self._record)
 
     def now(self) -> float:
         """Return the time of the bus's clock, in seconds."""
-        return self.shared.now()
+        return self._shared.now()
 
     def latest(self, point: Any, /) -> Sample[Any] | None:
         """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
-        return self.shared.latest(point)
+        return self._shared.latest(point)
 
-    def held(self, point: Any, /) -> Any:
+    def _held(self, point: Any, /) -> Any:
         """Return what a point of it would have read last, by whatever name it was polled, alone or with others.
 
         None where that is not known, or may have been written since.
         """
-        return self.shared.held(self.record, point)
+        return self._shared.held(self._record, point)
 
     def planned(self) -> PlannedNode:
         """Return the node as the planner sees it, with its reply time as measured so far."""
-        record = self.record
-        return PlannedNode(record.profile, record.address, record.timings, self.reply_time)
+        record = self._record
+        return PlannedNode(record.profile, record.address, record.timings, self._reply_time)
 
-    def note_wait(self, wait: float) -> None:
+    def _note_wait(self, wait: float) -> None:
         """Note that it took so many seconds to reply: the mean of the last replies is what planning goes by."""
+        # A moving mean: a drive gets slower when its program grows, and plans must follow.
         self._measured = min(self._measured + 1, REPLIES_REMEMBERED)
-        known = wait if self.reply_time is None else self.reply_time
-        self.reply_time = known + (wait - known) / self._measured
+        known = wait if self._reply_time is None else self._reply_time
+        self._reply_time = known + (wait - known) / self._measured
 
     @property
     def health(self) -> Health:
         """Return what is known of the node: up, suspect, down or unknown; offline while the line is lost."""
-        return Health.OFFLINE if self.shared.condition.is_lost else self.record.health
+        return Health.OFFLINE if self._shared.condition.is_lost else self._record.health
 
     def __repr__(self) -> str:
         return f"<Node {self.profile.name} {self.address} {self.health.value}>"
@@ -172,13 +187,14 @@ class Node:
     @on_return.setter
     def on_return(self, hook: Callable[[Node], Awaitable[None]] | None) -> None:
         self._on_return = hook
-        self.shared.arbiter.expect_hook(self.record, hook is not None)
+        self._shared.arbiter.expect_hook(self._record, hook is not None)
 
-    def check_shared(self, profile: Profile, timings: Timings | Learned | None, retries: int | None) -> None:
+    def _check_shared(self, profile: Profile, timings: Timings | Learned | None, retries: int | None) -> None:
         """Raise InvalidCommand where somebody asks for this node with anything else than it was first asked with.
 
         What is None was left open: a profile's `merge` too.
         """
+        # The usual case, without building the table below.
         own = self.profile
         if profile is own and timings is None and retries is None:
             return
@@ -186,7 +202,7 @@ class Node:
             timings = timings.of(profile.timings)
         wanted = {
             f"other timings{_windows(timings, self._asked)}": timings not in (None, self._asked),
-            f"other retries ({retries}, not {self.record.retries})": retries not in (None, self.record.retries),
+            f"other retries ({retries}, not {self._record.retries})": retries not in (None, self._record.retries),
             "another profile": profile != own or profile.merge not in (None, own.merge),
         }
         for what, differs in wanted.items():
@@ -198,7 +214,7 @@ class Node:
 
     def merge_reads(self, merge: Merge, /) -> None:
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
-        self.shared.arbiter.change_profile(self.record, replace(self.record.profile, merge=merge))
+        self._shared.arbiter.change_profile(self._record, replace(self._record.profile, merge=merge))
 
     def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
         """Use these reads in place of its profile's; None or an empty sequence leaves what the profile has.
@@ -217,34 +233,34 @@ class Node:
                 "give all handles of an address the same options, or leave them out in all but the first"
             )
         self._sync_reads = wanted
-        own = self.record.profile
-        changed = replace(own, probe=wanted[0] or own.probe, checks=wanted[1] or own.checks)
-        self.shared.arbiter.change_profile(self.record, changed)
+        own = self._record.profile
+        changed = replace(own, probe=wanted[0] or own.probe, sync_reads=wanted[1] or own.sync_reads)
+        self._shared.arbiter.change_profile(self._record, changed)
 
     def limit(self, limit: Limit, /) -> None:
         """Refuse, from now on, every write beyond a limit, whatever names it; writes to all nodes too."""
-        line = self.shared
+        line = self._shared
         line.limiter = line.limiter or Limiter()
         line.limiter.add(self, limit)
 
     def lift(self, limit: Limit) -> None:
         """Hold a limit no longer; the others stay."""
-        if self.shared.limiter is not None:
-            self.shared.limiter.drop(self, limit)
+        if self._shared.limiter is not None:
+            self._shared.limiter.drop(self, limit)
 
     @property
     def limits(self) -> tuple[Limit, ...]:
         """Return the limits that are held."""
-        return () if self.shared.limiter is None else self.shared.limiter.of(self)
+        return () if self._shared.limiter is None else self._shared.limiter.of(self)
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
         """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
 
         A `stop` is held by no limit.
         """
-        if self.shared.limiter is not None and not stop:
+        if self._shared.limiter is not None and not stop:
             for command in commands:
-                self.shared.limiter.check(self, command)
+                self._shared.limiter.check(self, command)
 
     async def request(
         self,
@@ -267,130 +283,81 @@ class Node:
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
         chosen = self._options(options) if options else ORDINARY
-        limiter = self.shared.limiter
-        if limiter is not None and getattr(command, "writes", False):
-            async with limiter.passing(self, command, chosen, stop or chosen.safe) as left:
-                return (await self._timed(command, left, touches, stops_seen, stop=stop))[0]
-        transaction = self._prepared(command, chosen, False, touches, stops_seen, None, stop)
-        future = self.shared.pump.transact(transaction)
-        try:
-            value: T = await future
-        except asyncio.CancelledError:
-            self.give_up(transaction)
-            raise
-        return value
+        return await self._run(Request(command, chosen, touches, stops_seen, stop))
 
     async def timed_request(self, command: Command[T], **options: Unpack[CommandOptions]) -> tuple[T, Timeline]:
         """Do what `request` does, and return beside the value the timeline that says why it took so long."""
-        chosen, limiter = self._options(options), self.shared.limiter
-        if limiter is None or not getattr(command, "writes", False):
-            return await self._timed(command, chosen)
-        async with limiter.passing(self, command, chosen, chosen.safe) as left:
-            return await self._timed(command, left)
-
-    async def followed_request(
-        self,
-        command: Command[T],
-        journey: Journey,
-        *,
-        touches: Command[Any] | None = None,
-        stops_seen: int | None = None,
-        stop: bool = False,
-        client: LineClient | None = None,
-        **options: Unpack[CommandOptions],
-    ) -> T:
-        """Do what `request` does, for a client of the line or within a sequence, and say by `journey`, also once this
-        was cancelled, whether it was ever sent. Raises HoldEnded if the sequence is over."""
-        within = self._within(client, command)
-        chosen, limiter = self._options(options), self.shared.limiter
-        if limiter is None or not command.writes:
-            return (await self._timed(command, chosen, touches, stops_seen, journey, client, stop))[0]
-        async with limiter.passing(self, command, chosen, stop or chosen.safe, within) as left:
-            return (await self._timed(command, left, touches, stops_seen, journey, client, stop))[0]
+        request = Request(command, self._options(options))
+        value = await self._run(request)
+        assert request.transaction is not None
+        return value, request.transaction.timeline()
 
     @asynccontextmanager
     async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
         """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`."""
-        hold = self.hold(max_hold)
+        hold = self._hold(max_hold)
         try:
             yield _HeldNode(self, hold)
         finally:
-            self.shared.release(hold)
+            self._shared.release(hold)
 
-    def _within(self, client: LineClient | None, command: Command[Any]) -> Requester | None:
-        """Return the node for the sequence that a request is of, if it is of one. Raises HoldEnded if that is over."""
-        if not isinstance(client, Hold):
+    def _within(self, request: Request[Any]) -> Requester | None:
+        """Return the node for the sequence that a request is part of, if any. Raises HoldEnded if that is over."""
+        hold = request.client
+        if not isinstance(hold, Hold):
             return None
-        if client.over:
-            raise hold_ended(self, client.longest, command)
-        return _HeldNode(self, client)
+        if hold.over:
+            raise hold_ended(self, hold.longest, request.command)
+        return _HeldNode(self, hold)
 
-    def hold(self, max_hold: float, client: LineClient | None = None) -> Hold:
+    def _hold(self, max_hold: float, client: LineClient | None = None) -> Hold:
         """Return what the requests of one sequence, of a client of the line, name as their client.
 
         It is to be released. Raises InvalidCommand unless `max_hold` is above 0 s, and 5 s at most.
         """
-        self.shared.check_loop()
-        return self.shared.arbiter.exclusive(self.record, client, checked_hold(max_hold, self.label))
+        self._shared.check_loop()
+        return self._shared.arbiter.exclusive(self._record, client, checked_hold(max_hold, self.label))
 
-    def begin_reading(
-        self,
-        command: Command[Any],
-        reader: Waiter,
-        options: RequestOptions = ORDINARY,
-        *,
-        stops_seen: int | None = None,
-        client: LineClient | None = None,
-    ) -> Transaction:
-        """Begin a request of what writes nothing; `reader` is told what became of it, perhaps before this returns.
+    async def _run(self, request: Request[T]) -> T:
+        """Do what `request` does, with a request that says how far it has come, also once this was cancelled.
 
-        It returns what says how far it has come, and what `give_up` takes when the reader waits no longer. Raises what
-        `request` raises before anything is sent, and HoldEnded as `followed_request`.
+        Raises HoldEnded if the sequence that it is part of is over.
         """
-        if isinstance(client, Hold):
-            self._within(client, command)
-        transaction = self._prepared(command, options, stops_seen=stops_seen, client=client)
-        self.shared.pump.begin(transaction, reader)
-        return transaction
+        # Most requests are reads, and most lines have no limits: neither needs a check.
+        limiter = self._shared.limiter
+        if limiter is None or not getattr(request.command, "writes", False):
+            return await self._value(request)
+        free, within = request.stop or request.options.safe, self._within(request)
+        async with limiter.passing(self, request.command, request.options, free, within) as request.options:
+            return await self._value(request)
 
-    async def _timed(
-        self,
-        command: Command[T],
-        options: RequestOptions,
-        touches: Command[Any] | None = None,
-        stops_seen: int | None = None,
-        journey: Journey | None = None,
-        client: LineClient | None = None,
-        stop: bool = False,
-    ) -> tuple[T, Timeline]:
-        transaction = self._prepared(command, options, False, touches, stops_seen, client, stop)
-        if journey is not None:
-            journey.transaction = transaction
-        future = self.shared.pump.transact(transaction)
+    async def _value(self, request: Request[T]) -> T:
+        transaction = self._start(request)
         try:
-            return await future, transaction.timeline()
+            value: T = await transaction.tag
+        # R6: the caller is free at once, whatever the line does with the request.
         except asyncio.CancelledError:
-            self.give_up(transaction)
+            self._give_up(transaction)
             raise
+        return value
 
     def _options(self, given: CommandOptions) -> RequestOptions:
+        """Return the options of a request that a caller gave. Raises InvalidCommand, naming the node."""
         options = RequestOptions.of(given, self.label)
         if options.verify:
             raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
         return options
 
-    def _prepared(
-        self,
-        command: Command[Any],
-        options: RequestOptions,
-        probe: bool = False,
-        touches: Command[Any] | None = None,
-        stops_seen: int | None = None,
-        client: LineClient | None = None,
-        stop: bool = False,
-    ) -> Transaction:
-        """Return the transaction of a request. Raises what says that it cannot be begun."""
-        record, line = self.record, self.shared
+    def _start(self, request: Request[Any], waiter: Waiter | None = None) -> Transaction:
+        """Start a request: the one way by which anything is asked of a node. Limits were checked before.
+
+        `waiter` gets the value or the error, perhaps before this returns; without one, the transaction's tag is a
+        future that gets them. `give_up` takes the transaction once nobody waits for it. Raises what `request` raises
+        before anything is sent.
+        """
+        record, line, command, options = self._record, self._shared, request.command, request.options
+        if isinstance(request.client, Hold) and request.client.over:
+            raise hold_ended(self, request.client.longest, command)
         if self._to_all and not command.writes:
             raise InvalidCommand(
                 f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
@@ -399,51 +366,55 @@ class Node:
             if not line.running:
                 raise line.not_open(record=record, command=str(command))
             line.check_loop()
-        if type(command) not in self.kinds:
+        if type(command) not in self._kinds:
             if not hasattr(command, "open"):
                 raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
-            self.kinds[type(command)] = command
-        if stops_seen is not None and stops_seen != record.stops:
+            self._kinds[type(command)] = command
+        # Checked here, in the same step in which it is queued: a stop cannot come in between.
+        if request.stops_seen is not None and request.stops_seen != record.stops:
             raise Superseded("the node was told to stop since this was decided", node=record, command=str(command))
+        # The line is being taken to its safe state: a late write of the application would undo it.
         if line.only_safe and command.writes and not options.safe:
             raise Superseded(LEFT, node=record, command=str(command), hint="")
-        return Transaction(  # by position: keywords cost more, and this is done for every request
+        request.transaction = transaction = Transaction(  # by position: keywords cost more, for every request
             record,
             command,
             options.priority,
             inf if options.start_within is None else line.now() + options.start_within,
             options.retries,
             options.idempotent,
-            probe,
+            request.probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
-            self if touches is None else (self, touches),
-            client,
+            self if request.touches is None else (self, request.touches),
+            request.client,
             None,
             None,
-            command.writes and (stop or options.safe),
+            command.writes and (request.stop or options.safe),
         )
+        line.pump.begin(transaction, waiter)
+        return transaction
 
-    def give_up(self, transaction: Transaction) -> None:
+    def _give_up(self, transaction: Transaction) -> None:
         """Cancel what nobody waits for any more. A write that is on the wire ends before anything else can be read."""
-        line = self.shared
+        line = self._shared
         line.pump.cancel(transaction)
         # Its end is told to nobody, but what it may have changed is: samples that were read before it are stale now.
+        # The drive may have carried it out, so values that were read before can be wrong now.
         if transaction.writes and transaction.attempts:
             line.touched(transaction, line.now())
 
     async def probe(self) -> bool:
         """Ask the node's cheapest read now, once. Return True if it answered (a refusal is an answer), False if not, or
         if it could not be asked."""
-        transaction = self._prepared(self.profile.probe, PROBE, probe=True)
-        future = self.shared.pump.transact(transaction)
+        request = Request(self.profile.probe, PROBE, probe=True)
+        # A refusal proves that the node is there: that is what a probe is for.
         try:
-            await future
-        except asyncio.CancelledError:
-            self.give_up(transaction)
-            raise
+            await self._run(request)
         except Refused:
             return True
         except BusError:
+            if request.transaction is None:  # the bus is not open: nothing is known of the node
+                raise
             return False
         return True
 
@@ -454,33 +425,33 @@ class Node:
         """
         if seconds(for_, f"{self.label}: a suspension") > LONGEST_SUSPENSION:
             raise InvalidCommand(f"{self.label}: a suspension lasts {LONGEST_SUSPENSION:g} s at most, not {for_!r}")
-        self.shared.suspend(self.record, for_)
+        self._shared.suspend(self._record, for_)
 
     @property
     def suspended(self) -> bool:
         """Return whether it rests: its polls are not sent."""
-        return self.shared.now() < self.record.suspended_until
+        return self._shared.now() < self._record.suspended_until
 
-    def times_to_keep(self) -> tuple[LearnedTimes, ...]:
+    def _times_to_keep(self) -> tuple[LearnedTimes, ...]:
         """Return what `begin_with` may be given in the next run: the reply times that were learned and are trusted."""
-        record = self.record
+        record = self._record
         return () if record.learning is None else record.learning.to_keep(record.timings)
 
-    def begin_with(self, known: Iterable[LearnedTimes]) -> None:
+    def _begin_with(self, known: Iterable[LearnedTimes]) -> None:
         """Begin with what an earlier run has learned of its reply times, before it is asked anything.
 
         That is trusted after twenty replies; where nothing is to be learned it is left out.
         """
-        if self.record.learning is not None:
-            self.record.learning.begin_with(known)
+        if self._record.learning is not None:
+            self._record.learning.begin_with(known)
 
     def statistics(self) -> NodeStatistics:
         """Return counts and latencies since the bus was opened or its statistics were reset."""
-        self.shared.check_loop()
-        record = self.record
+        self._shared.check_loop()
+        record = self._record
         learning = record.learning
         learned = () if learning is None else learning.times(record.timings)
-        return replace(record.counters.snapshot(record.lateness), learned=learned)
+        return replace(record.counters.snapshot(record.max_reply_delay), learned=learned)
 
 
 def _windows(asked: Timings | Learned | None, own: Timings | Learned) -> str:
@@ -513,12 +484,5 @@ class _HeldNode(HeldNode):
         **options: Unpack[CommandOptions],
     ) -> T:
         """Run one command within the sequence, see `HeldNode.request`."""
-        return await self._own.followed_request(
-            command,
-            Journey(),
-            touches=touches,
-            stops_seen=stops_seen,
-            stop=stop,
-            client=self.hold,
-            **options,
-        )
+        own = self._own
+        return await own._run(Request(command, own._options(options), touches, stops_seen, stop, self.hold))

@@ -31,7 +31,7 @@ class Outlook:
         self._groups = groups
 
     def plan_steps(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge]) -> Generator[int, None, Plan]:
-        """Reckon what becomes of the groups, and of `more`, as `planning.plan_steps` does."""
+        """Calculate what becomes of the groups, and of `more`, as `planning.plan_steps` does."""
         groups = []
         for group in tuple(self._groups.values()):
             groups.append(group.planned())
@@ -74,8 +74,8 @@ class Outlook:
     def _asked(self) -> list[Read]:
         """Return every kind of command that was asked of a node, once for all nodes with the same timings."""
         asked = {
-            (id(node.record.profile), id(node.record.timings), kind): (node, command)
+            (id(node._record.profile), id(node._record.timings), kind): (node, command)
             for node in self._nodes.values()
-            for kind, command in node.kinds.items()
+            for kind, command in node._kinds.items()
         }
         return [(node.planned(), command) for node, command in asked.values()]

@@ -9,8 +9,8 @@ from math import inf, nextafter
 from typing import Any, NamedTuple
 
 from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.counters import Histogram
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import line_time, set_members
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.bus.answers import Answer
@@ -44,7 +44,7 @@ class _Read(NamedTuple):
     """One exchange of a group: the points that it serves, each with its place in a batch's value (None: all of it).
 
     `bytes_time` is what its bytes take on the line up to the end of its reply, `unwaited` with what is behind it,
-    `legs` how often a reply is waited for, and `guess` what it takes as a whole while the node's reply time is
+    `steps` how often a reply is waited for, and `guess` what it takes as a whole while the node's reply time is
     unknown. `blank` has all points of the group, in their order.
     """
 
@@ -53,15 +53,15 @@ class _Read(NamedTuple):
     points: tuple[tuple[Point[Any], int | None], ...]
     bytes_time: float
     unwaited: float
-    legs: int
+    steps: int
     guess: float
     blank: dict[Point[Any], Any]
 
     @property
     def line_time(self) -> float:
         """Return the seconds of the line that it takes, by the node's reply time as measured so far."""
-        wait = self.node.reply_time
-        return self.guess if wait is None else self.unwaited + self.legs * wait
+        wait = self.node._reply_time
+        return self.guess if wait is None else self.unwaited + self.steps * wait
 
 
 class PollGroup(Cycles):
@@ -117,7 +117,7 @@ class PollGroup(Cycles):
 
     def points_of(self, record: NodeRecord) -> list[Point[Any]]:
         """Return those of its points that are of this node."""
-        return [point for point, node in self._points.items() if node.record is record]
+        return [point for point, node in self._points.items() if node._record is record]
 
     @property
     def period(self) -> float:
@@ -144,7 +144,8 @@ class PollGroup(Cycles):
         fresh: dict[Point[Any], Node] = {}
         for point in points:
             node = point.node
-            if not isinstance(node, Node) or node.shared is not self._line:
+            # A point of another line would be read by nobody, without any error.
+            if not isinstance(node, Node) or node._shared is not self._line:
                 raise InvalidCommand(f"poll group {self.name!r}: {point.key} belongs to another bus")
             if node.address == node.profile.broadcast:
                 raise InvalidCommand(
@@ -152,6 +153,7 @@ class PollGroup(Cycles):
                 )
             if point not in self._points:
                 fresh[point] = node
+        # Only now: an error in the middle of the list must leave the group as it was.
         self._points.update(fresh)
         self._points_changed()
 
@@ -181,6 +183,7 @@ class PollGroup(Cycles):
     def close(self) -> None:
         """End the group; its consumers end after what they hold."""
         self._line.check_loop()
+        # close() may be called again by the bus that closes, or by `async with`.
         if self._poll.active:
             self._on_close(self)
             self._watch(())
@@ -214,6 +217,7 @@ class PollGroup(Cycles):
 
     def planned(self) -> PlannedGroup:
         """Return the group as the planner sees it, with reply times as measured so far."""
+        # Refused merges are left out: the plan must calculate with what the line really sends.
         nodes = {node: node.planned() for node in set(self._points.values())}
         for node, plan in nodes.items():
             if self._refused and plan.profile.merge is not None:
@@ -236,6 +240,7 @@ class PollGroup(Cycles):
         self._line_time += read.line_time
         if transaction.error is None:
             _measure(transaction, read)
+        # A refused batch says nothing of its items: they are read one by one instead.
         elif read.served.batch and isinstance(transaction.error, Refused):
             self._refusals.append(read)
         for point, place in read.points:
@@ -256,6 +261,7 @@ class PollGroup(Cycles):
         self._age()
         self._use_readings()
         self._tally.note(poll, self._qualities)
+        # No start: every exchange of the cycle was rejected before it was sent.
         started = poll.started if poll.started > -inf else None
         wall = poll.finished + self._wall_offset
         snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, wall, self._samples)
@@ -277,6 +283,7 @@ class PollGroup(Cycles):
         quality = Quality.BAD
         if error is None:
             quality = Quality.LATE if transaction.late else Quality.GOOD
+            # One comparison on a line without writes; only then the search for the write that matters.
             if self._line.last_touched > transaction.started and self._line.is_stale(point, transaction.started):
                 quality = Quality.STALE
             try:
@@ -291,6 +298,7 @@ class PollGroup(Cycles):
     def _note_good(self, point: Point[Any]) -> None:
         """Keep when a point was last read, as its sample of the cycle before is about to be replaced by an error."""
         before = None if self.latest is None else self.latest.samples.get(point)
+        # Kept only while a point fails: for all others the sample itself has the time.
         if before is not None and before.error is None:
             self._good_at[point] = before.wall
 
@@ -309,6 +317,7 @@ class PollGroup(Cycles):
         if self._line.last_touched <= self._poll.started:
             return
         for transaction in self._poll.results:
+            # Per node first: most nodes of a line are never written.
             if not self._line.written_since(transaction.node, transaction.started):
                 continue
             for point, _ in transaction.tag.points:
@@ -327,6 +336,7 @@ class PollGroup(Cycles):
     def take_reading(self, read: Point[Any], reading: Transaction) -> None:
         """Take the value that a read of one of its quantities brought, if it is younger than what the group has."""
         latest = self.latest
+        # Before the first cycle there is no snapshot that the value could replace.
         if latest is None or not self._poll.active:
             return
         fresh: dict[Point[Any], Sample[Any]] = {}
@@ -349,6 +359,7 @@ class PollGroup(Cycles):
     def report_outdated(self, record: NodeRecord, when: float) -> None:
         """Report to consumers of changes which values a write that ended just now has made stale."""
         latest = self.latest
+        # Without consumers of changes nothing is calculated: this runs at every confirmed write.
         if latest is None or not self._consumers_of_changes:
             return
         to_all, before = record.address == record.profile.broadcast, nextafter(when, -inf)
@@ -409,11 +420,12 @@ class PollGroup(Cycles):
             return
         poll = self._poll
         asked = poll.results if poll.fresh is None else poll.fresh
+        # Unchanged reads keep their transactions, and with them their count of refusals.
         if [transaction.tag.points for transaction in asked] == [read.points for read in reads]:
             return
         fresh = []
         for read in reads:
-            fresh.append(Transaction(read.node.record, read.served.command, tag=read, client=self._client))
+            fresh.append(Transaction(read.node._record, read.served.command, tag=read, client=self._client))
             read.blank.update((point, None) for point, _ in read.points)
             yield 5
         set_members(poll, fresh, self._priority)
@@ -423,6 +435,7 @@ class PollGroup(Cycles):
         """Choose the reads: points with one command share an exchange, and merges are taken where they are cheaper."""
         behind: dict[Node, dict[Command[Any], list[Point[Any]]]] = {}
         for point, node in tuple(self._points.items()):
+            # Points that read the same (a word and its bits) share one exchange.
             behind.setdefault(node, {}).setdefault(point.command, []).append(point)
             yield 2
         reads: list[_Read] = []
@@ -450,9 +463,9 @@ class PollGroup(Cycles):
         blank: dict[Point[Any], Any],
     ) -> _Read:
         exchange, byte_time = node.planned().open(served.command), self._line.arbiter.byte_time
-        node.kinds.setdefault((type(served.command), *shape(exchange)), served.command)
+        node._kinds.setdefault((type(served.command), *shape(exchange)), served.command)
         unwaited, guess = line_time(exchange, byte_time, 0.0), line_time(exchange, byte_time)
-        bytes_time = unwaited - exchange.closing * byte_time - exchange.timing.turnaround
+        bytes_time = unwaited - exchange.closing * byte_time - exchange.timing.driver_release_time
         return _Read(node, served, points, bytes_time, unwaited, 1 + len(exchange.later), guess, blank)
 
     def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
@@ -479,4 +492,4 @@ def _is_older(sample: Sample[Any], started: float) -> bool:
 def _measure(transaction: Transaction, read: _Read) -> None:
     """Note what the node takes to reply, as the mean over the last of its replies."""
     if transaction.attempts == 1:  # of a repeated one, the time includes what the failed attempts cost
-        read.node.note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.legs)
+        read.node._note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.steps)

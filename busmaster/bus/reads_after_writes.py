@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Coroutine, Mapping
 from math import nextafter
 from typing import Any
 
 from busmaster.arbiter.transaction import ENDED, Priority, Transaction
-from busmaster.bus.node import Node
+from busmaster.bus.node import Node, Request
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import RequestOptions
@@ -55,7 +54,7 @@ class ReadsAfterWrites:
             for point in group.read_after_write:
                 node = Node.of(point)
                 # not after a write to all: no node confirms that, and a read of each would hold up the line
-                if node.record is write.node and self._line.is_stale(point, before):
+                if node._record is write.node and self._line.is_stale(point, before):
                     self._want(point, node, group.period)
 
     def _want(self, point: Point[Any], node: Node, within: float) -> None:
@@ -69,16 +68,12 @@ class ReadsAfterWrites:
         """Read a point once, and give its value to the groups that poll it."""
         options = RequestOptions(priority=Priority.POLL, start_within=within)
         try:
-            future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-            reading = node.begin_reading(point.command, future, options)
-            try:
-                await future
-            except asyncio.CancelledError:
-                node.give_up(reading)
-                raise
+            request = Request(point.command, options)
+            await node._run(request)
+            assert request.transaction is not None
             self.read += 1
             for group in self._groups.values():
-                group.take_reading(point, reading)
+                group.take_reading(point, request.transaction)
         except (BusError, InvalidCommand):  # InvalidCommand: the bus was closed, or the node given back, meanwhile
             self.failed += 1
         finally:

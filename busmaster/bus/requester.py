@@ -79,7 +79,7 @@ class RequestOptions:
     runs out unheard, and is not repeated. `retries`, 0 to 100, in place of the node's. `idempotent`: whether a write
     may be repeated after an unknown outcome (R7), in place of what its command says. `verify`: a handle's `write`
     reads back what it wrote, and raises VerifyFailed if that differs. `safe`: this write is of the safe state in which
-    a line is left, and accepted when no other is (`Bus.take_only_safe_writes`); no limit of its point holds it.
+    a line is left, and accepted when no other is (`ext.take_only_safe_writes`); no limit of its point holds it.
     """
 
     priority: Priority = COMMAND

@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Quality(enum.Enum):
-    """GOOD; LATE: begun after the nominal reply time; STALE: older than a write to it; BAD: no value; OVERHEARD: taken
+    """GOOD; LATE: begun after `late_after`; STALE: older than a write to it; BAD: no value; OVERHEARD: taken
     from another master's exchange, of which a listener may have missed a part."""
 
     GOOD = "good"

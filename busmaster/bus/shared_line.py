@@ -11,8 +11,8 @@ from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import Hold, LineClient
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.bus.alarms import Alarms
 from busmaster.bus.answers import Answer, composed

@@ -11,8 +11,7 @@ from typing import Any, Generic, TypeVar
 
 import anyio
 
-from busmaster.arbiter.counters import Quantiles
-from busmaster.arbiter.histogram import Histogram
+from busmaster.arbiter.counters import Histogram, Quantiles
 from busmaster.arbiter.transaction import Poll
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
@@ -74,7 +73,7 @@ class GroupStatistics:
 
     `period` as asked, `achieved` as seen (mean), without the time for which it was paused. `jitter` runs from a cycle's
     due time to its start, `cycle_time` to its last value. `good`, `late`, `stale` and `bad` count samples. What its
-    cycles waited for before they started, on average: `exchanges_ahead` of others, and `settling_ahead` seconds after
+    cycles waited for before they started, on average: `exchanges_ahead` of others, and `quiet_time_ahead` seconds after
     somebody's uncertain outcome.
     """
 
@@ -89,7 +88,7 @@ class GroupStatistics:
     stale: int
     bad: int
     exchanges_ahead: float
-    settling_ahead: float
+    quiet_time_ahead: float
 
 
 class Tally:
@@ -97,7 +96,7 @@ class Tally:
 
     __slots__ = (
         *("cycle_time", "cycles", "exchanges_ahead", "last", "missed", "periods", "recent", "samples"),
-        *("settling_ahead", "spanned"),
+        *("quiet_time_ahead", "spanned"),
     )
 
     def __init__(self, poll: Poll) -> None:
@@ -111,7 +110,7 @@ class Tally:
         self.periods = 0
         self.recent: deque[float] = deque(maxlen=RECENT_PERIODS)
         self.exchanges_ahead = 0
-        self.settling_ahead = 0.0
+        self.quiet_time_ahead = 0.0
         self.cycle_time = Histogram()
         self.samples = NO_SAMPLES.copy()
 
@@ -133,7 +132,7 @@ class Tally:
         for transaction in poll.results[:1]:
             if transaction.started > -inf:
                 self.exchanges_ahead += transaction.exchanges_ahead
-                self.settling_ahead += transaction.settling_ahead
+                self.quiet_time_ahead += transaction.quiet_time_ahead
 
     def statistics(self, poll: Poll) -> GroupStatistics:
         """Return an immutable snapshot of the group's counts."""
@@ -150,7 +149,7 @@ class Tally:
             stale=self.samples[Quality.STALE],
             bad=self.samples[Quality.BAD],
             exchanges_ahead=self.exchanges_ahead / cycles if cycles else 0.0,
-            settling_ahead=self.settling_ahead / cycles if cycles else 0.0,
+            quiet_time_ahead=self.quiet_time_ahead / cycles if cycles else 0.0,
         )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import UNACKED, UNASKED, Direction, Frame, Kind
+from busmaster.capture.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.registry import NodeKind, find, protocols
 
@@ -52,7 +52,7 @@ class _Exchange:
         """
         if self.attempt is not None and self.request is None:
             return False  # its protocol is not known here: the frames say nothing
-        if frame.fault == UNASKED or self.request is None or self.released or self.is_broadcast:
+        if frame.fault == UNEXPECTED or self.request is None or self.released or self.is_broadcast:
             return True
         last = self.last
         if last is None or self.kind is None or self.judge()[0] is Outcome.NO_REPLY:
@@ -104,7 +104,7 @@ class Assembler:
         if self._kind is not None:
             self._kinds[self._kind.protocol.name] = self._kind
         self._echo = echo
-        self._echo_owed = b""
+        self._echo_pending = b""
         self._sent = b""
         self._offset = offset
         self._decoders: dict[str, Decoder] = {}
@@ -125,9 +125,9 @@ class Assembler:
             self._rest()
         self._now, self._told, self._sender, self._asked = now, True, sender, attempt
         if sender is Direction.HOST and self._echo:
-            self._echo_owed += data
+            self._echo_pending += data
             self._sent = data
-        elif self._echo_owed:
+        elif self._echo_pending:
             data = self._strip_echo(data)
         if attempt is not None and attempt is not self._exchange.attempt:
             request = attempt.request
@@ -176,12 +176,12 @@ class Assembler:
         if asks and exchange.request is None:
             exchange.request = frame
         packet = Packet(self._micros(frame.time), self._name, frame.sender, frame.raw, frame.node, joined=frame.joined)
-        unasked = self._told and self._asked is None and not from_host
-        if not (unasked or exchange.released):
+        unexpected = self._told and self._asked is None and not from_host
+        if not (unexpected or exchange.released):
             self._mark(packet)
-        if unasked or (not from_host and exchange.is_behind(frame)):
-            packet.outcome = Outcome.UNASKED
-            packet.comment = self._straggler()
+        if unexpected or (not from_host and exchange.is_behind(frame)):
+            packet.outcome = Outcome.UNEXPECTED
+            packet.comment = self._overdue_reply()
         elif not from_host:
             exchange.last, exchange.answer = frame, packet
         elif frame.kind is Kind.NAK:
@@ -202,7 +202,7 @@ class Assembler:
         if attempt is not None:
             packet.transaction, packet.attempt = attempt.transaction, attempt.number
 
-    def _straggler(self) -> str:
+    def _overdue_reply(self) -> str:
         """Return what a stray may be, "" if that is not known."""
         attempt = self._exchange.attempt
         late = self._told and attempt is not None and attempt.verdict is Verdict.NO_REPLY
@@ -218,12 +218,12 @@ class Assembler:
         MSC's closing ACK comes with the next request. An echo that differs is left as it came: the line collided.
         """
         # The last alone is tried first: an echo that never came must not use up the next one.
-        for owed in (self._sent, self._echo_owed):
-            length = min(len(owed), len(data))
-            if length and data[:length] == owed[:length]:
-                self._echo_owed, self._sent = owed[length:], b""
+        for overdue in (self._sent, self._echo_pending):
+            length = min(len(overdue), len(data))
+            if length and data[:length] == overdue[:length]:
+                self._echo_pending, self._sent = overdue[length:], b""
                 return data[length:]
-        self._echo_owed = b""
+        self._echo_pending = b""
         return data
 
     def _decoder(self) -> Decoder | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
-UNASKED = "unasked"
+UNEXPECTED = "unexpected"
 """The fault of a frame from a node that nobody had asked."""
 UNACKED = "before the ACK"
 """The fault of an MSC packet whose request was not yet acknowledged: it may answer an older one."""
@@ -50,7 +50,7 @@ class Frame:
     value: str = ""
     fault: str = ""
     answers: bool = False
-    """It ends what the last request asked for, or one leg of it."""
+    """It ends what the last request asked for, or one step of it."""
     continues: bool = False
     """It is what the host says in the midst of an exchange, and begins none."""
     joined: bool = False
@@ -82,7 +82,7 @@ class Frame:
 
 __all__ = [
     "UNACKED",
-    "UNASKED",
+    "UNEXPECTED",
     "Direction",
     "Frame",
     "Kind",

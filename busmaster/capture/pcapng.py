@@ -64,8 +64,8 @@ class Outcome(enum.IntEnum):
     NO_REPLY = 2
     GARBLED = 3
     REFUSED = 4
-    UNASKED = 5
-    DOUBTED = 6
+    UNEXPECTED = 5
+    AMBIGUOUS = 6
     """A good answer came and was not believed, since it may have been another request's."""
     SPOILT = 7
     """What came was not read: the port said that it was damaged, or it came too early, or the echo was another."""

@@ -1,7 +1,7 @@
 """A recorded line, run through the master's readers of today: what would they make of the same bytes?
 
-The clock is not replayed, so what a reply's lateness decided is not decided again: unasked bytes stay
-unasked, and where nothing came nothing comes.
+The clock is not replayed, so what a reply's maximum reply delay decided is not decided again: unexpected bytes stay
+unexpected, and where nothing came nothing comes.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ class _Heard:
 class _Run:
     """One exchange of today's, driven with what was recorded.
 
-    With `pauses`, a reply that pauses for longer than its byte gap is over for the reader, as it was for the arbiter,
-    unless that allowed for an adapter that holds bytes back: which it did is not recorded.
+    With `pauses`, a reply that pauses for longer than its inter-byte timeout is over for the reader, as it was for the
+    arbiter, unless that allowed for an adapter that holds bytes back: which it did is not recorded.
     """
 
     def __init__(self, asked: _Heard, command: Command[Any], profile: Profile, pauses: bool = False) -> None:
@@ -131,7 +131,7 @@ class _Run:
     def note(self, heard: _Heard) -> None:
         """Take the recorded outcome and values."""
         packet = heard.packet
-        if packet.outcome not in (Outcome.NONE, Outcome.UNASKED):
+        if packet.outcome not in (Outcome.NONE, Outcome.UNEXPECTED):
             self._recorded = Result(packet.outcome, packet.comment.removesuffix(" (late)"))
         if heard.frame.kind is Kind.VALUE and not heard.frame.fault:
             self._values += numbers_in(heard.frame.value)
@@ -147,7 +147,7 @@ class _Run:
         self._pause(heard.packet.micros)
         self.note(heard)
         self._given_up = None
-        if not heard.packet.joined:  # readers of several legs weigh what came in one piece
+        if not heard.packet.joined:  # readers of several steps weigh what came in one piece
             self._hand_over()
         self._heard += heard.packet.frame
         self._answered = self._answered or bool(heard.packet.frame)
@@ -192,7 +192,7 @@ class _Run:
         if not self._pauses or last is None or self._over or self._differs:
             return
         self._hand_over()
-        if self._driver.ending is None and (now - last) / 1e6 > self._driver.timing.byte_gap:
+        if self._driver.ending is None and (now - last) / 1e6 > self._driver.timing.inter_byte_timeout:
             self._driver.expire()
             self._gather()
 
@@ -204,12 +204,12 @@ class _Run:
         if self._given_up is not None and recorded.outcome is self._given_up.outcome:
             now = self._given_up  # time decided it, which is not replayed
         if self._answered and recorded.outcome in FAILED and now.outcome in FAILED:
-            now.outcome = recorded.outcome  # in pieces of what size a later leg began is not recorded
+            now.outcome = recorded.outcome  # in pieces of what size a later step began is not recorded
         if recorded.outcome is Outcome.OK:
             recorded.values = self._values
             recorded.text = recorded.text.removeprefix(lead) if recorded.text.startswith(lead) else ""
-        elif recorded.outcome is Outcome.DOUBTED and now.outcome is Outcome.OK:
-            now = Result(Outcome.DOUBTED, f"{now.text}, which was not believed")
+        elif recorded.outcome is Outcome.AMBIGUOUS and now.outcome is Outcome.OK:
+            now = Result(Outcome.AMBIGUOUS, f"{now.text}, which was not believed")
         return _replayed(self.asked, str(self._command), recorded, now)
 
     def _hand_over(self) -> None:
@@ -263,7 +263,7 @@ def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
     for place, one in enumerate(heard):
         of_run = run is not None and one.exchange == run.asked.exchange
         if one.packet.direction is not Direction.HOST:
-            if run is not None and of_run and (any(one.exchange) or one.packet.outcome is not Outcome.UNASKED):
+            if run is not None and of_run and (any(one.exchange) or one.packet.outcome is not Outcome.UNEXPECTED):
                 run.node_says(one)
             continue
         if (run is not None and of_run and run.host_says(one)) or not one.is_request or (of_run and any(one.exchange)):
@@ -328,7 +328,7 @@ def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:
     for follower in heard[place + 1 :]:
         if follower.is_request:
             break
-        if follower.packet.outcome is not Outcome.UNASKED:
+        if follower.packet.outcome is not Outcome.UNEXPECTED:
             outcome = follower.packet.outcome or outcome
     return outcome
 

@@ -46,6 +46,8 @@ COMMANDS = (
     "web",
     "opcua",
     "safe",
+    "check",
+    "migrate",
     "plan",
     "points",
     "monitor",

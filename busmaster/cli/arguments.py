@@ -63,9 +63,9 @@ class Connection:
         return self.profile.timings.with_window(self.timeout)
 
     @property
-    def lateness(self) -> float:
+    def max_reply_delay(self) -> float:
         """The seconds after which nothing comes any more, as the options say, else the protocol."""
-        return (documented(self.timings) or self.profile.timings).read.lateness
+        return (documented(self.timings) or self.profile.timings).read.max_reply_delay
 
     def endpoint(self) -> SerialPort | TcpPort:
         """Return the endpoint that PORT names. Raises InvalidCommand for a PORT that is none."""

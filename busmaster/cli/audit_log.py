@@ -1,4 +1,4 @@
-"""The record of writes on standard error: for systemd's journal, or whoever reads there."""
+"""The audit log on standard error: for systemd's journal, or whoever reads there."""
 
 from __future__ import annotations
 

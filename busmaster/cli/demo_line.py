@@ -52,7 +52,7 @@ def unplug(server: LineServer, address: int) -> None:
 
 
 def plug_in(server: LineServer) -> None:
-    """Mend the wire that was cut."""
+    """Fix the wire that was cut."""
     server.call(lambda line, now: line.restore(now))
 
 

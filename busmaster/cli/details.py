@@ -88,8 +88,8 @@ def _exchange_text(times: Mapping[str, Any]) -> str:
     parts = [f"waited {_ms(started - queued)}"]
     if times["exchanges_ahead"]:
         parts[0] += f" behind {times['exchanges_ahead']}"
-    if times["settling_ahead"]:
-        parts[0] += f", {_ms(times['settling_ahead'])} of it while the line settled"
+    if times["quiet_time_ahead"]:
+        parts[0] += f", {_ms(times['quiet_time_ahead'])} of it while the line resynchronised"
     if times["first_byte"] is not None:
         parts.append(f"reply after {_ms(times['first_byte'] - started)}")
     if times["last_byte"] is not None:

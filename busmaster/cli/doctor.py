@@ -64,7 +64,7 @@ def command(
     with capturing(capture, port=name, protocol=protocol or "", echo=patient.endpoint.echo) as recorder:
         until_ended(examine, patient, tell, recorder)
     if wrong:
-        note(f"{name}: {wrong} thing{'' if wrong == 1 else 's'} to mend")
+        note(f"{name}: {wrong} thing{'' if wrong == 1 else 's'} to fix")
         return FAILED
     return 0
 
@@ -87,9 +87,9 @@ def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
 def lines_of(finding: Finding) -> Iterator[str]:
     """Yield the lines of a finding, the first behind its mark.
 
-    The mark is `ok`; `note`: in order, but could be better; `MEND`: not in order.
+    The mark is `ok`; `note`: in order, but could be better; `FAIL`: not in order.
     """
-    mark = "MEND" if not finding.ok else "note" if finding.advice else "ok"
+    mark = "FAIL" if not finding.ok else "note" if finding.advice else "ok"
     yield f"{mark:4}  {finding.topic:{TOPIC}}  {finding.what}"
     if finding.advice:
         yield f"{'':4}  {'':{TOPIC}}  -> {finding.advice}"

@@ -15,8 +15,8 @@ from typing import Any
 
 import anyio
 
+from busmaster.authorisation.authorisation import Authorisation
 from busmaster.cli.app import FAILED
-from busmaster.gate.gate import Gate
 from busmaster.service.service import Service
 
 LEAVE_SCREEN = b"\x1b[?1000l\x1b[?1003l\x1b[?1006l\x1b[?2004l\x1b[?1004l\x1b[<u\x1b[?25h\x1b[?1049l"
@@ -45,10 +45,12 @@ async def draw(address: str) -> int:
 
 
 @asynccontextmanager
-async def served_here(gate: Gate, title: str) -> AsyncIterator[Service]:
+async def served_here(authorisation: Authorisation, title: str) -> AsyncIterator[Service]:
     """Serve a line to this process's own view alone: what is not to be served to others, or cannot be."""
     with tempfile.TemporaryDirectory(prefix="busmaster-") as folder:
-        async with Service(gate.bus, gate=gate, path=Path(folder) / "view.sock", title=title) as service:
+        async with Service(
+            authorisation.bus, authorisation=authorisation, path=Path(folder) / "view.sock", title=title
+        ) as service:
             yield service
 
 

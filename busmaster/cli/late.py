@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 
 import anyio
 
-from busmaster.arbiter.events import LatenessRaised, RepliesLate
+from busmaster.arbiter.events import MaxReplyDelayRaised, RepliesLate
 from busmaster.bus.bus import Bus
 from busmaster.cli.output import Level, note
 from busmaster.errors import NoReply
@@ -31,12 +31,12 @@ class LateNodes:
     async def listen(self, bus: Bus | RemoteBus) -> None:
         """Note late answers, until cancelled."""
         async for event in bus.events():
-            if isinstance(event, LatenessRaised | RepliesLate):
+            if isinstance(event, MaxReplyDelayRaised | RepliesLate):
                 self._ages[event.node.address] = (event.node.label, event.age)
 
-    async def explain(self, error: NoReply, lateness: float) -> None:
+    async def explain(self, error: NoReply, max_reply_delay: float) -> None:
         """Say in an error what to try where its node is only late. Waits as long as the answer may still come."""
-        await anyio.sleep(lateness)
+        await anyio.sleep(max_reply_delay)
         if error.address is not None and error.address in self._ages:
             _, age = self._ages.pop(error.address)
             error.hint = advice(age)

@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import anyio
 import click
 
+from busmaster.authorisation.record import WriteRecord
 from busmaster.cli.output import Level, note
 from busmaster.config import LineFile, line_settings, load
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.distributor import Distributor
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort

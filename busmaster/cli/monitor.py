@@ -11,6 +11,7 @@ from typing import Any
 import anyio
 import click
 
+from busmaster import ext
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.snapshots import Snapshot, Stream
 from busmaster.bus.suitability import check_settings
@@ -63,7 +64,7 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
     endpoint = Connection(port, protocol, baud).endpoint()
     kind = find(protocol)
     check_settings(kind.profile, endpoint)
-    names = kind.handle.names_of_items()
+    names = ext.names_of_items(kind.handle)
     write = json_text if as_json else plain_text
     with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:
         decoder = Decoder(kind.protocol.dialect())
@@ -98,8 +99,8 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
         try:
             until_ended(run, recorder)
         finally:
-            if overheard.doubted:
-                note(f"{overheard.doubted} replies could have been those to earlier requests, and were no values")
+            if overheard.ambiguous:
+                note(f"{overheard.ambiguous} replies could have been those to earlier requests, and were no values")
             for counts in line.outputs.statistics():
                 note(output_text(counts))
 

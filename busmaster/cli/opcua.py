@@ -7,8 +7,8 @@ from importlib.util import find_spec
 import click
 
 from busmaster.cli.app import OK
-from busmaster.cli.doors import door_options, following, place_of
 from busmaster.cli.ending import until_ended
+from busmaster.cli.interfaces import following, interface_options, place_of
 from busmaster.cli.output import note
 from busmaster.config.service import read_tokens
 from busmaster.service.tcp import is_loopback
@@ -19,7 +19,7 @@ FOLDER = click.Path(exists=True, file_okay=False)
 
 
 @click.command(short_help="Serve a line that another program owns by OPC UA.")
-@door_options(BIND)
+@interface_options(BIND)
 @click.option(
     "--allow",
     multiple=True,
@@ -43,8 +43,8 @@ def command(
     """Show a line to OPC UA clients: nodes as objects, points as variables with unit, range, status and time.
 
     LINE is the name that `busmaster status` lists, its LINE.toml or its port; without it, the one line that runs. The
-    line goes on whatever becomes of the server, and the server waits for a line whose owner is away. Clients write
-    the points that --allow names, through the owner's gate. Beyond this machine (--bind 0.0.0.0:4840) they need a
+    line goes on whatever becomes of the server, and the server waits for a line whose owner is away. Clients write the
+    points that --allow names, through the owner's authorisation. Beyond this machine (--bind 0.0.0.0:4840) they need a
     token for that: it is the password of the user of its name.
     """
     if any(find_spec(module) is None for module in ("asyncua", "websockets")):
@@ -61,8 +61,8 @@ def command(
         raise click.UsageError("--trusted needs --certificate: without one no client shows its own")
     secrets = {} if token_file is None else read_tokens(token_file)
     followed = following(line, read_only=read_only)
-    from busmaster.doors.opcua import read_trusted, serve
-    from busmaster.doors.opcua_access import Rules
+    from busmaster.interfaces.opcua import read_trusted, serve
+    from busmaster.interfaces.opcua_access import Rules
 
     known = None if trusted is None else read_trusted(trusted)
     rules = Rules(allow=allow, secrets=secrets, trusted=known, is_signed=certificate is not None, is_local=is_local)

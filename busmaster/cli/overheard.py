@@ -19,6 +19,7 @@ from typing import Any
 
 import anyio
 
+from busmaster import ext
 from busmaster.arbiter.transaction import Timeline
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -122,12 +123,12 @@ class Overheard:
 
     def __init__(self, protocol: Protocol, points: Iterable[Point[Any]], clock: Clock) -> None:
         self.groups: list[HeardGroup] = []
-        self.doubted = 0
+        self.ambiguous = 0
         """Replies that were no values, as they could have been another request's."""
         self._clock = clock
         self._open: list[OpenRequest] = []
         self._request_ended = -inf
-        self._lateness = 0.0
+        self._max_reply_delay = 0.0
         self._unread = False
         """The open request was not understood: how its reply begins is not known."""
         self._profile = protocol.profile
@@ -155,28 +156,30 @@ class Overheard:
         elif self._unread and frame.answers and not frame.fault:
             self._unread = bool(self._still_open(frame))
         elif frame.fault and frame.sender is Direction.UNKNOWN:  # perhaps a request
-            self._request_ended, self._lateness, self._unread = frame.ended, self._longest(), True
+            self._request_ended, self._max_reply_delay, self._unread = frame.ended, self._longest(), True
 
     def _ask(self, frame: Frame) -> None:
         """Begin an exchange; what the request before asked for may still come."""
         self._give_up()
         address = frame.node if self._profile.addressed else self._profile.addresses[0]
         node = None if address is None else self._nodes.get(address)
-        self._request_ended, self._lateness, self._unread = frame.ended, self._longest(), True
+        self._request_ended, self._max_reply_delay, self._unread = frame.ended, self._longest(), True
         if frame.fault or address is None:
             return
         with suppress(InvalidCommand, KeyError, ValueError):
             command = self._dialect.command(frame, ())
             timings = self._profile.timings if node is None else node.timings
             exchange = command.open(address, timings)
-            self._lateness = exchange.timing.lateness + (timings.packet.lateness if exchange.later else 0.0)
+            self._max_reply_delay = exchange.timing.max_reply_delay + (
+                timings.packet.max_reply_delay if exchange.later else 0.0
+            )
             self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
             self._asked = None if node is None else (node, command)  # a reply to a node that is in no group
             self._unread = False
 
     def _answer(self, driver: Driver, frame: Frame) -> None:
         timing, delay = driver.timing, frame.delay or 0.0
-        if frame.fault or frame.sender is not Direction.NODE or delay > timing.lateness:
+        if frame.fault or frame.sender is not Direction.NODE or delay > timing.max_reply_delay:
             self._give_up()  # whatever still comes may be anybody's
             return
         driver.feed(frame.raw)
@@ -186,9 +189,9 @@ class Overheard:
         # any request can be refused, whatever its good replies begin with
         refused = not driver.ending.delivered
         possible = [one for one in self._still_open(frame) if refused or not one.answers or answers & one.answers]
-        doubtful = any(one.request != driver.exchange.request for one in possible)
-        self.doubted += doubtful
-        if not (refused or doubtful) and self._asked is not None:
+        ambiguous = any(one.request != driver.exchange.request for one in possible)
+        self.ambiguous += ambiguous
+        if not (refused or ambiguous) and self._asked is not None:
             self._deliver(self._found(*self._asked, driver.ending.value), frame.time - frame.earlier)
         if possible:
             self._give_up()  # its own reply may be the one that still comes
@@ -198,8 +201,8 @@ class Overheard:
         """Leave the exchange, whose reply may still come."""
         driver, self._driver = self._driver, None
         if self._unread or (driver is not None and driver.exchange.answered):
-            request, owed = (b"", ()) if driver is None else (driver.exchange.request, driver.exchange.owed)
-            self._open.append(OpenRequest(request, frozenset(owed), self._request_ended + self._lateness))
+            request, overdue = (b"", ()) if driver is None else (driver.exchange.request, driver.exchange.overdue)
+            self._open.append(OpenRequest(request, frozenset(overdue), self._request_ended + self._max_reply_delay))
             del self._open[:-MOST_OPEN]
         self._unread = False
 
@@ -212,7 +215,9 @@ class Overheard:
     def _longest(self) -> float:
         """Return the maximum reply delay of whatever node it was that was asked."""
         timings = (self._profile.timings, *(node.timings for node in self._nodes.values()))
-        return max(max(each.read.lateness, each.write.lateness) + each.packet.lateness for each in timings)
+        return max(
+            max(each.read.max_reply_delay, each.write.max_reply_delay) + each.packet.max_reply_delay for each in timings
+        )
 
     def _found(self, node: Node, command: Command[Any], value: Any) -> dict[Point[Any], Any]:
         """Return what each point would have read, of all that the exchange tells."""
@@ -256,7 +261,7 @@ async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snaps
                     snapshot = group.turn(time.monotonic(), time.time())
                     if snapshot is not None:
                         show(snapshot)
-                        line.bus.overheard(snapshot.samples)
+                        ext.take_overheard(line.bus, snapshot.samples)
     finally:
         for group in overheard.groups:  # what the last period heard, before the outputs end
             group.turn(time.monotonic(), time.time())

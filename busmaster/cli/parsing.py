@@ -16,7 +16,7 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 LONGEST_WINDOW = 60.0
-"""Seconds. Lateness moves with it, and a line is first listened to for that long."""
+"""Seconds. Maximum reply delay moves with it, and a line is first listened to for that long."""
 
 
 class Whole(click.IntRange):

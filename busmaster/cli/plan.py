@@ -9,14 +9,15 @@ from typing import Any
 import click
 
 from busmaster.arbiter.transaction import Priority
+from busmaster.authorisation.rights import line_parts
+from busmaster.bounds import MOST_CLIENTS
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import json_option
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import columns, emit, emit_all, json_line
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.contract.profile import LineSettings
-from busmaster.gate.rights import line_parts
-from busmaster.planning import GroupPlan, Losses, Plan
+from busmaster.planning import Bounds, GroupPlan, Losses, Plan
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 
@@ -26,14 +27,14 @@ SOME = 8
 HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "MISSED")
 
 
-@click.command(short_help="Reckon whether the polls of a file fit its line.")
+@click.command(short_help="Calculate whether the polls of a file fit its line.")
 @file_argument()
 @json_option
 def command(path: str, as_json: bool) -> int:
-    """Reckon how busy LINE.toml's poll groups will keep its line, and what would fit. Nothing is opened; what the file
-    says of emulated nodes is checked too.
+    """Calculate how busy LINE.toml's poll groups will keep its line, and what would fit. Nothing is opened; what the
+    file says of emulated nodes is checked too.
 
-    Reply times are the file's `reply_time`, else half of the nominal one. The exit status is 1 if cycles will be
+    Reply times are the file's `reply_time`, else half of `late_after`. The exit status is 1 if cycles will be
     missed.
     """
     file = load(path)
@@ -70,7 +71,7 @@ def page(head: str, plan: Plan, assumed: Sequence[str], *, shared: bool = False)
 
 
 def waits_text(plan: Plan) -> Iterator[str]:
-    """Yield what to reckon with, and then the bounds of R9, which no line comes near."""
+    """Yield what to calculate with, and then the bounds of R9, which no line comes near."""
     yield (
         f"a command waits up to {time_text(plan.typical_wait)} on a healthy line; "
         f"while a dead node is probed all waits are about {time_text(plan.dead_wait)} longer"
@@ -87,6 +88,14 @@ def parts_text(plan: Plan) -> Iterator[str]:
         f"while polls wait, all programs of a role together can take of the line: {parts}; a safe write or another "
         f"urgent write of the owner waits for the exchange on the wire, at most {wait}"
     )
+    waits = ", ".join(f"{time_text(wait)} with {clients}" for clients, wait in program_waits(plan).items())
+    yield f"an urgent write of a program that has not used its part waits at most (by the number of programs): {waits}"
+
+
+def program_waits(plan: Plan) -> dict[int, float]:
+    """Return how many seconds an urgent write of a program waits at most (R9), by how many programs are connected."""
+    hold = plan.worst_waits[Priority.URGENT]
+    return {clients: Bounds(hold, hold, clients=clients).wait(Priority.URGENT) for clients in (1, 8, MOST_CLIENTS)}
 
 
 def assumed_text(nodes: Sequence[str]) -> Iterator[str]:
@@ -94,7 +103,7 @@ def assumed_text(nodes: Sequence[str]) -> Iterator[str]:
     if nodes:
         some = ", ".join(nodes[:SOME]) + (f" and {len(nodes) - SOME} more" if len(nodes) > SOME else "")
         yield (
-            f"reply times are assumed, half of the nominal one, for {some}: `busmaster doctor` measures them, and "
+            f"reply times are assumed (half of late_after) for {some}: `busmaster doctor` measures them, and "
             "`reply_time` says them"
         )
 
@@ -104,7 +113,7 @@ def losses_text(losses: Losses) -> str:
     shortest, longest = map(time_text, losses.windows)
     windows = f"a window of {shortest}" if shortest == longest else f"windows of {shortest} to {longest}"
     return (
-        f"with {losses.share:.0%} of all frames lost it asks for {losses.documented:.0%} of the line; "
+        f"with {losses.share:.0%} of all frames lost the schedule asks for {losses.documented:.0%} of the line; "
         f'with timing = "learned" ({windows}) for {losses.learned:.0%}'
     )
 
@@ -172,6 +181,7 @@ def fields(plan: Plan) -> dict[str, Any]:
         "dead_wait": plan.dead_wait,
         "worst_waits": {priority.name.lower(): finite(wait) for priority, wait in plan.worst_waits.items()},
         "role_parts": line_parts(),
+        "program_waits": {str(clients): finite(wait) for clients, wait in program_waits(plan).items()},
         "fitting_baudrate": plan.fitting_baudrate,
         "losses": {
             "share": plan.losses.share,

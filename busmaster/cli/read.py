@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from busmaster import ext
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
 from busmaster.bus.node import Node
@@ -61,9 +62,9 @@ async def read(
     async with bus, late_nodes(bus) as late:
         for item, point in zip(items, points, strict=True):
             try:
-                value = await handle.read_item(item, **how)
+                value = await ext.read_item(handle, item, **how)
             except NoReply as error:
-                await late.explain(error, connection.lateness)
+                await late.explain(error, connection.max_reply_delay)
                 raise
             if as_json:
                 fields = {"value": json_value(value), **name_fields(value), "time": utc(time.time())}
@@ -97,7 +98,7 @@ async def read_points(line: ConfiguredLine, bus: Bus | RemoteBus, names: tuple[s
             try:
                 value = point.value_of(await handles[point.where].node.request(point.command))
             except NoReply as error:
-                await late.explain(error, Node.of(point).timings.read.lateness)
+                await late.explain(error, Node.of(point).timings.read.max_reply_delay)
                 raise
             if as_json:
                 fields = {"value": json_value(value), **name_fields(value), "unit": point.unit}
@@ -112,5 +113,5 @@ def plain_lines(handle: Handle, item: str, value: Any, precision: int | None) ->
     if not isinstance(value, tuple):
         yield f"{item} {value_text(value, precision)}"
         return
-    for name, one in zip(handle.run_items(item, len(value)), value, strict=True):
+    for name, one in zip(ext.run_items(handle, item, len(value)), value, strict=True):
         yield f"{name} {value_text(one, precision)}"

@@ -8,6 +8,7 @@ import sys
 import anyio
 import click
 
+from busmaster import ext
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View, viewed
 from busmaster.cli.audit_log import AuditLog
@@ -16,6 +17,7 @@ from busmaster.cli.ending import Ending, until_ended
 from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
+from busmaster.cli.plan import losses_text
 from busmaster.cli.reaching import check_no_owner
 from busmaster.cli.safe import tell_unsafe
 from busmaster.cli.serving import secrets_of, served, service_of
@@ -27,6 +29,8 @@ from busmaster.outputs.base import OutputStatistics
 
 SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
+WORTH_SAYING = 0.005
+"""Share of the line that learned reply times would spare below which nothing is said of them."""
 FAREWELL = 2.0
 """Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
 
@@ -65,7 +69,7 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
         line = ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only)
-        line.gate.take_secrets(secrets_of(file))
+        line.authorisation.take_secrets(secrets_of(file))
         running = Running(
             line,
             path,
@@ -97,7 +101,7 @@ class Running:
         self._view = view
         self._hangups = hangups
         self._ending = ending
-        self.watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True, of_file=True)
+        self.watch = Watch(line.bus, line.file.title, view, authorisation=line.authorisation, steady=True, of_file=True)
         self._manager = ServiceManager()
 
     async def run(self) -> int:
@@ -130,6 +134,7 @@ class Running:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._manager.show_life, self.line.bus)
                 tasks.start_soon(self._hear_hangups)
+                tasks.start_soon(self._say_what_learning_would_gain)
                 try:
                     await anyio.sleep_forever()
                 finally:
@@ -147,6 +152,13 @@ class Running:
         else:
             note("no safe state: when this ends, nodes keep what was written to them last (see [safe])")
 
+    async def _say_what_learning_would_gain(self) -> None:
+        """Say once what learned reply times would spare of the line, where a node has none."""
+        if self.line.groups and any(node.could_learn for node in self.line.file.nodes.values()):
+            losses = (await ext.plan_in_steps(self.line.bus)).losses
+            if losses.documented - losses.learned >= WORTH_SAYING:
+                note(losses_text(losses))
+
     async def _hear_hangups(self) -> None:
         while True:
             await self._hangups.next()
@@ -158,11 +170,11 @@ class Running:
         A file that is wrong is told, and the line goes on as it was.
         """
         self._manager.reloading()
-        self.line.bus.accept_device()
+        ext.accept_device(self.line.bus)
         try:
             file, secrets = await anyio.to_thread.run_sync(self._checked_file)
             await self.line.take(file)
-            self.line.gate.take_secrets(secrets)
+            self.line.authorisation.take_secrets(secrets)
         except (InvalidCommand, OSError) as error:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
@@ -204,7 +216,7 @@ class Running:
         self._leaving = True
         self._manager.stopping()
         if self.line.safe_state:
-            outcomes = await self.line.safe_state.enter(self.line.gate, self._why())
+            outcomes = await self.line.safe_state.enter(self.line.authorisation, self._why())
             self.left_safely = tell_unsafe(outcomes) == OK
             if self.left_safely:
                 note(f"the safe state is confirmed: {', '.join(outcomes)}", Level.NOTICE)

@@ -9,6 +9,7 @@ import anyio
 import click
 
 from busmaster.arbiter.events import PortFailed
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.alarms import BusEvent
 from busmaster.bus.polling import Stream
 from busmaster.capture.recorder import Recorder
@@ -20,7 +21,6 @@ from busmaster.cli.output import Level, emit, note
 from busmaster.cli.reaching import owner_of, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import BusError, InvalidCommand
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.values import event_text
 from busmaster.service.remote import RemoteBus, connect
 from busmaster.transport.endpoints import Endpoint
@@ -76,11 +76,11 @@ async def leave_through(remote: RemoteBus, values: Mapping[str, float]) -> int:
 async def leave(line: ConfiguredLine) -> int:
     """Send the safe state, print each point that was confirmed, and return the exit status."""
     records: list[WriteRecord] = []
-    line.gate.record = records.append
+    line.authorisation.record = records.append
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(tell_of_port, line.bus.events())
         async with line.bus:
-            outcomes = await line.safe_state.enter(line.gate, "busmaster safe")
+            outcomes = await line.safe_state.enter(line.authorisation, "busmaster safe")
     status = tell_outcomes(outcomes)
     # only now: no output, be it broken, is in the way of a stop
     try:

@@ -26,7 +26,7 @@ def service_of(line: ConfiguredLine) -> Service | None:
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
     return Service(
         line.bus,
-        gate=line.gate,
+        authorisation=line.authorisation,
         name=name,
         mode=section.mode,
         group=section.group,

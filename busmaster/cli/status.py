@@ -27,8 +27,8 @@ NOT_FOR_US = "not for this user"
 def command(as_json: bool) -> int:
     """List the lines that programs of this user serve, and those of the system in /run/busmaster: name, port, process,
     programs that use it, how busy it is, or that it is offline, and how many of its nodes are up. The exit status is 1
-    if one does not answer; one that is not for this user is listed as such. Connections that were refused because no
-    place was free, and logins that failed, are named on standard error.
+    if one does not answer; one that is not for this user is listed as such. Connections that were refused, and
+    logins that failed, are named on standard error.
     """
     return until_ended(status, as_json)
 
@@ -75,7 +75,7 @@ async def ask(owner: Owner) -> dict[str, Any]:
 
 def refused_text(line: dict[str, Any]) -> str:
     """Return what the owner of a line has refused since it runs, "" for nothing."""
-    names = {"refused_connections": "connections refused, as no place was free", "failed_logins": "logins failed"}
+    names = {"refused_connections": "connections refused", "failed_logins": "logins failed"}
     return ", ".join(f"{line[count]} {name}" for count, name in names.items() if line[count])
 
 

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 
 import anyio
 
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.state import LineState
 from busmaster.bus.bus import Bus
 
 AT_LEAST = 0.1

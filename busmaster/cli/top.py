@@ -16,8 +16,8 @@ from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.reaching import owner_of, token_for
 from busmaster.cli.terminal import made_printable
 from busmaster.contract.profile import LineSettings
-from busmaster.doors.following import Following, Lost
 from busmaster.errors import LineDown
+from busmaster.interfaces.following import Following, Lost
 from busmaster.service.folder import find_owner, line_name, owners
 from busmaster.transport.endpoints import endpoint, is_served
 
@@ -98,6 +98,8 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
         screen = Screen(following.picture, following, leave="end the run" if of_owner else "leave")
 
         def show_state() -> None:
+            if of_owner and screen.away:
+                return  # the first reason counts: what a retry finds while the screen leaves would hide it
             screen.away = following.state.why if isinstance(following.state, Lost) else ""
             screen.picture, screen.read_only = following.picture, following.read_only
             screen.take_picture()

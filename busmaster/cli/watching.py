@@ -12,10 +12,12 @@ from typing import Any, Protocol
 import anyio
 from anyio.abc import TaskGroup
 
+from busmaster import ext
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import LineChange, LineChanged, NodeChanged, PortFailed, RepliesLate
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.learned import LearnedTimes
-from busmaster.arbiter.state import LineState
+from busmaster.authorisation.authorisation import Authorisation
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.polling import PollGroup, Snapshot
@@ -27,7 +29,6 @@ from busmaster.cli.output import Level, SteadyOutput, emit_all, json_line, note,
 from busmaster.cli.top import what_is_missing
 from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
-from busmaster.gate.gate import Gate
 from busmaster.outputs.values import cycle_fields, event_text, utc
 from busmaster.service.service import Service
 
@@ -38,9 +39,9 @@ LINE = ""
 class Watch:
     """What is told of a bus while its groups are polled. Times are in seconds since it was made.
 
-    `view` says how it is shown, `gate` is what the writes of the screen pass. `steady`: that nobody can print any more
-    does not end it. `of_file`: a LINE.toml says what is polled. It hears what happens to the bus from the start on,
-    before that is entered too.
+    `view` says how it is shown, `authorisation` is what the writes of the screen pass. `steady`: that nobody can print
+    any more does not end it. `of_file`: a LINE.toml says what is polled. It hears what happens to the bus from the
+    start on, before that is entered too.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Watch:
         title: str,
         view: View,
         *,
-        gate: Gate | None = None,
+        authorisation: Authorisation | None = None,
         steady: bool = False,
         of_file: bool = False,
     ) -> None:
@@ -58,7 +59,7 @@ class Watch:
         self.output = SteadyOutput(note) if steady else None
         self.title = title
         self.view = view
-        self.gate = gate or Gate(bus, read_only=view.read_only)
+        self.authorisation = authorisation or Authorisation(bus, read_only=view.read_only)
         self.start = bus.now()
         self.groups: list[PollGroup] = []
         self.service: Service | None = None
@@ -156,7 +157,7 @@ class Watch:
     def summarise(self) -> None:
         """Print the summary on standard error: cycles, missed, achieved period, utilisation; a line for each node."""
         counts = self.bus.statistics()
-        if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.unasked_bytes):
+        if self.bus.state is LineState.RESYNCHRONISING and not (counts.exchanges or counts.unexpected_bytes):
             note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
         if text := loss_text(self.bus):
             note(text, Level.WARNING)
@@ -187,7 +188,7 @@ def loss_text(bus: Bus) -> str:
     if not (losses or lost.is_lost):
         return ""
     times = f"lost {losses} time{'s' * (losses != 1)}, " if losses else "never connected, "
-    return f"line: {times}for {bus.lost_seconds:.1f} s" + (f"; still lost: {lost.reason}" if lost.is_lost else "")
+    return f"line: {times}for {ext.lost_seconds(bus):.1f} s" + (f"; still lost: {lost.reason}" if lost.is_lost else "")
 
 
 def learned_text(learned: Iterable[LearnedTimes]) -> str:
@@ -270,7 +271,7 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     async with AsyncExitStack() as stack:
         if shown_on_screen(view) and watch.service is None:
             try:
-                watch.service = await stack.enter_async_context(served_here(watch.gate, watch.title))
+                watch.service = await stack.enter_async_context(served_here(watch.authorisation, watch.title))
             except (OSError, InvalidCommand) as error:  # no folder for it, say: the line runs all the same
                 note(f"there is no live view: {error}; plain lines instead", Level.WARNING)
                 watch.view = view = replace(view, plain=True)

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 import click
 
 from busmaster.cli.app import OK
-from busmaster.cli.doors import door_options, following, place_of
 from busmaster.cli.ending import until_ended
+from busmaster.cli.interfaces import following, interface_options, place_of
 from busmaster.cli.output import note
 from busmaster.config.service import read_tokens
 
@@ -19,7 +19,7 @@ NEEDED = ("starlette", "uvicorn", "websockets")
 
 
 @click.command(short_help="Serve a page and a REST API over a line that another program owns.")
-@door_options(BIND)
+@interface_options(BIND)
 @click.option("--token-file", metavar="FILE", help="Who may write: a name and its token on each line.")
 @click.option(
     "--host",
@@ -38,7 +38,7 @@ def command(line: str | None, bind: str, read_only: bool, token_file: str | None
     """
     if any(find_spec(module) is None for module in NEEDED):
         raise click.UsageError("the page needs an extra: pip install 'busmaster[web]'")
-    from busmaster.doors.web import serve
+    from busmaster.interfaces.web import serve
 
     listen, secrets = place_of(bind), {} if token_file is None else read_tokens(token_file)
     for host in hosts:

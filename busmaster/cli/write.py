@@ -10,6 +10,9 @@ from typing import Any
 
 import click
 
+from busmaster import ext
+from busmaster.authorisation.authorisation import Wish
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.handle import Send
 from busmaster.bus.points import Point
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
@@ -23,8 +26,6 @@ from busmaster.cli.protocols import ItemCommand
 from busmaster.cli.reaching import owner_of, reach, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import InvalidCommand
-from busmaster.gate.gate import Wish
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.values import utc
 from busmaster.registry import find
 from busmaster.service.remote import connect
@@ -86,10 +87,10 @@ async def write(
     bus = reach(connection)
     handle = connection.open_handle(bus, address)
     if decimals is not None:
-        items = (name for item, values in pairs for name in handle.run_items(item.partition(":")[0], len(values)))
+        items = (name for item, values in pairs for name in ext.run_items(handle, item.partition(":")[0], len(values)))
         with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
         handle = replace(connection, options=with_decimals).open_handle(bus, address)
-    prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
+    prepared = [(item, ext.prepare_write(handle, item, values, verify=verify)) for item, values in pairs]
     async with bus, late_nodes(bus):
         for item, sends in prepared:
             for send in sends:
@@ -101,7 +102,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     """Write the pairs to points of a line, as `write` does, and have its outputs keep a record of each."""
     audit = line.audit(note)  # first: nothing is written of which no record can be kept
     records: list[WriteRecord] = []
-    line.gate.record = records.append
+    line.authorisation.record = records.append
     try:
         prepared = [prepare(line, name, values, verify) for name, values in pairs]
         async with line.bus, late_nodes(line.bus, in_file=True):
@@ -129,14 +130,14 @@ def tell(name: str, as_json: bool, **fields: Any) -> None:
 
 async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
     """Write one point, of which a record is kept."""
-    with line.gate.begin(wish):
+    with line.authorisation.begin(wish):
         await send()
 
 
 def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> Wish:
     """Return what a person wants to have written; without a point, to what is none of the line."""
     value = values[0] if len(values) == 1 else tuple(values)
-    return Wish(door="command line", by="busmaster write", name=name, point=point, value=value)
+    return Wish(interface="command line", by="busmaster write", name=name, point=point, value=value)
 
 
 def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> tuple[Wish, Send]:
@@ -149,5 +150,5 @@ def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bo
         wish = wish_of(name, values, line.point(name))
         return wish, line.prepare_write(name, values, verify=verify)
     except InvalidCommand as error:
-        line.gate.refuse(wish, str(error))
+        line.authorisation.refuse(wish, str(error))
         raise

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from busmaster.config.checking import Report, check
 from busmaster.config.emulated import emulated_line, line_settings
 from busmaster.config.line import ConfiguredLine, open_line
+from busmaster.config.migrating import migration
 from busmaster.config.sections import LineFile, load
 from busmaster.config.source import FileError
 
-__all__ = ["ConfiguredLine", "FileError", "LineFile", "emulated_line", "line_settings", "load", "open_line"]
+__all__ = [
+    "ConfiguredLine",
+    "FileError",
+    "LineFile",
+    "Report",
+    "check",
+    "emulated_line",
+    "line_settings",
+    "load",
+    "migration",
+    "open_line",
+]

@@ -1,4 +1,4 @@
-"""What `[service]` says of users, groups and tokens, as the gate of its line holds it."""
+"""What `[service]` says of users, groups and tokens, as authorisation of its line holds it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Hashable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Any, Protocol
 
+from busmaster.authorisation.permission import Access, Permission
 from busmaster.bus.handle import Handle
 from busmaster.bus.points import Point
 from busmaster.config.service import RoleSection, ServiceSection
 from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
-from busmaster.gate.permission import Access, Permission
 
 ALL = "*"
 
@@ -42,7 +42,7 @@ def _permission(role: RoleSection, names: Names) -> Permission:
         return Permission(role.who, role.role)
     only: dict[tuple[str, int], frozenset[Hashable] | None] = {}
     for number, text in enumerate(role.only):
-        with role.table.at("allow_writes", number):
+        with role.table.part(), role.table.at("allow_writes", number):
             for (protocol, address), places in _places(text, names):
                 before = only.get((protocol, address), frozenset())
                 only[protocol, address] = None if before is None or places is None else before | places

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 
+from busmaster import ext
 from busmaster.config.line import decimals_of
 from busmaster.config.names import expanded
 from busmaster.config.point_section import PointSection
@@ -62,7 +63,7 @@ def _device(file: LineFile, name: str) -> Device:
 
 def _hold(device: Device, node: NodeSection, key: str, values: tuple[float, ...]) -> None:
     """Have the device hold values of what the file calls so, as `busmaster run` will show them."""
-    named = {name: number for number, name in node.kind.handle.names_of_items().items()}
+    named = {name: number for number, name in ext.names_of_items(node.kind.handle).items()}
     named |= {name: str(address) for name, address in node.options.get("symbols", {}).items()}
     known = {*node.points, *named}
     for name in expanded(key, known):

@@ -76,12 +76,13 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
     # of its own each: faults are set anew while a line is emulated
     sections = {name: replace(every, faults=_faults(shared, {})) for name in nodes}
     for one in table.tables("nodes"):
-        with one.at():
-            names = list(expanded(one.name, nodes))
-        for name in names:
-            if name not in nodes:
-                raise one.error(f"no such node {name!r}; {meant(name, nodes)}")
-            sections[name] = _changed(sections[name], one, nodes[name], shared)
+        with one.part():
+            with one.at():
+                names = list(expanded(one.name, nodes))
+            for name in names:
+                if name not in nodes:
+                    raise one.error(f"no such node {name!r}; {meant(name, nodes)}")
+                sections[name] = _changed(sections[name], one, nodes[name], shared)
     return EmulatorSection(paced=table.flag("paced", True), seed=table.whole("seed", 1), nodes=sections)
 
 
@@ -107,7 +108,7 @@ def _faults(table: Table, base: Mapping[str, Any]) -> Faults:
     """Return the faults of the table over `base`."""
     table.only(*NAMES)
     faults = Faults()
-    for name, rate in {**base, **{name: table.number(name) for name in table.data}}.items():
+    for name, rate in {**base, **{name: table.number(name) for name in table.data if name in NAMES}}.items():
         with table.at(name):
             setattr(faults, name, rate)
     return faults

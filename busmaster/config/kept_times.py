@@ -18,12 +18,13 @@ from typing import Any
 
 import anyio
 
+from busmaster import ext
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.files import open_file, read_file
 
-VERSION = 1
+VERSION = 2
 """Of the file's form. Another one is started anew."""
 KEEP_EVERY = 600.0
 """Seconds from one keeping to the next, while the line runs."""
@@ -62,7 +63,7 @@ class KeptTimes:
         self._path, self._nodes = path, dict(nodes)
         for name, node in fresh.items():
             if name in self._known and self._known[name]["settings"] == self._settings(node):
-                node.begin_with(_times(self._known[name]))
+                ext.begin_with(node, _times(self._known[name]))
         if path is not None and self._keeping is None:
             self._keeping = asyncio.ensure_future(self._keep_often())
         self._say()
@@ -89,7 +90,7 @@ class KeptTimes:
         for number, (name, node) in enumerate(list(self._nodes.items())):
             if number % SLICE == SLICE - 1:
                 await asyncio.sleep(0)
-            if times := node.times_to_keep():
+            if times := ext.times_to_keep(node):
                 kept[name] = {"settings": self._settings(node), "times": [asdict(each) for each in times]}
         await asyncio.to_thread(self._do, NOT_KEPT, self._write, path, kept)
         self._say()
@@ -161,7 +162,7 @@ def _times(node: Any) -> list[LearnedTimes]:
     """Return what a file says of one node. Raises ValueError, TypeError or KeyError for what cannot be."""
     found = [LearnedTimes(**said) for said in node["times"]]
     for times in found:
-        seconds = (times.slowest, times.heard, times.pause, times.window)
+        seconds = (times.slowest, times.received, times.pause, times.window)
         if not (type(times.kind) is str and type(times.packet) is type(times.trusted) is bool):
             raise ValueError("a kind is a text, packet and trusted are true or false")
         if not all(type(time) in (int, float) and 0 <= time < math.inf for time in seconds):

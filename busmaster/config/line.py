@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from operator import is_
 from types import TracebackType
 from typing import Any, Unpack
 
+from busmaster import ext
 from busmaster.arbiter.tap import Tap
+from busmaster.authorisation.authorisation import Authorisation
 from busmaster.bounds import MOST_MEMBERS
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle, Send
@@ -28,14 +31,13 @@ from busmaster.config.safe import SafeState, SafeWrite
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
-from busmaster.gate.gate import Gate
 from busmaster.outputs.distributor import Distributor, Wanted
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
 
 KEEPING_AUDIT = ("jsonl", "sqlite", "mqtt")
-"""The outputs that keep a record of writes."""
+"""The outputs that keep an audit log."""
 
 
 class ConfiguredLine:
@@ -44,9 +46,9 @@ class ConfiguredLine:
     `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError, which
     names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
     sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
-    happens to the outputs. `read_only` lets nothing from outside be written: `gate` is what all of that passes. With
-    `wait_for_port` a port that cannot be opened yet is no error. One that never `asks` is not entered: its outputs,
-    fed with what another master hears, say nothing of the state of line and nodes.
+    happens to the outputs. `read_only` lets nothing from outside be written: `authorisation` is what all of that
+    passes. With `wait_for_port` a port that cannot be opened yet is no error. One that never `asks` is not entered: its
+    outputs, fed with what another master hears, say nothing of the state of line and nodes.
     """
 
     def __init__(
@@ -63,17 +65,22 @@ class ConfiguredLine:
     ) -> None:
         self.file = file
         self.bus = Bus(port or file.port, tap=tap, strict=file.strict, wait_for_port=wait_for_port)
-        self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
+        self.nodes: dict[str, Handle] = {}
+        for name, node in file.nodes.items():
+            with node.table.part():
+                self.nodes[name] = self._handle(node)
+        if len(self.nodes) < len(file.nodes):  # problems are collected
+            self.file = replace(file, nodes={name: file.nodes[name] for name in self.nodes})
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
         self._limits = list(self._held_limits())
         self._wanted = self._members_of_groups()
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
-        self.gate = Gate(self.bus, read_only=read_only, access=access_of(file.service, self))
-        self.gate.safe_state = self.safe_state
-        self.outputs = Distributor(self.bus, tell, gate=self.gate, asks=asks)
+        self.authorisation = Authorisation(self.bus, read_only=read_only, access=access_of(file.service, self))
+        self.authorisation.safe_state = self.safe_state
+        self.outputs = Distributor(self.bus, tell, authorisation=self.authorisation, asks=asks)
         self._kept_times = KeptTimes(self.bus, self._tell)
-        self.gate.record = self.outputs.record
+        self.authorisation.record = self.outputs.record
         if outputs:
             self._add_outputs()
 
@@ -93,7 +100,7 @@ class ConfiguredLine:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Close the line first; the outputs then have a few seconds to write what they still hold."""
-        self.gate.leaving = True
+        self.authorisation.leaving = True
         try:
             await self.bus.__aexit__(kind, error, traceback)
         finally:
@@ -119,8 +126,8 @@ class ConfiguredLine:
             node.lift(limit)
         self._wanted = self._members_of_groups()
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
-        self.gate.safe_state = self.safe_state
-        self.gate.access = access_of(file.service, self, self.gate.access.secrets)
+        self.authorisation.safe_state = self.safe_state
+        self.authorisation.access = access_of(file.service, self, self.authorisation.access.secrets)
         for name, group in list(self.groups.items()):
             same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]
             # by identity: points are equal whatever their scale and unit, which may be what changed
@@ -168,11 +175,11 @@ class ConfiguredLine:
                 raise InvalidCommand(f"{name} does not take {len(values)} values: {error}") from None
         handle = self.handle(point.where, bus)
         # one call, whatever it takes on the line: half of it must not be taken for nothing, or for the whole
-        [send] = handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
+        [send] = ext.prepare_write(handle, point.source.item, list(map(point.unscaled, values)), **options)
         return send
 
     def audit(self, tell: Callable[[str], None] = lambda _: None) -> Distributor:
-        """Return those outputs of the file that keep a record of writes, for a process that polls nothing.
+        """Return those outputs of the file that keep an audit log, for a process that polls nothing.
 
         They are not started, say nothing of the line's state, and take in no commands. Raises InvalidCommand if an
         extra is missing.
@@ -231,9 +238,9 @@ class ConfiguredLine:
             own = Node.of(handle)
             _use_sync_reads(node, handle)
             if node.reply_time is not None:
-                own.reply_time = node.reply_time  # until it is measured
+                ext.set_reply_time(own, node.reply_time)  # until it is measured
             if not is_decimal(node.name):
-                own.rename(node.name)  # what messages and the screen call it
+                ext.rename(own, node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
                 source = handle.point(point.item)  # looked up for its complaint, which has the line here
@@ -246,7 +253,7 @@ class ConfiguredLine:
         for node in self.file.nodes.values():
             for name, section in node.points.items():
                 if section.limited:
-                    with section.table.at():
+                    with section.table.part(), section.table.at():
                         point = self._point(node.name, name)
                         limit = point.limit(
                             minimum=section.minimum,
@@ -261,10 +268,13 @@ class ConfiguredLine:
         wanted: dict[str, tuple[NamedPoint, ...]] = {}
         left = MOST_MEMBERS
         for group in self.file.groups.values():
-            wanted[group.name] = members = tuple(islice(self._members(group), left + 1))
-            if len(members) > left:
-                raise group.table.error(f"the groups of a line have {MOST_MEMBERS} points at most", "points")
-            left -= len(members)
+            wanted[group.name] = ()
+            with group.table.part():
+                members = tuple(islice(self._members(group), left + 1))
+                if len(members) > left:
+                    raise group.table.error(f"the groups of a line have {MOST_MEMBERS} points at most", "points")
+                left -= len(members)
+                wanted[group.name] = members
         return wanted
 
     def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
@@ -334,11 +344,12 @@ class ConfiguredLine:
         section = self.file.safe
         table = section.table.table("writes")
         known: dict[object, str] = {}
-        for name in section.repeatable:
-            if name not in section.writes:
-                raise section.table.error(f"{name} is not among the writes", "repeatable")
+        with section.table.part():
+            for name in section.repeatable:
+                if name not in table.data:
+                    raise section.table.error(f"{name} is not among the writes", "repeatable")
         for name, value in section.writes.items():
-            with table.at(name):
+            with table.part(), table.at(name):
                 point = self.point(name)
                 other = known.setdefault(point.quantity, name)
                 if other != name:
@@ -348,20 +359,23 @@ class ConfiguredLine:
 
     def _add_outputs(self) -> None:
         for kind, wanted in self._wanted_outputs():
-            with self.file.table.table("outputs").table(kind).at():
+            table = self.file.table.table("outputs").table(kind)
+            with table.part(), table.at():
                 self.outputs.add(kind, wanted.settings, commands=wanted.commands)
 
     def _wanted_outputs(self) -> Iterator[tuple[str, Wanted]]:
         for kind, settings in self.file.outputs.items():
             table = self.file.table.table("outputs").table(kind)
-            for group in settings.groups or self._wanted:
-                check_takes(table, settings, group, {point.key: self._sort(point) for point in self._wanted[group]})
-            writable: dict[str, Point[Any]] = {}
-            if isinstance(settings, MqttSettings):
-                for number, text in enumerate(settings.allow_commands):
-                    with table.at("allow_commands", number):
-                        writable |= {point.key: point for point in map(self._writable, self._names(text))}
-            yield kind, Wanted(settings, writable)
+            with table.part():
+                for group in settings.groups or self._wanted:
+                    points = self._wanted.get(group, ())  # a group with a problem has none
+                    check_takes(table, settings, group, {point.key: self._sort(point) for point in points})
+                writable: dict[str, Point[Any]] = {}
+                if isinstance(settings, MqttSettings):
+                    for number, text in enumerate(settings.allow_commands):
+                        with table.at("allow_commands", number):
+                            writable |= {point.key: point for point in map(self._writable, self._names(text))}
+                yield kind, Wanted(settings, writable)
 
     def _sort(self, point: NamedPoint) -> str:
         node = self.file.nodes[point.where]

@@ -19,8 +19,8 @@ from busmaster.errors import InvalidCommand
 class Scale:
     """What a number on the line means: value = number / 10**decimals x factor + offset.
 
-    Reckoned in whole numbers and divided once, so that 3 x 0.1 is 0.3; of a number with decimals 15 digits are kept, so
-    that 14.2953 x 0.001 is 0.0142953. `whole`: the line carries whole numbers, to which a written value is rounded,
+    Calculated in whole numbers and divided once, so that 3 x 0.1 is 0.3; of a number with decimals 15 digits are kept,
+    so that 14.2953 x 0.001 is 0.0142953. `whole`: the line carries whole numbers, to which a written value is rounded,
     half away from zero.
     """
 

@@ -128,7 +128,7 @@ class _RowPlace(Source):
 
     def error(self, key: Key, text: str) -> FileError:
         column = f", column {key[1]}" if len(key) > 1 else f", column {POINT}" if key else ""
-        return FileError(f"{self.name}: row {self._number}{column}: {' '.join([*map(str, key[2:]), text])}")
+        return FileError(self.name, 0, "", f"row {self._number}{column}: {' '.join([*map(str, key[2:]), text])}")
 
 
 class _Incoming:

@@ -33,19 +33,23 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
         for key in ("path", "spill"):
             path = getattr(settings, key, None)
             if path is not None and taken.setdefault(path, f"{kind}.{key}") != f"{kind}.{key}":
-                raise table.table(kind).error(f"{taken[path]} is that file already", key)
+                with table.part():
+                    raise table.table(kind).error(f"{taken[path]} is that file already", key)
     return outputs
 
 
 def _enabled(outer: Table, groups: Collection[str]) -> Iterator[tuple[str, Settings]]:
     for table in outer.each():
-        kind = KINDS[table.name]
-        readers: Readers = {**READERS, "groups": partial(_groups, known=groups)}
-        said = table.typed(kind, "enabled", readers=readers, without=WITHOUT.get(table.name, ()))
-        with table.at():
-            settings = kind(**said)
-        if table.flag("enabled", True):
-            yield table.name, settings
+        kind = KINDS.get(table.name)
+        if kind is None:
+            continue  # it was refused above
+        with table.part():
+            readers: Readers = {**READERS, "groups": partial(_groups, known=groups)}
+            said = table.typed(kind, "enabled", readers=readers, without=WITHOUT.get(table.name, ()))
+            with table.at():
+                settings = kind(**said)
+            if table.flag("enabled", True):
+                yield table.name, settings
 
 
 def check_takes(table: Table, settings: Settings, group: str, points: Mapping[str, str]) -> None:

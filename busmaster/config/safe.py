@@ -16,6 +16,10 @@ from dataclasses import dataclass, field
 
 import anyio
 
+from busmaster import ext
+from busmaster.authorisation.authorisation import Authorisation, Wish, outcome_of
+from busmaster.authorisation.permission import Permission
+from busmaster.authorisation.record import Outcome
 from busmaster.bounds import LONGEST_SAFE_STATE
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle, Send
@@ -26,9 +30,6 @@ from busmaster.config.points import NamedPoint
 from busmaster.config.table import Table
 from busmaster.contract.exchange import Command
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
-from busmaster.gate.gate import Gate, Wish, outcome_of
-from busmaster.gate.permission import Permission
-from busmaster.gate.record import Outcome
 
 WITHIN = 2.0
 LOOK_AGAIN = 0.05
@@ -76,8 +77,11 @@ def read_safe(table: Table) -> SafeSection:
     if not 0 < within <= LONGEST_SAFE_STATE:
         raise table.error(f"must be more than 0 and at most {LONGEST_SAFE_STATE:g} seconds, not {within}", "within")
     values = table.table("writes")
-    writes = {name: _one(values, name) for name in values.data}
-    if table.data and not writes:
+    writes: dict[str, float] = {}
+    for name in values.data:
+        with values.part():
+            writes[name] = _one(values, name)
+    if table.data and not values.data:
         raise table.error('a safe state is of writes: writes = { "NODE/ITEM" = VALUE }')
     return SafeSection(within, table.texts("repeatable", ()), writes, table)
 
@@ -122,7 +126,8 @@ class SafeWrite:
         item, number = point.source.item, point.unscaled(value)
 
         def prepare(within: float) -> Send:
-            [send] = handle.prepare_write(
+            [send] = ext.prepare_write(
+                handle,
                 item,
                 [number],
                 priority=Priority.URGENT,
@@ -159,7 +164,7 @@ class SafeState:
             "",
         )
 
-    async def enter(self, gate: Gate, by: str, *, leaving: bool = True) -> dict[str, BusError | None]:
+    async def enter(self, authorisation: Authorisation, by: str, *, leaving: bool = True) -> dict[str, BusError | None]:
         """Send all, urgently, read them back, and return by point why it was not confirmed, None if it was.
 
         From now on the bus takes no other write; unless the line is not left (`leaving`): then it does so afterwards,
@@ -168,21 +173,21 @@ class SafeState:
         """
         if not self.writes:
             return {}
-        take_writes_again = gate.bus.take_only_safe_writes()
+        take_writes_again = ext.take_only_safe_writes(authorisation.bus)
         try:
             for write in self.writes:
                 write.node.note_stop()
-            return await self._send(gate, by)
+            return await self._send(authorisation, by)
         finally:
             if not leaving:
                 take_writes_again()
 
-    async def _send(self, gate: Gate, by: str) -> dict[str, BusError | None]:
-        bus = gate.bus
+    async def _send(self, authorisation: Authorisation, by: str) -> dict[str, BusError | None]:
+        bus = authorisation.bus
         deadline = bus.now() + self.within
         by_node: dict[Node, list[Leaving]] = {}
         for write in self.writes:
-            by_node.setdefault(write.node, []).append(Leaving(write, gate, by))
+            by_node.setdefault(write.node, []).append(Leaving(write, authorisation, by))
         leaving = [one for ones in by_node.values() for one in ones]
         try:
             with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
@@ -200,11 +205,13 @@ class SafeState:
 class Leaving:
     """One write of the safe state on its way. `error` is why it is not confirmed yet, None once it is."""
 
-    def __init__(self, write: SafeWrite, gate: Gate, by: str) -> None:
+    def __init__(self, write: SafeWrite, authorisation: Authorisation, by: str) -> None:
         self.write = write
         self.error: BusError | None = NotStarted("not sent in time", node=write.node)
         key = write.point.key
-        self._passage = gate.begin(Wish(door="safe", by=by, name=key, point=write.point, value=write.value))
+        self._passage = authorisation.begin(
+            Wish(interface="safe", by=by, name=key, point=write.point, value=write.value)
+        )
 
     async def try_once(self, within: float) -> bool:
         """Write it and read it back, and return whether it is over: confirmed, or nothing can be sent any more."""

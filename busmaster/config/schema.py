@@ -45,7 +45,7 @@ TCP = {
 }
 POINT = {
     "item": "The ITEM that it is, as on the command line. The point's own name by default.",
-    "unit": "The unit of its value: a name, which nothing is reckoned with.",
+    "unit": "The unit of its value: a name, which nothing is calculated with.",
     "factor": "value = number on the line x factor + offset.",
     "offset": "See `factor`.",
     "decimals": "How many of the number's last digits are decimals, where the line carries no point.",

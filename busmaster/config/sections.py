@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 from busmaster.arbiter.transaction import Poll, Priority
 from busmaster.bounds import LONGEST_PERIOD, LONGEST_TIMING, LONGEST_TITLE, MOST_RETRIES, SHORTEST_PERIOD
@@ -33,6 +34,10 @@ from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
+T = TypeVar("T")
+
+NO_PORT = TcpPort("127.0.0.1", 1)
+"""Stands for a port that cannot be read, where all problems of a file are collected. It is never opened."""
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 KEYS = (
     Key("title", "text", "What the line is called: in lists, views and pages. The file's name by default."),
@@ -139,6 +144,11 @@ class NodeSection:
     def profile(self) -> Profile:
         return self.kind.profile
 
+    @property
+    def could_learn(self) -> bool:
+        """Whether reply times could be learned of it, and are not."""
+        return self.profile.checked_requests and not isinstance(self.timings, Learned)
+
 
 @dataclass(frozen=True, slots=True)
 class GroupSection:
@@ -182,25 +192,42 @@ def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
     top.only(*names_of(KEYS))
-    nodes = {node.name: node for node in _nodes(top, _defaults(top))}
-    groups = {table.name: _group(table) for table in top.tables("groups")}
+    no_nodes: dict[str, NodeSection] = {}
+    nodes = _value(top, _nodes, no_nodes)
+    no_port: SerialPort | TcpPort = NO_PORT
+    profiles = _profiles(top)
+    may_read_port = profiles or not source.unread  # without a protocol it would miss a baud rate
     file = LineFile(
         path=source.name,
-        title=_title(top),
-        strict=top.flag("strict", False),
-        learned=_learned(top, nodes.values()),
-        port=read_port(top, [node.profile for node in nodes.values()]),
+        title=_value(top, _title, ""),
+        strict=_value(top, lambda top: top.flag("strict", False), False),
+        learned=_value(top, partial(_learned, nodes=nodes.values()), None),
+        port=_value(top, partial(read_port, profiles=profiles), no_port) if may_read_port else no_port,
         nodes=nodes,
-        groups=groups,
-        outputs=read_outputs(top.table("outputs"), groups),
-        safe=read_safe(top.table("safe")),
-        service=read_service(top.table("service")),
-        emulator=read_emulator(top.table("emulator"), {node.name: node.kind for node in nodes.values()}),
+        groups=_value(top, _groups, {}),
+        outputs=top.read("outputs", partial(read_outputs, groups=top.table("groups").data)),
+        safe=top.read("safe", read_safe),
+        service=top.read("service", read_service),
+        emulator=top.read("emulator", partial(read_emulator, nodes={node.name: node.kind for node in nodes.values()})),
         table=top,
     )
-    if not nodes:
-        raise top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]")
+    if not top.table("nodes").data:
+        source.keep((), top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]"))
     return file
+
+
+def _value(top: Table, read: Callable[[Table], T], instead: T) -> T:
+    """Return what `read` makes of a part of the file; `instead` if it has a problem and problems are collected."""
+    found = [instead]
+    with top.part():
+        found.append(read(top))
+    return found[-1]
+
+
+def _profiles(top: Table) -> list[Profile]:
+    """Return the profiles of the protocols that the file's nodes name."""
+    named = {node.get("protocol") for node in top.table("nodes").data.values() if isinstance(node, dict)}
+    return [kind.profile for name, kind in kinds().items() if name in named]
 
 
 def _title(top: Table) -> str:
@@ -214,7 +241,8 @@ def _learned(top: Table, nodes: Iterable[NodeSection]) -> str | None:
     """Read where learned reply times are kept from one run to the next."""
     path = top.text("learned", None)
     if path is not None:
-        if not any(isinstance(node.timings, Learned) for node in nodes):
+        learns = any(isinstance(node.timings, Learned) for node in nodes)
+        if not learns and not top.source.unread:  # a node that could not be read may be one that learns
             raise top.error(f'no reply times are learned: say timing = "{LEARNED_WORD}" too', "learned")
         with top.at("learned"):
             check_folder(path)
@@ -226,31 +254,35 @@ def _learned(top: Table, nodes: Iterable[NodeSection]) -> str | None:
 
 def _defaults(top: Table) -> dict[str, Table]:
     """Read `[protocols.hcp2]`: what holds for all nodes of one protocol that do not say otherwise."""
-    tables = {table.name: table for table in top.tables("protocols")}
     top.table("protocols").only(*kinds())
+    tables = {table.name: table for table in top.tables("protocols") if table.name in kinds()}
     for protocol, table in tables.items():
         common = (option.name for option in find(protocol).options if option.common)
         table.only(*names_of(SHARED_KEYS), *common)
     return tables
 
 
-def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
+def _nodes(top: Table) -> dict[str, NodeSection]:
+    """Read `[nodes]`, and return the nodes by name."""
+    no_defaults: dict[str, Table] = {}
+    defaults = _value(top, _defaults, no_defaults)
+    learned = _value(top, lambda top: top.choice("timing", (LEARNED_WORD,), None) is not None, False)
+    nodes: dict[str, NodeSection] = {}
     taken: dict[tuple[str, int], str] = {}
-    names: set[str] = set()
     profiles: dict[str, Profile] = {}
-    learned = top.choice("timing", (LEARNED_WORD,), None) is not None
     for table in top.tables("nodes"):
-        for node in _several(table, defaults, learned):
-            with table.at("protocol"):
-                check_company(node.profile, profiles.values())
-            profiles.setdefault(node.profile.name, node.profile)
-            if node.name in names:
-                raise table.error(f"there are two nodes {node.name!r}")
-            names.add(node.name)
-            other = taken.setdefault((node.profile.name, node.address), node.name)
-            if other != node.name:
-                raise table.error(f"node {other!r} has address {node.address} already", "address")
-            yield node
+        with table.part():
+            for node in _several(table, defaults, learned):
+                with table.at("protocol"):
+                    check_company(node.profile, profiles.values())
+                profiles.setdefault(node.profile.name, node.profile)
+                if node.name in nodes:
+                    raise table.error(f"there are two nodes {node.name!r}")
+                other = taken.setdefault((node.profile.name, node.address), node.name)
+                if other != node.name:
+                    raise table.error(f"node {other!r} has address {node.address} already", "address")
+                nodes[node.name] = node
+    return nodes
 
 
 def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iterator[NodeSection]:
@@ -328,6 +360,15 @@ def _no_address(text: str) -> int:
 
 
 # groups
+
+
+def _groups(top: Table) -> dict[str, GroupSection]:
+    """Read `[groups]`, and return the poll groups by name."""
+    groups: dict[str, GroupSection] = {}
+    for table in top.tables("groups"):
+        with table.part():
+            groups[table.name] = _group(table)
+    return groups
 
 
 def _group(table: Table) -> GroupSection:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import grp
 import os
 import pwd
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
+from busmaster.authorisation.permission import digest_of
+from busmaster.authorisation.rights import RIGHTS, Role
 from busmaster.bounds import LONGEST_FILE, SHORTEST_TOKEN
 from busmaster.config.keys import REQUIRED, Key, names_of
 from busmaster.config.names import NODE_NAME
@@ -17,9 +20,9 @@ from busmaster.config.table import Table
 from busmaster.contract.arguments import host_and_port
 from busmaster.errors import InvalidCommand
 from busmaster.files import check_regular
-from busmaster.gate.permission import digest_of
-from busmaster.gate.rights import RIGHTS, Role
 from busmaster.service.tcp import check_listening
+
+K = TypeVar("K")
 
 MODE = 0o600
 ROLES = tuple(role.value for role in Role)
@@ -124,12 +127,13 @@ def read_service(table: Table) -> ServiceSection:
     mode = read_mode(table, "mode") if "mode" in table else MODE if group is None else 0o660
     token_file = table.text("token_file", None)
     listen = None
-    if "listen" in table:
-        with table.at("listen"):
-            listen = host_and_port(table.text("listen"))
-            check_listening(listen, tokens=token_file is not None)
-    elif token_file is not None:
-        raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
+    with table.part():
+        if "listen" in table:
+            with table.at("listen"):
+                listen = host_and_port(table.text("listen"))
+                check_listening(listen, tokens=token_file is not None)
+        elif token_file is not None:
+            raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
     share = table.number("share", 1.0)
     if not LEAST_SHARE <= share <= MOST_SHARE:
         raise table.error(f"must be {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share:g}", "share")
@@ -140,11 +144,20 @@ def read_service(table: Table) -> ServiceSection:
         share=share,
         listen=listen,
         token_file=token_file,
-        users={_user(each): _role(each, "user") for each in table.tables("users")},
-        groups={_group(each, None, each.name): _of_group(each, mode) for each in table.tables("groups")},
-        tokens={_token(each, token_file): _role(each, "token") for each in table.tables("tokens")},
+        users=_roles(table, "users", lambda each: (_user(each), _role(each, "user"))),
+        groups=_roles(table, "groups", lambda each: (_group(each, None, each.name), _of_group(each, mode))),
+        tokens=_roles(table, "tokens", lambda each: (_token(each, token_file), _role(each, "token"))),
         table=table,
     )
+
+
+def _roles(table: Table, key: str, read: Callable[[Table], tuple[K, RoleSection]]) -> dict[K, RoleSection]:
+    """Read `[service.users]`, say, and return the role of each of them."""
+    roles: dict[K, RoleSection] = {}
+    for each in table.tables(key):
+        with each.part():
+            name, roles[name] = read(each)
+    return roles
 
 
 def _role(table: Table, kind: str) -> RoleSection:

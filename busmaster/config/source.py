@@ -35,7 +35,21 @@ AT = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
 
 
 class FileError(InvalidCommand):
-    """Something is wrong in a file; the text says where."""
+    """Something is wrong in a file. The text begins with the place.
+
+    `file` is the path, `line` counts from 1, `key` is the way to the value ("nodes.winder.address"), and `what` is the
+    problem alone. `line` is 0, and `key` "", where the problem is one of the file as a whole. `way` is `key` as a
+    tuple.
+    """
+
+    def __init__(self, file: str, line: int, key: str, what: str, way: Key = ()) -> None:
+        place = f"{file}:{line}" if line else file
+        super().__init__(f"{place}: {key}: {what}" if key else f"{place}: {what}")
+        self.file = file
+        self.line = line
+        self.key = key
+        self.what = what
+        self.way = way
 
 
 class Source:
@@ -52,7 +66,11 @@ class Source:
             found = AT.search(str(error))
             line = (found and found[1]) or len(text.splitlines())  # "at end of document" has no number
             what = AT.sub("", str(error))
-            raise FileError(f"{name}:{line}: this is no TOML: {what[:1].lower()}{what[1:]}") from None
+            raise FileError(name, int(line), "", f"this is no TOML: {what[:1].lower()}{what[1:]}") from None
+        self.problems: dict[Key, list[FileError]] | None = None
+        """Where this is a dict, problems are collected in it, by the part of the file that has them; see `keep`."""
+        self.unread: set[Key] = set()
+        """The parts that could not be read to their end, where problems are collected."""
         self._places = places(text.replace("\r\n", "\n"))  # as tomllib itself reads it
 
     @classmethod
@@ -63,7 +81,7 @@ class Source:
             return cls(name, read_file(path).decode())
         except UnicodeDecodeError as error:
             line = error.object[: error.start].count(b"\n") + 1
-            raise FileError(f"{name}:{line}: this is no TOML: it is not written in UTF-8") from None
+            raise FileError(name, line, "", "this is no TOML: it is not written in UTF-8") from None
 
     def beside(self, name: str) -> Path:
         """Return the path of a file that this one names: from its own folder, where it is not absolute."""
@@ -78,7 +96,18 @@ class Source:
     def error(self, key: Key, text: str) -> FileError:
         """Return an error of what is wrong at `key`, with its place: "line.toml:12: nodes.winder.address: ..."."""
         shown = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
-        return FileError(f"{self.name}:{self.line(key)}: {shown}: {text}" if key else f"{self.name}: {text}")
+        return FileError(self.name, self.line(key) if key else 0, shown, text, key)
+
+    def keep(self, part: Key, error: FileError) -> None:
+        """Collect a problem of one part of the file, and return; raise it where problems are not collected.
+
+        `load` and `open_line` stop at the first problem. `busmaster check` reads on, and reports all of them.
+        """
+        if self.problems is None:
+            raise error
+        known = self.problems.setdefault(part, [])
+        if all((error.file, error.key or error.what) != (one.file, one.key or one.what) for one in known):
+            known.append(error)
 
 
 def check_bounds(name: str, text: str) -> None:
@@ -92,15 +121,16 @@ def check_bounds(name: str, text: str) -> None:
     for match in TOKEN.finditer(text):
         kind, token = match.lastgroup, match[0]
         if kind == "string" and len(token) > LONGEST_TEXT:
-            raise FileError(f"{name}:{line}: a text has {LONGEST_TEXT} characters at most, not {len(token)}")
+            raise FileError(name, line, "", f"a text has {LONGEST_TEXT} characters at most, not {len(token)}")
         if kind == "bare" and len(token) > LONGEST_WORD:
-            raise FileError(f"{name}:{line}: a number or a key has {LONGEST_WORD} characters at most, not {len(token)}")
+            what = f"a number or a key has {LONGEST_WORD} characters at most, not {len(token)}"
+            raise FileError(name, line, "", what)
         if kind == "mark":
             brackets += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token, 0)
         if kind in ("mark", "newline"):
             names = names + 1 if token == "." else 1
         if max(brackets, names) > MOST_NESTED:
-            raise FileError(f"{name}:{line}: this is nested more than {MOST_NESTED} levels deep: no key needs that")
+            raise FileError(name, line, "", f"this is nested more than {MOST_NESTED} levels deep: no key needs that")
         line += token.count("\n")
 
 

@@ -12,6 +12,7 @@ from busmaster.bounds import LARGEST_WHOLE
 from busmaster.config.source import FileError, Key, Source
 from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
+from busmaster.renames import now_called
 
 T = TypeVar("T")
 Readers: TypeAlias = Mapping[str, "Callable[[Table, str], Any]"]
@@ -44,11 +45,29 @@ class Table:
         """Refuse other keys. Raises FileError for a key that is none of these."""
         for key in self.data:
             if key not in known:
-                raise self.error(f"no such key; {meant(key, known)}", key)
+                self.source.keep(self.key, self.error(f"no such key; {self._meant(key, known)}", key))
+
+    def _meant(self, key: str, known: tuple[str, ...]) -> str:
+        new = now_called(key, known)
+        if new is None:
+            return meant(key, known)
+        return f"it is now {new!r}: `busmaster migrate {self.source.name} --write` changes all old names of the file"
 
     def error(self, text: str, *way: str | int) -> FileError:
         """Return an error with the place of this table, or of what `way` leads to in it."""
         return self.source.error((*self.key, *way), text)
+
+    @contextmanager
+    def part(self) -> Iterator[None]:
+        """Read a part of the file inside that stands for itself: with a problem in it, the others can still be read.
+
+        Raises FileError, unless the problems of the source are collected.
+        """
+        try:
+            yield
+        except FileError as error:
+            self.source.keep(self.key, error)
+            self.source.unread.add(self.key)
 
     @contextmanager
     def at(self, *way: str | int) -> Iterator[None]:
@@ -201,7 +220,21 @@ class Table:
 
     def each(self) -> Iterator[Table]:
         """Return each of the tables in this one."""
-        return map(self.table, self.data)
+        for key in self.data:
+            with self.part():
+                yield self.table(key)
+
+    def read(self, key: str, read: Callable[[Table], T]) -> T:
+        """Return what `read` makes of the table under this key.
+
+        Where problems are collected, and there is one, it is read as if the file had left the table out.
+        """
+        found: list[T] = []
+        with self.part():
+            table = self.table(key)
+            with table.part():
+                found.append(read(table))
+        return found[0] if found else read(Table(self.source, (*self.key, key), {}))
 
     def _path(self, key: str) -> str:
         return ".".join(str(part) for part in (*self.key, key))

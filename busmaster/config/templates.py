@@ -25,7 +25,7 @@ from busmaster.config.table import Table
 from busmaster.contract.arguments import guess
 from busmaster.registry import NodeKind, kinds
 
-FOLDER = Path(__file__).parent.parent / "templates"
+FOLDERS = Path(__file__).parent.parent / "protocols"
 SUFFIX = ".toml"
 KEYS = (
     Key("title", "text", "What it is a template of, for people."),
@@ -45,8 +45,18 @@ class Template:
 
 @cache
 def shipped() -> tuple[str, ...]:
-    """Return the names of the templates that come with the package."""
-    return tuple(sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}")))
+    """Return the names of the templates that come with the package: the TOML files of the protocols' folders."""
+    return tuple(sorted(_shipped()))
+
+
+def shipped_file(name: str) -> Path:
+    """Return the file of a template that comes with the package."""
+    return _shipped()[name]
+
+
+@cache
+def _shipped() -> Mapping[str, Path]:
+    return {path.stem: path for path in FOLDERS.glob(f"*/*{SUFFIX}")}
 
 
 def read_template(node: Table, kind: NodeKind) -> Template:
@@ -72,8 +82,8 @@ def read_template(node: Table, kind: NodeKind) -> Template:
 
 
 def _source(node: Table, name: str) -> Source:
-    if name in shipped():
-        return Source.read(FOLDER / f"{name}{SUFFIX}")
+    if name in _shipped():
+        return Source.read(shipped_file(name))
     if not name.endswith(SUFFIX):
         others = f": there are {', '.join(shipped())}; a file of one's own ends in {SUFFIX}"
         raise node.error(f"no such template {name!r}{guess(name, shipped()) or others}", "template")
@@ -95,10 +105,11 @@ def read_points(node: Table, kind: NodeKind) -> dict[str, PointSection]:
     template = read_template(node, kind)
     points = {name: read_point(point, kind, template.name) for name, point in template.points.items()}
     for own in node.tables("points"):
-        given = template.points.get(own.name)
-        if given is None:
-            points[own.name] = read_point(own, kind)
-        else:
-            both = Table(own.source, own.key, {**given.data, **own.data})
-            points[own.name] = read_point(both, kind, template.name)
+        with own.part():
+            given = template.points.get(own.name)
+            if given is None:
+                points[own.name] = read_point(own, kind)
+            else:
+                both = Table(own.source, own.key, {**given.data, **own.data})
+                points[own.name] = read_point(both, kind, template.name)
     return points

@@ -1,6 +1,6 @@
 """Reply times as a file gives them, in seconds.
 
-timing = { window = 0.2, lateness = 0.3 }          # of reads and writes
+timing = { window = 0.2, max_reply_delay = 0.3 }          # of reads and writes
 timing = { write = { window = 0.8 } }              # of writes alone; so too read and packet (msc)
 timing = "learned"                                 # from the replies; { learned = true, ... } with other times, too
 """
@@ -23,11 +23,15 @@ def _time(name: str, about: str) -> Key:
 
 
 TIME_KEYS = (
-    _time("nominal", "A reply that begins by then is on time; a later one is counted late."),
-    _time("window", "A reply that begins by then is as expected; a later one, until `lateness`, is delivered late."),
-    _time("lateness", "What has not begun by then never comes: on this it rests that no value is another's (R3)."),
-    _time("byte_gap", "The longest pause between two bytes of one reply."),
-    _time("turnaround", "How long the node's driver holds the line after its reply."),
+    _time("late_after", "A reply that begins by then is on time; a later one is counted late."),
+    _time(
+        "window", "A reply that begins by then is as expected; a later one, until `max_reply_delay`, is delivered late."
+    ),
+    _time(
+        "max_reply_delay", "What has not begun by then never comes: on this it rests that no value is another's (R3)."
+    ),
+    _time("inter_byte_timeout", "The longest pause between two bytes of one reply."),
+    _time("driver_release_time", "How long the node's driver holds the line after its reply."),
 )
 KEYS = (
     *TIME_KEYS,
@@ -49,7 +53,7 @@ TIMES = names_of(TIME_KEYS)
 def read_timings(table: Table, base: Timings) -> Timings:
     """Return `base` with what the table's `timing` changes.
 
-    Nominal and lateness move with the window where they must.
+    Nominal and maximum reply delay move with the window where they must.
     """
     if isinstance(table.data.get("timing"), str):
         table.choice("timing", (LEARNED_WORD,))
@@ -58,9 +62,9 @@ def read_timings(table: Table, base: Timings) -> Timings:
     timing.only(*names_of(KEYS))
     read, write = _changed(timing, base.read), _changed(timing, base.write)
     return Timings(
-        read=_changed(timing.table("read"), read, leg=True),
-        write=_changed(timing.table("write"), write, leg=True),
-        packet=_changed(timing.table("packet"), base.packet, leg=True),
+        read=_changed(timing.table("read"), read, step=True),
+        write=_changed(timing.table("write"), write, step=True),
+        packet=_changed(timing.table("packet"), base.packet, step=True),
     )
 
 
@@ -72,8 +76,8 @@ def reads_learned(table: Table, base: bool) -> bool:
     return table.table("timing").flag(LEARNED_WORD, base)
 
 
-def _changed(table: Table, timing: ReplyTiming, leg: bool = False) -> ReplyTiming:
-    if leg:
+def _changed(table: Table, timing: ReplyTiming, step: bool = False) -> ReplyTiming:
+    if step:
         table.only(*TIMES)
     given = {name: table.seconds(name, most=math.inf) for name in TIMES if name in table}
     for name, time in given.items():
@@ -82,6 +86,6 @@ def _changed(table: Table, timing: ReplyTiming, leg: bool = False) -> ReplyTimin
                 f"times are in seconds, {LONGEST_TIMING:g} at most: for {time:g} ms write {time / 1000:g}", name
             )
     window = given.get("window", timing.window)
-    moved = {"nominal": min(timing.nominal, window), "lateness": max(timing.lateness, window)}
+    moved = {"late_after": min(timing.late_after, window), "max_reply_delay": max(timing.max_reply_delay, window)}
     with table.at():
         return replace(timing, **{**moved, **given})

@@ -10,31 +10,33 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
-from busmaster.contract.exchange import Abandonable, Done, Exchange, Expect, FrameError, Step
+from busmaster.contract.exchange import Abandonable, Done, Exchange, Expect, FrameError, Progress
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 
-MOST_LEGS = 64
-"""Legs in a row, without a byte between them, after which an exchange that wants another one has no end."""
+MOST_STEPS = 64
+"""Steps in a row, without a byte between them, after which an exchange that wants another one has no end."""
 
 
 class EndlessExchange(Exception):
-    """An exchange wants one leg after the other though nothing comes: a bug of its protocol."""
+    """An exchange wants one step after the other though nothing comes: a bug of its protocol."""
 
 
-def follow(exchange: Exchange[Any], step: Expect, begin: Callable[[Expect, float], object], now: float) -> Step[Any]:
-    """Go from leg to leg for as long as the reader says so, and return what it says then.
+def follow(
+    exchange: Exchange[Any], progress: Expect, begin: Callable[[Expect, float], object], now: float
+) -> Progress[Any]:
+    """Go from step to step for as long as the reader says so, and return what it says then.
 
-    `begin` is called with each leg, and with `now`; it says what the host says first. Raises what `begin` and the
+    `begin` is called with each step, and with `now`; it says what the host says first. Raises what `begin` and the
     reader raise, and EndlessExchange.
     """
-    for _ in range(MOST_LEGS):
-        begin(step, now)
+    for _ in range(MOST_STEPS):
+        begin(progress, now)
         following = exchange.feed(b"")
         if type(following) is not Expect:
             return following
-        step = following
-    raise EndlessExchange(f"another leg after {MOST_LEGS} of one chunk")
+        progress = following
+    raise EndlessExchange(f"another step after {MOST_STEPS} of one chunk")
 
 
 def without_noise(exchange: Exchange[Any], data: bytes) -> bytes:
@@ -46,7 +48,7 @@ def without_noise(exchange: Exchange[Any], data: bytes) -> bytes:
 class Ending:
     """How an exchange ended: with `value`, or with `error`. `send` is what the host says last; `rest` came after.
 
-    `silent`: it failed because nothing came of the leg that was awaited.
+    `silent`: it failed because nothing came of the step that was awaited.
     """
 
     value: Any = None
@@ -83,7 +85,7 @@ class Ending:
 class Driver:
     """One fresh exchange, as a host drives it that has no clock: somebody else knows when a window or gap is over.
 
-    `said` is what the host says after the request, leg by leg. `timing` is that of the leg which is awaited, and
+    `said` is what the host says after the request, step by step. `timing` is that of the step which is awaited, and
     `begun` tells whether a byte of it has come. `ending` is how it ended, None until it has. `noise_tolerant` is the
     profile's: bytes that begin no reply are left out before one.
     """
@@ -112,18 +114,18 @@ class Driver:
         return self
 
     def expire(self) -> None:
-        """Tell that the window of the leg is over, or the byte gap where it has begun."""
+        """Tell that the window of the step is over, or the inter-byte timeout where it has begun."""
         if self.ending is None:
             self._silent = not self.begun
             self._take(self.exchange.expired, self.begun)
 
     def run_out(self) -> Ending:
-        """Return how it ends if nothing more comes: one window or byte gap after the other is over."""
-        for _ in range(MOST_LEGS):
+        """Return how it ends if nothing more comes: one window or inter-byte timeout after the other is over."""
+        for _ in range(MOST_STEPS):
             self.expire()
             if self.ending is not None:
                 return self.ending
-        return Ending(error=EndlessExchange(f"another leg after {MOST_LEGS} that expired"))
+        return Ending(error=EndlessExchange(f"another step after {MOST_STEPS} that expired"))
 
     def fail(self, error: Exception) -> None:
         """End it with an error, the host's own too: whatever is still heard does not count."""
@@ -135,22 +137,22 @@ class Driver:
         self.said.clear()
         self.fail(cast("Abandonable", self.exchange).abandon())
 
-    def _take(self, call: Callable[[Any], Step[Any]], argument: object) -> None:
+    def _take(self, call: Callable[[Any], Progress[Any]], argument: object) -> None:
         try:
-            step = call(argument)
-            if isinstance(step, Expect):
-                step = follow(self.exchange, step, self._begin, 0.0)
+            progress = call(argument)
+            if isinstance(progress, Expect):
+                progress = follow(self.exchange, progress, self._begin, 0.0)
         except Exception as error:
             self.fail(error)
             return
-        if isinstance(step, Done):
-            self.ending = Ending(step.value, step.send, step.rest)
+        if isinstance(progress, Done):
+            self.ending = Ending(progress.value, progress.send, progress.rest)
 
-    def _begin(self, leg: Expect, _now: float) -> None:
-        self.timing = leg.timing
+    def _begin(self, step: Expect, _now: float) -> None:
+        self.timing = step.timing
         self.begun = False
-        if leg.send:
-            self.said.append(leg.send)
+        if step.send:
+            self.said.append(step.send)
 
 
-__all__ = ["MOST_LEGS", "Driver", "Ending", "EndlessExchange", "follow", "without_noise"]
+__all__ = ["MOST_STEPS", "Driver", "Ending", "EndlessExchange", "follow", "without_noise"]

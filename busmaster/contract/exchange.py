@@ -3,7 +3,7 @@
 A `Command` is an immutable value ("read element 100"). For each attempt it opens a fresh `Exchange`: the bytes to
 send and a reader for what comes back. The arbiter owns the clock and the line; an exchange owns only its frame.
 
-One exchange has one or more *legs*: something is said by the host, something is awaited. Most protocols need one.
+One exchange has one or more *steps*: something is said by the host, something is awaited. Most protocols need one.
 MSC needs two (ACK, then the packet) and more when a packet must be sent again.
 """
 
@@ -23,15 +23,15 @@ T_co = TypeVar("T_co", covariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """Bytes of one reply leg: `typical` for planning, `longest` for the published bounds."""
+    """Bytes of one reply step: `typical` for planning, `longest` for the published bounds."""
 
     typical: int
     longest: int
 
 
 @dataclass(frozen=True, slots=True)
-class LaterLeg:
-    """One later leg of an undisturbed exchange, for planning: what the host says first, then what is awaited."""
+class LaterStep:
+    """One later step of an undisturbed exchange, for planning: what the host says first, then what is awaited."""
 
     timing: ReplyTiming
     sizes: Sizes
@@ -39,7 +39,7 @@ class LaterLeg:
 
 
 class Need(enum.Enum):
-    """`MORE`: not a whole frame yet; the byte gap is re-armed."""
+    """`MORE`: not a whole frame yet; the inter-byte timeout is re-armed."""
 
     MORE = "more"
 
@@ -49,7 +49,7 @@ MORE = Need.MORE
 
 @dataclass(slots=True)
 class Expect:
-    """This leg is over and another follows: MSC's packet after its ACK, a NAKed packet sent again.
+    """This step is over and another follows: MSC's packet after its ACK, a NAKed packet sent again.
 
     The arbiter sends `send`, then calls `feed(b"")` at once, for bytes that came in the same chunk.
     """
@@ -63,8 +63,8 @@ class Expect:
 class Done(Generic[T_co]):
     """The reply is complete.
 
-    `rest` is what came after the reply: nobody asked for those bytes and the line settles. `send` is the host's closing
-    ACK (MSC): the line is free when it has left.
+    `rest` is what came after the reply: nobody asked for those bytes and the line resynchronises. `send` is the host's
+    closing ACK (MSC): the line is free when it has left.
     """
 
     value: T_co
@@ -72,16 +72,16 @@ class Done(Generic[T_co]):
     send: bytes = b""
 
 
-Step: TypeAlias = Need | Expect | Done[T_co]
+Progress: TypeAlias = Need | Expect | Done[T_co]
 
 
 class FrameError(Exception):
     """This is no reply: the attempt failed. Never reaches a caller.
 
     `whole` is True only for a whole frame with the right echo and a bad checksum: its reply has begun, so the line
-    need not wait for stragglers, only for silence (R3). `send` is a closing ACK owed to the device all the same
+    need not wait for overdue replies, only for silence (R3). `send` is a closing ACK overdue to the device all the same
     (MSC), else it retransmits into other exchanges. `heard` is all that came in place of the reply, where it may be
-    another request's: it pays what is owed (R15). `hint` is what to try, where that is not what helps against most
+    another request's: it pays what is overdue (R15). `hint` is what to try, where that is not what helps against most
     garbled replies.
     """
 
@@ -106,17 +106,17 @@ class Exchange(Protocol[T_co]):
 
     @property
     def timing(self) -> ReplyTiming:
-        """Return the reply times of the first leg."""
+        """Return the reply times of the first step."""
         ...
 
     @property
     def sizes(self) -> Sizes:
-        """Return the bytes of the first reply leg."""
+        """Return the bytes of the first reply step."""
         ...
 
     @property
-    def later(self) -> Sequence[LaterLeg]:
-        """Return the legs after the first, when nothing goes wrong. Empty for most protocols."""
+    def later(self) -> Sequence[LaterStep]:
+        """Return the steps after the first, when nothing goes wrong. Empty for most protocols."""
         ...
 
     @property
@@ -126,7 +126,7 @@ class Exchange(Protocol[T_co]):
 
     @property
     def starts(self) -> bytes:
-        """Return the legal first bytes of the first reply leg; anything else is a FrameError."""
+        """Return the legal first bytes of the first reply step; anything else is a FrameError."""
         ...
 
     @property
@@ -139,7 +139,7 @@ class Exchange(Protocol[T_co]):
         ...
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         """Return what its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
         ...
 
@@ -148,12 +148,12 @@ class Exchange(Protocol[T_co]):
         """Return False for a broadcast: no reply will come, and `expired(False)` is called when the line is free."""
         ...
 
-    def feed(self, data: bytes, /) -> Step[T_co]:
+    def feed(self, data: bytes, /) -> Progress[T_co]:
         """Take the next bytes of the line. Raises FrameError or Refused; anything else is a bug."""
         ...
 
     def expired(self, started: bool, /) -> Expect | Done[T_co]:
-        """Say what becomes of a window (`started` False) or a byte gap (True) that ran out.
+        """Say what becomes of a window (`started` False) or an inter-byte timeout (True) that ran out.
 
         Raises FrameError to fail the attempt, or returns Expect (NAK a cut packet) or Done (a broadcast).
         """
@@ -180,7 +180,7 @@ class Command(Protocol[T_co]):
 
     @property
     def writes(self) -> bool:
-        """Return True if it changes the node: then it is never retried unasked, and never overtakes a write."""
+        """Return True if it changes the node: then it is never retried unexpected, and never overtakes a write."""
         ...
 
     @property
@@ -201,7 +201,8 @@ class Listener(Protocol):
         ...
 
     def expired(self) -> Done[None]:
-        """Say what becomes of a byte gap that ran out in mid-frame, or behind noise in which a frame may have been."""
+        """Say what becomes of an inter-byte timeout that ran out in mid-frame, or behind noise in which a frame may
+        have been."""
         ...
 
 
@@ -235,12 +236,12 @@ __all__ = [
     "Exchange",
     "Expect",
     "FrameError",
-    "LaterLeg",
+    "LaterStep",
     "Listener",
     "Need",
+    "Progress",
     "Refused",
     "Sizes",
-    "Step",
     "no_reply",
     "other_format",
 ]

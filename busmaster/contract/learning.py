@@ -11,8 +11,8 @@ from busmaster.contract.timing import Timings
 class Learned:
     """Say that a node's reply times are to be learned from its replies, for reads that can be repeated.
 
-    `document`: the times that hold until enough is known, that are never exceeded, and on whose lateness the promise
-    rests that no value is another request's (R3, R15); None for those of the node's protocol.
+    `document`: the times that hold until enough is known, that are never exceeded, and on whose maximum reply delay the
+    promise rests that no value is another request's (R3, R15); None for those of the node's protocol.
     """
 
     document: Timings | None = None

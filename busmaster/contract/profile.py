@@ -83,7 +83,7 @@ class Profile:
     line: LineSettings
     timings: Timings
     probe: Command[Any] = field(compare=False)
-    checks: Sequence[Command[Any]] = field(default=(), compare=False)
+    sync_reads: Sequence[Command[Any]] = field(default=(), compare=False)
     # Both compared apart: two kinds of device that speak one protocol may share a node (Node.check_shared).
     broadcast: int | None = None
     addressed: bool = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from busmaster.arbiter.unasked import QUIET
+from busmaster.arbiter.unexpected import QUIET
 from busmaster.contract.profile import LineSettings
 from busmaster.discovery.steps import LISTENING, Step, ranges
 from busmaster.doctor.diagnosis import garbage, speed, spoken
@@ -239,7 +239,7 @@ class Search:
     async def _confirmed(self, step: Step, address: int) -> Found | None:
         """Ask a node again and again; None unless it answers each time, with nobody else to answer for it."""
         prober = self._prober(step)
-        await self._wire.hear_all(step.kind.profile.timings.read.lateness)  # an answer of before is over then
+        await self._wire.hear_all(step.kind.profile.timings.read.max_reply_delay)  # an answer of before is over then
         probes = [await prober.ask(address, alone=True) for _ in range(CONFIRMED)]
         if any(probe.outcome is not Outcome.ANSWERED for probe in probes):
             return None

@@ -35,6 +35,7 @@ def line_text(port: SerialPort | TcpPort, discovery: Discovery) -> str:
         "# `busmaster items PROTOCOL` lists what else can be read.",
         "",
         'title = "Discovered line"',
+        *_timing(found),
         "",
         *_port(port, discovery),
     ]
@@ -71,6 +72,12 @@ def summary(discovery: Discovery) -> str:
         who = f"{'node' if len(nodes) == 1 else 'nodes'} {some}" if protocol.profile.addressed else "one drive"
         texts.append(f"{protocol.profile.title}{at}, {who}")
     return "; ".join(texts)
+
+
+def _timing(found: Sequence[Found]) -> Iterator[str]:
+    """Yield the line that has reply times learned, if they can be of one of these nodes."""
+    if any(node.protocol.profile.checked_requests for node in found):
+        yield 'timing = "learned"  # reply times from the replies: a lost reply then holds up the line for less'
 
 
 def _name(node: Found, found: Sequence[Found]) -> str:

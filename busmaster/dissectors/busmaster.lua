@@ -17,9 +17,9 @@ local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104, MODBUS, CT_ANSI = 1, 2, 3, 4, 5,
 local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104", "Modbus", "CT-ANSI" }
 local DIRECTIONS = { [0] = "unknown", "node to host", "host to node" }
 local OUTCOMES = {
-  [0] = "-", "ok", "no reply", "garbled", "refused", "unasked", "not believed", "not read", "cut off",
+  [0] = "-", "ok", "no reply", "garbled", "refused", "unexpected", "not believed", "not read", "cut off",
 }
-local NO_REPLY, UNASKED, DOUBTED = 2, 5, 6
+local NO_REPLY, UNEXPECTED, AMBIGUOUS = 2, 5, 6
 local SHORT_COMMANDS = { [NAK] = "again", [ACK] = "next", [BS] = "previous" }
 local ACKNOWLEDGED = { ACK = true, NAK = true, EOT = true }
 local ACKNOWLEDGEMENTS = { [ACK] = "ACK", [NAK] = "NAK", [EOT] = "EOT" }
@@ -63,7 +63,7 @@ local e = {
   missing = ProtoExpert.new("busmaster.eot", "No such parameter (EOT)", expert.group.RESPONSE_CODE, expert.severity.WARN),
   silent = ProtoExpert.new("busmaster.silent", "No reply", expert.group.SEQUENCE, expert.severity.WARN),
   echo = ProtoExpert.new("busmaster.echo", "Not what was asked", expert.group.SEQUENCE, expert.severity.WARN),
-  unasked = ProtoExpert.new("busmaster.unasked", "Nobody asked for this", expert.group.SEQUENCE, expert.severity.NOTE),
+  unexpected = ProtoExpert.new("busmaster.unexpected", "No request asked for this", expert.group.SEQUENCE, expert.severity.NOTE),
   late = ProtoExpert.new("busmaster.late.note", "A late reply", expert.group.SEQUENCE, expert.severity.WARN),
   unused = ProtoExpert.new("busmaster.unused", "Not taken for an answer", expert.group.SEQUENCE, expert.severity.WARN),
 }
@@ -493,13 +493,13 @@ local function link(p, pinfo, outcome)
   if outcome == NO_REPLY then
     given_up = asked
   elseif p.direction == FROM_NODE and given_up and asked and given_up.node == asked.node then
-    given_up = nil -- a node answers in order: it has said what it owed
+    given_up = nil -- a node answers in order: it has sent its overdue reply
   end
   return links[pinfo.number]
 end
 
 -- Bytes that nobody asked for may be the answer to the last request that was given up, if they could answer it.
-local function lateness(p, pinfo)
+local function delay_of(p, pinfo)
   if pinfo.visited then return late[pinfo.number] end
   local answers = p.kind == "value" or ACKNOWLEDGED[p.kind or ""]
   if given_up and answers and given_up.reader == READERS[p.protocol] and (p.item or given_up.item) == given_up.item then
@@ -512,7 +512,7 @@ local function seconds_since(request, pinfo)
   return math.floor((pinfo.rel_ts - request.time) * 1e6 + 0.5) / 1e6
 end
 
-local function add_lateness(p, pinfo, request)
+local function add_delay(p, pinfo, request)
   p.node = p.node or request.node
   p.tree:add(f.request_in, request.number):set_generated()
   p.tree:add(f.time, seconds_since(request, pinfo)):set_generated()
@@ -545,8 +545,8 @@ end
 local function add_outcome(p, outcome, whole, size)
   if size > 0 and not whole then p.tree:add_proto_expert_info(e.broken) end
   if outcome == NO_REPLY then p.tree:add_proto_expert_info(e.silent) end
-  if outcome == UNASKED then p.tree:add_proto_expert_info(e.unasked) end
-  if outcome >= DOUBTED then
+  if outcome == UNEXPECTED then p.tree:add_proto_expert_info(e.unexpected) end
+  if outcome >= AMBIGUOUS then
     p.tree:add_proto_expert_info(e.unused, "Not taken for an answer: " .. (OUTCOMES[outcome] or ""))
   end
   if size == 0 then return (p.node and "node " .. p.node .. " " or "") .. (OUTCOMES[outcome] or "") end
@@ -584,9 +584,9 @@ function line.dissector(tvb, pinfo, root)
   if not whole then p.kind, p.say = nil, nil end
   local in_frame = p.node
   if not in_frame and tvb(4, 2):uint() ~= NO_NODE then p.node = tvb(4, 2):uint() end
-  if outcome == UNASKED then
-    local request = direction == FROM_NODE and lateness(p, pinfo)
-    if request then add_lateness(p, pinfo, request) end
+  if outcome == UNEXPECTED then
+    local request = direction == FROM_NODE and delay_of(p, pinfo)
+    if request then add_delay(p, pinfo, request) end
   else
     local request = link(p, pinfo, outcome)
     if request then add_link(p, pinfo, request) end
@@ -595,7 +595,7 @@ function line.dissector(tvb, pinfo, root)
   if p.leg then tree:add(f.leg, p.leg):set_generated() end
   if protocol == MODBUS and size > 0 then
     local found, own = pcall(Dissector.get, "mbrtu")
-    if found and own then own:call(tvb(header):tvb(), pinfo, root) end
+    if found and own then pcall(own.call, own, tvb(header):tvb(), pinfo, root) end -- it raises on a malformed frame
   end
 
   local text = add_outcome(p, outcome, whole, size)

@@ -155,7 +155,7 @@ def _holders(path: str, proc: Path) -> Finding:
         "holders",
         False,
         f"open in {', '.join(found)}",
-        "end it: two masters on one line garble each other (ModemManager and gpsd open ports unasked)",
+        "end it: two masters on one line garble each other (ModemManager and gpsd open ports unexpected)",
     )
 
 

@@ -59,10 +59,10 @@ class Record:
 # The line
 
 
-def unasked(heard: bytes, protocol: str | None) -> Finding:
+def unexpected(heard: bytes, protocol: str | None) -> Finding:
     """Say what was heard before anything was sent."""
     if not heard:
-        return Finding("silence", True, "nobody speaks unasked")
+        return Finding("silence", True, "nobody speaks unexpected")
     known = [] if protocol is None else spoken(heard, protocol)
     if known:
         return Finding(
@@ -74,7 +74,7 @@ def unasked(heard: bytes, protocol: str | None) -> Finding:
     return Finding(
         "silence",
         False,
-        f"{len(heard)} bytes came unasked: {garbage(heard)}",
+        f"{len(heard)} bytes came unexpected: {garbage(heard)}",
         "look for a second master, a babbling node, missing biasing or termination, or a wrong baud rate",
     )
 
@@ -155,7 +155,7 @@ def learning(starts: Sequence[float], timing: ReplyTiming) -> Finding:
         "learning",
         True,
         f"learned windows would be {milliseconds(window)} ms at most: a lost reply would hold up the line for about as "
-        f'long, in place of {milliseconds(timing.lateness)} ms (--timeout learned, timing = "learned")',
+        f'long, in place of {milliseconds(timing.max_reply_delay)} ms (--timeout learned, timing = "learned")',
     )
 
 
@@ -202,20 +202,20 @@ def _address_of(record: Record) -> str:
 def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
     """Say how measured latencies, in seconds, go with the reply times set."""
     slow = percentile(sorted(starts))
-    times = " / ".join(milliseconds(value) for value in (timing.nominal, timing.window, timing.lateness))
-    what = f"replies begin within {milliseconds(slow)} ms; set are {times} ms (nominal / window / lateness)"
+    times = " / ".join(milliseconds(value) for value in (timing.late_after, timing.window, timing.max_reply_delay))
+    what = f"replies begin within {milliseconds(slow)} ms; set are {times} ms (late_after / window / max_reply_delay)"
     window = max(rounded_up(3 * slow), SHORTEST_WINDOW)
     if slow > timing.window:
-        lateness = max(timing.lateness, rounded_up(1.5 * window))
-        wanted = " / ".join(milliseconds(value) for value in (rounded_up(1.5 * slow), window, lateness))
+        max_reply_delay = max(timing.max_reply_delay, rounded_up(1.5 * window))
+        wanted = " / ".join(milliseconds(value) for value in (rounded_up(1.5 * slow), window, max_reply_delay))
         advice = f"their values come, late: use {wanted} ms, or --timeout {milliseconds(window)}"
         return Finding("windows", False, what, advice)
-    if slow > timing.nominal:
-        nominal = milliseconds(rounded_up(1.5 * slow))
-        return Finding("windows", True, what, f"they are counted late: a nominal time of {nominal} ms would fit")
-    lateness = rounded_up(1.5 * window)
-    if lateness < timing.lateness:
-        times = f"timing = {{ window = {window:g}, lateness = {lateness:g} }}"
+    if slow > timing.late_after:
+        late_after = milliseconds(rounded_up(1.5 * slow))
+        return Finding("windows", True, what, f"they are counted late: late_after = {late_after} ms would fit")
+    max_reply_delay = rounded_up(1.5 * window)
+    if max_reply_delay < timing.max_reply_delay:
+        times = f"timing = {{ window = {window:g}, max_reply_delay = {max_reply_delay:g} }}"
         advice = f"{times} in LINE.toml would waste less on dead nodes, but leave room for busy ones"
         return Finding("windows", True, what, advice)
     return Finding("windows", True, what)

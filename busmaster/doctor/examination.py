@@ -11,7 +11,7 @@ from typing import Protocol, TypeAlias
 
 import anyio.to_thread
 
-from busmaster.arbiter.mark import Mark
+from busmaster.arbiter.counters import Mark
 from busmaster.arbiter.tap import Tap
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
@@ -189,7 +189,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     wire.port.reset()
     wire.marked.clear()
     heard = await wire.hear_all(LISTENING)
-    talk = diagnosis.unasked(heard, patient.protocol)
+    talk = diagnosis.unexpected(heard, patient.protocol)
     tell(talk)
     # Another master, or what may be one, must not be disturbed. Noise is no reason not to ask.
     if heard and (patient.protocol is None or diagnosis.spoken(heard, patient.protocol)):
@@ -235,7 +235,7 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
     with patient.progress("measuring", len(living) * PROBES) as bar:
         for record in living:
             for left in reversed(range(PROBES)):
-                # The last one waits out the lateness, so that nothing of this node is left for the next.
+                # The last one waits out the maximum reply delay, so that nothing of this node is left for the next.
                 record.probes.append(await prober.ask(record.address, alone=not left))
                 bar.advance()
     return records

@@ -1,4 +1,5 @@
-"""Asking nodes with the raw bytes in sight: what the arbiter discards while it settles is what a doctor wants to see.
+"""Asking nodes with the raw bytes in sight: what the arbiter discards while it resynchronises is what a doctor wants to
+see.
 
 One request at a time and nobody else on the port, so no arbiter is needed.
 """
@@ -16,10 +17,10 @@ from typing import Any
 
 import anyio
 
-from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.mark import Mark
+from busmaster.arbiter.counters import Mark
+from busmaster.arbiter.on_wire import Echo
 from busmaster.arbiter.tap import Attempt, Tap, Verdict
-from busmaster.arbiter.unasked import QUIET
+from busmaster.arbiter.unexpected import QUIET
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.profile import LineSettings, Profile
@@ -183,10 +184,11 @@ class Prober:
         self._numbers = count(1)
 
     async def ask(self, address: int, *, patience: float | None = None, alone: bool = False) -> Probe:
-        """Ask a node with its probe. `patience`: seconds to wait for the first byte, the lateness by default.
+        """Ask a node with its probe. `patience`: seconds to wait for the first byte, the maximum reply delay by
+        default.
 
-        Raises LineDown. `alone`: whatever still comes within the lateness is this node's doing, and not left for the
-        next request.
+        Raises LineDown. `alone`: whatever still comes within the maximum reply delay is this node's doing, and not left
+        for the next request.
         """
         profile, wire = self._profile, self._wire
         command = profile.probe
@@ -197,7 +199,7 @@ class Prober:
         self._echo.forget()
         wire.attempt = attempt
         hearing.asked = self._say(hearing.driver.exchange.request)
-        wait = hearing.driver.timing.lateness if patience is None else patience
+        wait = hearing.driver.timing.max_reply_delay if patience is None else patience
         until = hearing.asked + wait + wire.latency
         while (chunk := await wire.hear(until)) is not None:
             data = self._echo.strip(chunk[1])
@@ -211,7 +213,7 @@ class Prober:
         wire.attempted(attempt)
         rest = b""
         if hearing.start is not None:
-            rest = await wire.hear_all(wait if alone else max(QUIET, hearing.driver.timing.byte_gap))
+            rest = await wire.hear_all(wait if alone else max(QUIET, hearing.driver.timing.inter_byte_timeout))
         return hearing.probe(self._echo.strip(rest) or b"")
 
     def _say(self, data: bytes) -> float:
@@ -242,7 +244,7 @@ class _Hearing:
         # else the node would be left with something unacknowledged
         if driver.ending is not None and driver.ending.send:
             say(driver.ending.send)
-        return now + (driver.timing.byte_gap if driver.begun else driver.timing.lateness)
+        return now + (driver.timing.inter_byte_timeout if driver.begun else driver.timing.max_reply_delay)
 
     def collide(self, data: bytes) -> None:
         """Take it that this came in place of the echo."""

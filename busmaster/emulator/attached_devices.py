@@ -17,17 +17,20 @@ from busmaster.emulator.disturbance import misses
 
 Say = Callable[[Device, float, bytes], None]
 """A device is going to say something: from when on, and what."""
+TakeBack = Callable[[Device, float], None]
+"""A device has restarted at this time: what it was going to say is not said."""
 
 
 class AttachedDevices:
-    """The devices of a line. `say` is called with what they say in answer."""
+    """The devices of a line. `say` is called with what they say in answer, `take_back` when one has restarted."""
 
-    def __init__(self, say: Say, chance: Chance, tau: float) -> None:
+    def __init__(self, say: Say, take_back: TakeBack, chance: Chance, tau: float) -> None:
         self.devices: list[Device] = []
         self.wakeup = NEVER
         """When a device wants to be woken, at the earliest."""
         self.cut_off: frozenset[Device] = frozenset()
         self._say = say
+        self._take_back = take_back
         self._chance = chance
         self._tau = tau
         self._routes: dict[bytes, tuple[Device, ...]] = {}
@@ -123,6 +126,9 @@ class AttachedDevices:
 
     def _note(self, device: Device, now: float) -> None:
         """Note what it has come to say, whether it must hear everything from now on, and when it wants to be woken."""
+        if device.restarted:
+            device.restarted = False
+            self._take_back(device, now)
         if device.outbox:
             said = device.outbox[:]
             device.outbox.clear()

@@ -38,22 +38,25 @@ NAK = b"\x15"
 class Delay:
     """Seconds from the end of a request to the start of its reply: `low`, or evenly spread from `low` to `high`.
 
-    A share `stragglers` (0 to 1) of the replies takes `straggle[0]` to `straggle[1]` seconds instead.
+    A share `late_replies` (0 to 1) of the replies takes `late_reply_delay[0]` to `late_reply_delay[1]` seconds instead.
     Raises InvalidCommand unless 0 <= low <= high, and for a share that is none.
     """
 
     low: float = 0.002
     high: float | None = None
-    stragglers: float = 0.0
-    straggle: tuple[float, float] = (0.1, 0.145)
+    late_replies: float = 0.0
+    late_reply_delay: tuple[float, float] = (0.1, 0.145)
 
     def __post_init__(self) -> None:
         high = self.low if self.high is None else self.high
         object.__setattr__(self, "high", None if high == self.low else high)
-        if not 0 <= self.low <= high < math.inf or not 0 <= self.straggle[0] <= self.straggle[1] < math.inf:
+        if (
+            not 0 <= self.low <= high < math.inf
+            or not 0 <= self.late_reply_delay[0] <= self.late_reply_delay[1] < math.inf
+        ):
             raise InvalidCommand(f"a reply delay is 0 s or more, the lower bound first, not {self.low:g} to {high:g} s")
-        if not 0 <= self.stragglers <= 1:
-            raise InvalidCommand(f"the share of stragglers is from 0 to 1, not {self.stragglers:g}")
+        if not 0 <= self.late_replies <= 1:
+            raise InvalidCommand(f"the share of overdue replies is from 0 to 1, not {self.late_replies:g}")
 
     @classmethod
     def parse(cls, text: str) -> Delay:
@@ -68,8 +71,8 @@ class Delay:
 
     def draw(self, chance: Chance) -> float:
         """Return a delay in seconds, drawn by `chance` unless it is always the same."""
-        if self.stragglers and chance.random() < self.stragglers:
-            return chance.uniform(*self.straggle)
+        if self.late_replies and chance.random() < self.late_replies:
+            return chance.uniform(*self.late_reply_delay)
         return self.low if self.high is None else chance.uniform(self.low, self.high)
 
 
@@ -105,12 +108,14 @@ class Device(ABC):
         self.outbox: list[tuple[float, bytes]] = []
         """What it is going to say, and when the first byte begins. The line empties it."""
         self.faults = Faults()
-        self.turnaround = 0.0
+        self.driver_release_time = 0.0
         """Seconds for which its driver still holds the line after its last byte."""
         self.lag = 0.0
         """Added to every delay: how a fault makes one reply late."""
         self.away_until = 0.0
         """A fault took it off the line until then."""
+        self.restarted = False
+        """It has restarted, and the line has not yet taken back what it was about to say."""
 
     # Before it joins a line
 
@@ -156,6 +161,7 @@ class Device(ABC):
         self.attentive = False
         self.wakeup = NEVER
         self.free_at = now
+        self.restarted = True
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
         """Return the same reply as if for another element, parameter or unit, with a right checksum.

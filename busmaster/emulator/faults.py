@@ -1,9 +1,9 @@
 """What can be wrong with a device or a line: zero by default, seeded, changeable while it runs.
 
 Inside and outside the master's assumption (R3: one request causes at most one reply, which begins within its node's
-`lateness`): as long as every fault in use is one of `WITHIN`, and reply delay plus `late_by` stays within that
-lateness, no value that the master delivers may be wrong. `BEYOND` it the replies' anonymity or an 8-bit checksum
-makes a wrong value possible, and the campaigns count how often.
+`max_reply_delay`): as long as every fault in use is one of `WITHIN`, and reply delay plus `late_by` stays within that
+maximum reply delay, no value that the master delivers may be wrong. `BEYOND` it the replies' anonymity or an 8-bit
+checksum makes a wrong value possible, and the campaigns count how often.
 
 Faults of a line strike every frame on it, the host's too; those of a device what it hears and says. There are two
 that are `WITHIN` only as a device's: a request that is heard `doubled` is answered twice; and one that is `truncated`
@@ -66,7 +66,7 @@ class Faults:
     trailing: float = 0.0
     """A few noise bytes glued to its end: never an ACK, NAK, EOT or BS."""
     forged: float = 0.0
-    """An unasked ACK, NAK or EOT in front of it."""
+    """An unexpected ACK, NAK or EOT in front of it."""
     babble: float = 0.0
     """A burst of up to 60 noise bytes at some moment of the next 100 ms."""
     split: float = 0.0

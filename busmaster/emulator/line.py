@@ -65,9 +65,9 @@ class Talk:
 class Line:
     """A line with `devices` on it. `faults` strike every frame, the host's too.
 
-    `chance` is a seeded random.Random: needed as soon as a delay or a fault is random, or talkers collide.
-    `chunk` bytes at a time reach the host (0: whole frames, as far as it does not ask before), `latency` seconds after
-    they were on the wire. `turnaround`: for how long the host's driver still holds the line after its last byte.
+    `chance` is a seeded random.Random: needed as soon as a delay or a fault is random, or talkers collide. `chunk`
+    bytes at a time reach the host (0: whole frames, as far as it does not ask before), `latency` seconds after they
+    were on the wire. `driver_release_time`: for how long the host's driver still holds the line after its last byte.
     `paced` False: bytes take no time.
     """
 
@@ -82,7 +82,7 @@ class Line:
         echo: Echo | None = None,
         chunk: int = 0,
         latency: float = 0.0,
-        turnaround: float = 0.0,
+        driver_release_time: float = 0.0,
     ) -> None:
         self.settings = settings
         self.tau = settings.byte_time if paced else 0.0
@@ -92,7 +92,7 @@ class Line:
         self.echo = echo
         self.chunk = chunk
         self.latency = latency
-        self.turnaround = turnaround
+        self.driver_release_time = driver_release_time
         self.paced = paced
         """Whether the host may rely on the baud rate (R4). Set it to False for a line behind a network: there bytes
         take their time, and arrive at any."""
@@ -110,14 +110,14 @@ class Line:
         self._active: Talk | None = None
         self._pending: list[tuple[float, int, Talk]] = []
         self._order = 0
-        self._mending: Talk | None = None
+        self._fixing: Talk | None = None
         self._sent_by = 0.0
         self._held_until = 0.0
         self._holder: Device | None = None
         self._inbox = b""
         self._arrived = 0.0
         self._arrivals: deque[tuple[float, bytes]] = deque()
-        self._attached = AttachedDevices(self._say, self.chance, self.tau)
+        self._attached = AttachedDevices(self._say, self._take_back, self.chance, self.tau)
         for device in devices:
             self.add(device)
 
@@ -152,7 +152,7 @@ class Line:
         """Break the wire to `devices` (to all of them, by default): what they say or hear ends there and then."""
         self._advance(now)
         lost = devices or tuple(self.devices)
-        self._mending = None
+        self._fixing = None
         talk = self._active
         if talk is not None and talk.start < now:
             self._give(talk, now)
@@ -171,7 +171,7 @@ class Line:
         self._advance(now)
         talk = self._active
         if talk is not None and talk.talker is None and talk.start < now:
-            self._mending = talk
+            self._fixing = talk
         else:
             self._attached.cut_off = frozenset()
 
@@ -251,6 +251,16 @@ class Line:
         self._order += 1
         heappush(self._pending, (talk.start, self._order, talk))
 
+    def _take_back(self, talker: Device, now: float) -> None:
+        """Forget what `talker`, which restarted at `now`, has not begun to say by then."""
+        self._pending = [entry for entry in self._pending if entry[2].talker is not talker]
+        heapify(self._pending)
+        talk = self._active
+        if talk is not None and talk.talker is talker and talk.start >= now and talk.collision is None:
+            self._active = None
+            if self._pending:
+                self._activate(heappop(self._pending)[2])
+
     def _activate(self, talk: Talk) -> None:
         self._active = talk
         if talk.start < self._held_until and talk.talker is not self._holder:
@@ -290,7 +300,7 @@ class Line:
 
     def _finish(self, talk: Talk) -> None:
         talker = talk.talker
-        if self.turnaround if talker is None else talker.turnaround:
+        if self.driver_release_time if talker is None else talker.driver_release_time:
             self._held_until = talk.end + self._hold(talk)
             self._holder = talker
         self._active = None
@@ -303,12 +313,12 @@ class Line:
             self._attached.request(talk.data, talk.start, talk.end)
         else:
             self._attached.overhear(talk.data, talk.start, talk.end, talker, talk.clean)
-        if talk is self._mending:
-            self._mending = None
+        if talk is self._fixing:
+            self._fixing = None
             self._attached.cut_off = frozenset()
 
     def _hold(self, talk: Talk) -> float:
-        return self.turnaround if talk.talker is None else talk.talker.turnaround
+        return self.driver_release_time if talk.talker is None else talk.talker.driver_release_time
 
     # What the host hears of it
 
@@ -320,7 +330,7 @@ class Line:
         return bytes(byte for byte, whole in misheard(data, self.host, self.settings) if whole)
 
     def _heard_at_once(self, talk: Talk) -> bool:
-        """Return whether the host hears it as it comes; what is misheard is reckoned as a whole."""
+        """Return whether the host hears it as it comes; what is misheard is calculated as a whole."""
         if self.host is not None:
             return False
         return talk.talker is not None or (self.echo is not None and not self.echo.delay and not self.echo.corrupt)

@@ -20,9 +20,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, TypeAlias
 
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.polling import Snapshot
 from busmaster.errors import InvalidCommand
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.settings import Settings
 
 TICK = 0.05
@@ -205,7 +205,7 @@ class Output(ABC):
 
     # off the loop
 
-    def close_door(self) -> None:  # noqa: B027  nothing to do where there is no door
+    def close_interface(self) -> None:  # noqa: B027  nothing to do where there is no interface
         """Take in nothing from outside any more, and answer what has come. Most take in nothing at all."""
 
     def close(self, within: float) -> None:

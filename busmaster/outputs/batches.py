@@ -7,9 +7,9 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, TypeVar
 
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Sample, Snapshot
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import BATCH, PAUSE, TICK, Item, size_of
 from busmaster.outputs.settings import SpillingSettings
 from busmaster.outputs.spilling import SpillingOutput

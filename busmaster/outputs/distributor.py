@@ -9,15 +9,16 @@ from typing import Any, NamedTuple, Protocol
 
 import anyio
 
-from busmaster.arbiter.events import LatenessRaised, NodeChanged, RepliesLate
+from busmaster import ext
+from busmaster.arbiter.events import MaxReplyDelayRaised, NodeChanged, RepliesLate
+from busmaster.authorisation.authorisation import Authorisation
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bounds import AUDIT_WITHIN
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Snapshot, Stream
 from busmaster.bus.snapshots import Outdated
-from busmaster.gate.gate import Gate
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Output, OutputStatistics
 from busmaster.outputs.exceptions import News
 from busmaster.outputs.files import CsvOutput, JsonlOutput
@@ -62,8 +63,9 @@ class Wanted(NamedTuple):
 class Distributor:
     """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
 
-    `gate` is what the commands pass that they take in. One that is not `in_charge` of the line says nothing of its
-    state: another process may be. One that is not of a line that `asks` says only that it listens, and what it hears.
+    `authorisation` is what the commands pass that they take in. One that is not `in_charge` of the line says nothing of
+    its state: another process may be. One that is not of a line that `asks` says only that it listens, and what it
+    hears.
     """
 
     def __init__(
@@ -71,12 +73,12 @@ class Distributor:
         bus: Bus,
         tell: Callable[[str], None] = lambda _: None,
         *,
-        gate: Gate | None = None,
+        authorisation: Authorisation | None = None,
         in_charge: bool = True,
         asks: bool = True,
     ) -> None:
         self.tell = tell
-        self.gate = gate or Gate(bus)
+        self.authorisation = authorisation or Authorisation(bus)
         self._in_charge = in_charge
         self._asks = asks
         self._bus = bus
@@ -208,7 +210,7 @@ class Distributor:
 
     async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
         lost = 0
-        news = self._news[group] = News(self._bus.shared.is_outdated)
+        news = self._news[group] = News(ext.line_of(self._bus).is_outdated)
         async for snapshot in cycles:
             told = news.of(snapshot)
             for output in self._outputs:
@@ -252,29 +254,29 @@ class Distributor:
                     self._bus,
                     self._say,
                     commands=commands,
-                    gate=self.gate,
+                    authorisation=self.authorisation,
                     in_charge=self._in_charge,
                     asks=self._asks,
                 )
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput
 
-                return MetricsOutput(kind, settings, self._bus, self._say, self.statistics, self.gate.refusals)
+                return MetricsOutput(kind, settings, self._bus, self._say, self.statistics, self.authorisation.refusals)
             case _:
                 raise AssertionError(settings)
 
 
 async def close_all(outputs: Collection[Output]) -> None:
-    """Close them, their doors first: what was answered there is on record in all of them."""
+    """Close them, their interfaces first: what was answered there is on record in all of them."""
     # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
-    await asyncio.gather(*(asyncio.to_thread(output.close_door) for output in outputs))
+    await asyncio.gather(*(asyncio.to_thread(output.close_interface) for output in outputs))
     await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in outputs))
 
 
 def label_of(event: BusEvent) -> str:
     """Return the label of the node that an event is of, "" for one of the line."""
     match event:
-        case NodeChanged() | LatenessRaised() | RepliesLate():
+        case NodeChanged() | MaxReplyDelayRaised() | RepliesLate():
             return event.node.label
         case AlarmChanged():
             return event.point.node.label

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.polling import Sample, Snapshot
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Item, check_folder
 from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.cells import csv_lines, no_formula

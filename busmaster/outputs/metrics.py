@@ -14,13 +14,14 @@ from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
+from busmaster import ext
 from busmaster.arbiter.counters import LineStatistics, NodeStatistics, RecentUtilisation
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
+from busmaster.authorisation.refusals import INTERFACES, TOO_FAST, Refusals
+from busmaster.authorisation.rights import Role
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
-from busmaster.gate.refusals import INTERFACES, Refusals
-from busmaster.gate.rights import Role
 from busmaster.outputs.base import Output, OutputStatistics, check_extra
 from busmaster.outputs.scrapes import listening, page, serve
 from busmaster.outputs.settings import MetricsSettings
@@ -42,7 +43,7 @@ NOTED_EVERY = 1.0
 OUTCOMES = ("ok", "no_reply", "garbled", "refused")
 COUNTS = {
     "attempts": "Exchanges with this node that have ended",
-    "late": "Replies after the nominal time, accepted all the same",
+    "late": "Replies accepted after late_after",
     "overdue": "Replies after the reply window, accepted all the same",
     "retries": "Reads that were tried again",
     "unheard": "Replies to callers that had gone",
@@ -52,12 +53,12 @@ COUNTS = {
 LINE_COUNTS = {
     "exchanges": "Exchanges on the line",
     "cancelled": "Requests whose callers had gone",
-    "unasked_bytes": "Bytes that nobody had asked for",
+    "unexpected_bytes": "Bytes that no request asked for",
     "tainted": "Replies that came sooner than the baud rate allows",
     "collisions": "Echoes that differ from what was sent",
-    "checks": "Reads that proved the line to be in step",
-    "doubted": "Answers that were not believed, as they could have been another request's",
-    "settles": "Times the line was left to settle",
+    "sync_reads": "Reads that proved the line to be in sync",
+    "ambiguous": "Replies that were discarded because they could belong to another request",
+    "resyncs": "Times the line was resynchronised",
     "noisy": "Times the line would not be silent",
     "losses": "Times the port was lost",
     "damaged": "Bytes that came marked with a parity or framing error",
@@ -167,11 +168,13 @@ class MetricsOutput(Output):
         )
         yield GaugeMetricFamily(
             "busmaster_line_utilisation_ratio",
-            f"Share of the last {UTILISATION_WINDOW:g} s in which the line was busy or settling",
+            f"Share of the last {UTILISATION_WINDOW:g} s in which the line was busy or resynchronising",
             value=utilisation,
         )
         yield CounterMetricFamily("busmaster_line_busy_seconds", "Time in exchanges", value=line.busy)
-        yield CounterMetricFamily("busmaster_line_settling_seconds", "Time spent settling", value=line.settling)
+        yield CounterMetricFamily(
+            "busmaster_line_quiet_seconds", "Quiet time: time spent resynchronising", value=line.quiet_time
+        )
         yield GaugeMetricFamily("busmaster_line_backlog", "Requests that wait", value=line.backlog)
         for name, text in LINE_COUNTS.items():
             yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
@@ -197,11 +200,11 @@ class MetricsOutput(Output):
         return line, self._utilisation.note(self._bus.now(), line)
 
     def _counts_of_reads(self) -> dict[str, int]:
-        counts = self._bus.reads_after_writes
+        counts = ext.reads_after_writes(self._bus)
         return {"read": counts.read, "failed": counts.failed, "shared": counts.shared}
 
     def _lost_seconds(self) -> float:
-        return self._bus.lost_seconds
+        return ext.lost_seconds(self._bus)
 
     def _of_nodes(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -304,13 +307,15 @@ class MetricsOutput(Output):
         from prometheus_client.core import CounterMetricFamily
 
         connections = CounterMetricFamily(
-            "busmaster_connections_refused", "Connections for which no place was free, by role", labels=["role"]
+            "busmaster_connections_refused",
+            "Connections for which no place was free, by role; unknown: those of programs that connect too fast",
+            labels=["role"],
         )
         logins = CounterMetricFamily(
             "busmaster_logins_failed", "Logins that failed, by interface: service, web, opcua", labels=["interface"]
         )
         refused, failed = self._ask(lambda: (dict(self._refusals.connections), dict(self._refusals.logins)))
-        for role in (*(role.value for role in Role), "safe"):
+        for role in (*(role.value for role in Role), "safe", TOO_FAST):
             connections.add_metric([role], refused.get(role, 0))
         for interface in INTERFACES:
             logins.add_metric([interface], failed.get(interface, 0))
@@ -328,7 +333,7 @@ def read_node(node: Node) -> tuple[NodeStatistics, list[tuple[float, int]], floa
 
     The latencies are pairs (upper edge, count) of the buckets in use, and their sum; edges and sum are in seconds.
     """
-    latency = node.record.counters.latency
+    latency = ext.record_of(node).counters.latency
     return node.statistics(), latency.buckets(), latency.total
 
 

@@ -12,7 +12,7 @@
     PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to be written; or {"value": 12.5, "id": "a1",
                               "expires": 1767225600}, of which value alone must be said
     PREFIX/result/NODE/ITEM   {"ok": true}, or {"ok": false, "error": "..."}, with the command's id if it has one
-    PREFIX/audit              each write, by whatever door: who, what, when, what became of it
+    PREFIX/audit              each write, by whatever interface: who, what, when, what became of it
 
 In names +, # and % are written %2B, %23 and %25. A command is written within a second of its arrival, or by `expires`
 or the message's own expiry where it has one; an older one is refused. What is not allowed comes on a connection of its
@@ -39,12 +39,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 import anyio
 from anyio.abc import TaskStatus
 
-from busmaster.arbiter.state import LineState
+from busmaster import ext
+from busmaster.arbiter.counters import LineState
+from busmaster.authorisation.authorisation import Authorisation, Wish
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Sample, Snapshot
-from busmaster.gate.gate import Gate, Wish
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import PAUSE, TICK, Item, check_extra, size_of
 from busmaster.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.outputs.mqtt_connection import secrets, taking_in, topic_part, unread
@@ -106,7 +107,7 @@ class MqttOutput(SpillingOutput):
         say: Callable[[str], None] = lambda _: None,
         *,
         commands: Mapping[str, Point[Any]] | None = None,
-        gate: Gate | None = None,
+        authorisation: Authorisation | None = None,
         in_charge: bool = True,
         asks: bool = True,
     ) -> None:
@@ -115,14 +116,14 @@ class MqttOutput(SpillingOutput):
         self._settings = settings
         self._secrets = secrets(settings)
         self._bus = bus
-        self._gate = gate or Gate(bus)
+        self._authorisation = authorisation or Authorisation(bus)
         self._in_charge = in_charge
         self._asks = asks
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._arriving: Commands
         self._leaving = threading.Event()
-        self._door_is_closed = threading.Event()
-        self._door_is_closed.set()
+        self._interface_is_closed = threading.Event()
+        self._interface_is_closed.set()
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
         self._published: dict[str, str | None] = {}
@@ -138,9 +139,9 @@ class MqttOutput(SpillingOutput):
         self._owner = asyncio.get_running_loop()
         super().start()
 
-    def close_door(self) -> None:
+    def close_interface(self) -> None:
         self._leaving.set()
-        self._door_is_closed.wait(LAST_ANSWERS + MARGIN)
+        self._interface_is_closed.wait(LAST_ANSWERS + MARGIN)
 
     # on the thread
 
@@ -235,7 +236,11 @@ class MqttOutput(SpillingOutput):
         settings = self._settings
         username, password, tls = self._secrets
         self._arriving = Commands(
-            settings.prefix, self._gate, self._commands, self._bus.now, lambda text: self._say(f"{self.kind}: {text}")
+            settings.prefix,
+            self._authorisation,
+            self._commands,
+            self._bus.now,
+            lambda text: self._say(f"{self.kind}: {text}"),
         )
         client = aiomqtt.Client(
             settings.host,
@@ -321,7 +326,7 @@ class MqttOutput(SpillingOutput):
 
     def _outdated(self) -> Iterator[Outgoing]:
         """Yield the values that a write or a loss of the line has made something else than they were when read."""
-        line = self._bus.shared
+        line = ext.line_of(self._bus)
         seen = (line.last_touched, line.condition)
         if self._settings.messages == "cycle" or seen == self._seen:
             return
@@ -388,8 +393,8 @@ class MqttOutput(SpillingOutput):
         return ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection")
 
     async def _serve(self, client: Client, *, task_status: TaskStatus[None]) -> None:
-        """Take in commands until the door is to be closed; it has started when they are listened to."""
-        self._door_is_closed.clear()  # before the look: whoever wants it closed looks in the other order
+        """Take in commands until the interface is to be closed; it has started when they are listened to."""
+        self._interface_is_closed.clear()  # before the look: whoever wants it closed looks in the other order
         try:
             if self._commands and not self._leaving.is_set():
                 await self._hear(client, task_status)
@@ -397,7 +402,7 @@ class MqttOutput(SpillingOutput):
                 task_status.started()
         finally:
             self._arriving.close(self._keep)
-            self._door_is_closed.set()
+            self._interface_is_closed.set()
 
     async def _hear(self, client: Client, task_status: TaskStatus[None]) -> None:
         topics = [self._topic("set", name) for name in self._commands]
@@ -430,13 +435,13 @@ class MqttOutput(SpillingOutput):
     async def _write(self, wish: Wish) -> WriteRecord:
         """Write it on the loop that owns the line."""
         assert self._owner is not None
-        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._gate.write(wish), self._owner))
+        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._authorisation.write(wish), self._owner))
 
     def _keep(self, wish: Wish, error: str) -> None:
         """Put on record, on that loop too, what was refused."""
         assert self._owner is not None
         with suppress(RuntimeError):  # that loop has ended
-            self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
+            self._owner.call_soon_threadsafe(self._authorisation.refuse, wish, error)
 
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import anyio
 
+from busmaster.authorisation.authorisation import Authorisation, Wish
+from busmaster.authorisation.payload import NoCommand, read_payload
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
-from busmaster.gate.gate import Gate, Wish
-from busmaster.gate.payload import NoCommand, read_payload
-from busmaster.gate.record import WriteRecord
 
 if TYPE_CHECKING:
     from aiomqtt import Message
@@ -66,7 +66,7 @@ class Commands:
     def __init__(
         self,
         prefix: str,
-        gate: Gate,
+        authorisation: Authorisation,
         points: Mapping[str, Point[Any]],
         now: Callable[[], float],
         tell: Callable[[str], object] = lambda _: None,
@@ -77,7 +77,7 @@ class Commands:
         self.queued: deque[Wish] = deque()
         self._tell = tell
         self._asked = f"{prefix}/set/"
-        self._gate = gate
+        self._authorisation = authorisation
         self._points = points
         self._now = now
         self._looked = now()
@@ -111,7 +111,7 @@ class Commands:
             return
         shown = name if len(name) <= LONGEST_NAME else ""
         wish = Wish(
-            door="mqtt",
+            interface="mqtt",
             by=_sender(topic[:LONGEST_NAME], message),
             name=shown or name[:40],
             point=point,
@@ -121,7 +121,7 @@ class Commands:
         try:
             wish = self._read(wish, message)  # first: whatever becomes of it, its value and its id are told
             if point is None:
-                raise InvalidCommand(self._gate.refusal(wish))
+                raise InvalidCommand(self._authorisation.refusal(wish))
             if message.retain:
                 raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
             if len(self.queued) >= MOST_COMMANDS:

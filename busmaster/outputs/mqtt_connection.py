@@ -8,8 +8,6 @@ import struct
 import termios
 from typing import TYPE_CHECKING, TypeAlias
 
-from busmaster.errors import InvalidCommand
-from busmaster.outputs.base import reason
 from busmaster.outputs.settings import MqttSettings
 
 if TYPE_CHECKING:
@@ -22,16 +20,7 @@ Secrets: TypeAlias = tuple[str | None, str | None, ssl.SSLContext | None]
 
 def secrets(settings: MqttSettings) -> Secrets:
     """Return user name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
-    password = tls = None
-    try:
-        if settings.password_file is not None:
-            with open(settings.password_file, encoding="utf-8") as file:
-                password = file.read().strip()
-        if settings.tls:
-            tls = ssl.create_default_context(cafile=settings.ca_file)
-    except OSError as error:
-        raise InvalidCommand(reason(error)) from None
-    return settings.username, password, tls
+    return settings.username, settings.password(), settings.tls_context()
 
 
 def taking_in(most: int) -> Properties:

@@ -11,10 +11,10 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.meaning import Named
 from busmaster.errors import InvalidCommand
 from busmaster.files import open_file
-from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Item, check_folder
 from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.damaged import is_damaged, move_aside
@@ -23,7 +23,8 @@ from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.values import json_value, micros, write_fields
 
-VERSION = 1
+VERSION = 2
+"""The layout of a database, as it says itself (`user_version`). In 1, of 0.2, the column `interface` was `door`."""
 SCHEMA = """
 create table if not exists points (
     id integer primary key, node text not null, item text not null, unit text not null, unique (node, item, unit)
@@ -45,7 +46,7 @@ create table if not exists events (time real not null, node text, text text not 
 create index if not exists events_by_time on events (time);
 create table if not exists audit (
     time real not null,       -- seconds since 1970
-    door text not null,       -- mqtt, screen, ...
+    interface text not null,  -- mqtt, screen, ...
     by text not null,         -- the topic, the key
     user text not null, process integer not null,
     point text not null,
@@ -206,8 +207,13 @@ class SqliteOutput(BatchOutput[Rows]):
             database = self._database = sqlite3.connect(self._path, timeout=BUSY)
             [version] = database.execute("pragma user_version").fetchone()
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()
-            if version != VERSION and tables:  # an empty file has version 0 as well, and may be filled
-                raise InvalidCommand(f"{self._path} is a database of something else")
+            if tables and version > VERSION:
+                raise InvalidCommand(
+                    f"{self._path} has the layout {version}, and this version of busmaster writes {VERSION}: "
+                    "it is of a newer version, or of something else; upgrade, or give another path"
+                )
+            if tables and version < 1:  # an empty file has version 0 as well, and may be filled
+                raise InvalidCommand(f"{self._path} is a database of something else; give another path")
             database.execute("pragma journal_mode = wal")  # others may read while it grows
             history = database.execute("select sql from sqlite_master where name = 'history'").fetchone()
             if history is not None and "label" not in history[0]:
@@ -215,6 +221,9 @@ class SqliteOutput(BatchOutput[Rows]):
             points = database.execute("select sql from sqlite_master where name = 'points'").fetchone()
             if points is not None and ONE_ROW_A_POINT in points[0]:
                 database.executescript(REMADE)
+            audit = database.execute("select name from pragma_table_info('audit') where name = 'door'").fetchone()
+            if audit is not None:
+                database.execute("alter table audit rename column door to interface")
             database.executescript(SCHEMA)
             database.execute(f"pragma user_version = {VERSION}")
         return self._database

@@ -11,12 +11,12 @@ from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any
 
-from busmaster.arbiter.events import LatenessRaised, LineChanged, NodeChanged, PortFailed, RepliesLate
+from busmaster.arbiter.events import LineChanged, MaxReplyDelayRaised, NodeChanged, PortFailed, RepliesLate
 from busmaster.arbiter.health import Health
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.meaning import Named
 from busmaster.bus.polling import Quality, Sample, Snapshot
-from busmaster.gate.record import WriteRecord
 
 
 def number_text(value: float) -> str:
@@ -183,10 +183,10 @@ def event_text(event: BusEvent) -> str:
     match event:
         case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
             return f"{event.node.label} is {event.after.value}, was {event.before.value}"
-        case LatenessRaised():
+        case MaxReplyDelayRaised():
             return (
                 f"{event.node.label} answered after {event.age * 1000:.0f} ms: "
-                f"its lateness is now {event.lateness * 1000:.0f} ms"
+                f"its maximum reply delay is now {event.max_reply_delay * 1000:.0f} ms"
             )
         case RepliesLate():
             return (

@@ -2,7 +2,7 @@
 
 `plan` says how busy the line will be, how long each group's cycle takes, which group will miss cycles and what would
 fit, and how long anybody can wait in the worst case. Reply times are measured or declared; where neither is known,
-half of the nominal one is assumed. All times are in seconds.
+half of `late_after` is assumed. All times are in seconds.
 """
 
 from __future__ import annotations
@@ -130,9 +130,9 @@ def plan(
     could_merge: Sequence[Merge] = (),
     sharing: Sharing = ALONE,
 ) -> Plan:
-    """Reckon what becomes of these poll groups on this line.
+    """Calculate what becomes of these poll groups on this line.
 
-    `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
+    `others` may be asked beside them: the worst case calculates with those, and with every node's probe. `could_merge`
     are merges to be weighed that no group opts in to. `sharing` says who else has the line. Raises InvalidCommand for a
     period or phase that cannot be.
     """
@@ -211,7 +211,7 @@ class _Draft:
         self.longest = max(self.longest, seconds)
 
     def weigh(self) -> Generator[int, None, None]:
-        """Choose its exchanges, and reckon what each takes."""
+        """Choose its exchanges, and calculate what each takes."""
         self.exchanges = yield from _exchanges(self.group, self.group.merge, self.byte_time)
         for node, served in self.exchanges:
             exchange = node.open(served.command)
@@ -222,7 +222,7 @@ class _Draft:
         self.poll.cost = sum(self.costs)
 
     def weigh_further(self, could_merge: Sequence[Merge]) -> Generator[int, None, None]:
-        """Reckon what merges would save that nobody opted in to."""
+        """Calculate what merges would save that nobody opted in to."""
         if could_merge:
             merge = (*self.group.merge, *could_merge)
             further = _Draft(replace(self.group, merge=merge), self.byte_time)

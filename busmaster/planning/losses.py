@@ -12,7 +12,7 @@ from busmaster.contract.exchange import Exchange
 from busmaster.planning.worst_case import PlannedNode, unanswered
 
 LOST = 0.01
-"""The share of all frames, either way, that is reckoned to be lost."""
+"""The share of all frames, either way, that is calculated to be lost."""
 FAILED = (1 - LOST) ** -2 - 1
 """Attempts that fail then, for each that succeeds."""
 
@@ -40,12 +40,12 @@ class LostAttempts:
         self.windows = (inf, 0.0)
 
     def add(self, node: PlannedNode, exchange: Exchange[Any], byte_time: float) -> None:
-        """Reckon with one more exchange."""
+        """Calculate with one more exchange."""
         timing = exchange.timing
-        usual = timing.nominal / 2 if node.reply_time is None else node.reply_time
+        usual = timing.late_after / 2 if node.reply_time is None else node.reply_time
         window = min(window_of(usual, usual), timing.window)
         # The line goes on after the window and a short silence; a check shows that nothing is to come any more (R15).
-        silence = min(timing.byte_gap, LEAST_SILENCE * byte_time)
+        silence = min(timing.inter_byte_timeout, LEAST_SILENCE * byte_time)
         check = line_time(node.open(node.profile.probe), byte_time, node.reply_time)
         documented = unanswered(exchange, byte_time)
         self.documented += documented
@@ -54,7 +54,7 @@ class LostAttempts:
 
 
 def losses(utilisation: float, groups: list[tuple[float, LostAttempts]]) -> Losses:
-    """Reckon what a schedule asks of its line, that asks for `utilisation` of it while nothing is lost.
+    """Calculate what a schedule asks of its line, that asks for `utilisation` of it while nothing is lost.
 
     `groups` has the period of each in seconds, and what lost attempts cost it.
     """

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, TypeAlias
 from busmaster.arbiter.backlog import SHARE
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Priority, line_time
-from busmaster.arbiter.turns import PASSED_BY_EACH
-from busmaster.arbiter.unasked import NOISY_AFTER, QUIET
+from busmaster.arbiter.shared_backlog import PASSED_BY_EACH
+from busmaster.arbiter.unexpected import NOISY_AFTER, QUIET
 from busmaster.contract.exchange import Command, Exchange
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -56,35 +56,37 @@ ALONE = Sharing()
 
 def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
     """Return what, beside its timings, tells how long an exchange can take: two of one shape take equally long."""
-    later = tuple((leg.sent, leg.sizes.longest) for leg in exchange.later)
+    later = tuple((step.sent, step.sizes.longest) for step in exchange.later)
     return len(exchange.request), exchange.sizes.longest, later
 
 
 def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
     """Return for how many seconds one attempt can keep the line from others, if nothing is repeated in it.
 
-    Its settle is included. It is the H of R9: each leg's request, its lateness and its longest reply; then the silence
-    after the last byte, which a reply that trickles in puts off.
+    Its resynchronise is included. It is the H of R9: each step's request, its maximum reply delay and its longest
+    reply; then the silence after the last byte, which a reply that trickles in puts off.
     """
     before = worst = 0.0
-    legs = [(len(exchange.request), exchange.timing, exchange.sizes)]
-    legs += ((leg.sent, leg.timing, leg.sizes) for leg in exchange.later)
-    for sent, timing, sizes in legs:
+    steps = [(len(exchange.request), exchange.timing, exchange.sizes)]
+    steps += ((step.sent, step.timing, step.sizes) for step in exchange.later)
+    for sent, timing, sizes in steps:
         said = before + sent * byte_time + receive_latency
-        begins = timing.lateness + byte_time
-        whole = begins + sizes.longest * byte_time + timing.byte_gap  # then the leg is over, whatever still trickles in
-        quiet = max(QUIET, timing.byte_gap) + receive_latency + byte_time
+        begins = timing.max_reply_delay + byte_time
+        whole = (
+            begins + sizes.longest * byte_time + timing.inter_byte_timeout
+        )  # then the step is over, whatever still trickles in
+        quiet = max(QUIET, timing.inter_byte_timeout) + receive_latency + byte_time
         # Each byte puts the silence off; but a line that is not silent for longer is NOISY: nobody waits longer, but
         # fails with LineNoisy.
         trickles = min(begins + sizes.longest * quiet, whole + NOISY_AFTER + quiet)
         worst = max(worst, said + trickles + quiet)
         before = said + whole
-    return worst + exchange.closing * byte_time + exchange.timing.turnaround
+    return worst + exchange.closing * byte_time + exchange.timing.driver_release_time
 
 
 def unanswered(exchange: Exchange[Any], byte_time: float) -> float:
     """Return for how many seconds one attempt keeps the line from others if no byte of a reply comes."""
-    return len(exchange.request) * byte_time + max(exchange.timing.lateness, exchange.timing.turnaround)
+    return len(exchange.request) * byte_time + max(exchange.timing.max_reply_delay, exchange.timing.driver_release_time)
 
 
 @dataclass(frozen=True, slots=True)

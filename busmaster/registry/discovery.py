@@ -40,7 +40,7 @@ def protocols() -> tuple[Protocol, ...]:
         except Exception as error:  # whatever another package does
             brought = f" of {entry.dist.name}" if entry.dist is not None else ""
             warnings.warn(
-                f"the protocol {entry.name!r}{brought} cannot be used: {error}; mend or uninstall what brings it",
+                f"the protocol {entry.name!r}{brought} cannot be used: {error}; fix or uninstall what brings it",
                 stacklevel=2,
             )
     return tuple(sorted(found, key=lambda protocol: protocol.name))

@@ -115,7 +115,7 @@ class NodeKind:
     options: tuple[Option, ...] = ()
     """Arguments of its handle."""
     read_options: tuple[Option, ...] = ()
-    """Arguments of its handle's `read_item`, for the command line."""
+    """Arguments of its handle's `_read_item`, for the command line."""
     emulated: tuple[Option, ...] = ()
     """Arguments of `make_device`, said in [emulator.nodes.NAME]. One that is among `options` too is as the node says,
     unless it is said there."""

@@ -6,14 +6,23 @@ that sends the safe state.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+import os
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from typing import Any
 
-from busmaster.bounds import MOST_CLIENTS, MOST_STRANGERS, RESERVED_FOR_SAFE
-from busmaster.gate.permission import Permission
-from busmaster.gate.refusals import Refusals
-from busmaster.gate.rights import RIGHTS, Role
+from busmaster.authorisation.permission import Permission
+from busmaster.authorisation.refusals import Refusals
+from busmaster.authorisation.rights import RIGHTS, Role
+from busmaster.bounds import (
+    CONNECTIONS_A_SECOND,
+    FREE_CONNECTIONS,
+    MOST_CLIENTS,
+    MOST_CONNECTING_PEERS,
+    MOST_DELAYED,
+    MOST_STRANGERS,
+    RESERVED_FOR_SAFE,
+)
 from busmaster.service.client import Client
 from busmaster.service.messages import Malformed
 from busmaster.service.visit import Visit
@@ -69,6 +78,40 @@ class Admission:
             if rights.reserved and other is not role
         )
         return f"all {MOST_CLIENTS + RIGHTS[role].reserved} places for role {role.value} are taken; {others}"
+
+
+class ConnectionRate:
+    """How fast each peer connects. One that connects again and again would otherwise take the time of the line's loop:
+    a login costs about as much as thirty requests.
+
+    After FREE_CONNECTIONS a peer's connections are let in CONNECTIONS_A_SECOND; MOST_DELAYED wait for that, and others
+    are refused. So a client that comes in a crowd waits, and needs no second attempt.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._used_until: OrderedDict[Hashable, float] = OrderedDict()
+        """Until when the connections that came have used what each peer has; the peer that came longest ago first."""
+
+    def delay(self, peer: Hashable) -> float | None:
+        """Count a connection of a peer. Return for how many seconds it has to wait, None if it is refused."""
+        now = self._now()
+        used_until = max(now, self._used_until.pop(peer, now)) + 1 / CONNECTIONS_A_SECOND
+        delay = used_until - now - FREE_CONNECTIONS / CONNECTIONS_A_SECOND
+        refused = delay > MOST_DELAYED / CONNECTIONS_A_SECOND
+        self._used_until[peer] = used_until - 1 / CONNECTIONS_A_SECOND if refused else used_until
+        if len(self._used_until) > MOST_CONNECTING_PEERS:
+            self._used_until.popitem(last=False)
+        return None if refused else max(0.0, delay)
+
+
+def connecting_peer(origin: int | str | None, process: int) -> Hashable:
+    """Return what stands for a peer that connects, by its `origin`: a user, or an address.
+
+    Each process of the owner's user and of root stands for itself: one that connects again and again must not delay
+    the command that sends the safe state. Processes of another user have one rate together: it could have many.
+    """
+    return (origin, process) if origin in (0, os.getuid()) else origin
 
 
 def stranger_to_close(strangers: Collection[Visit]) -> Visit | None:

@@ -7,9 +7,13 @@ from dataclasses import replace
 from itertools import islice
 from typing import Any
 
+from busmaster import ext
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority
+from busmaster.authorisation.permission import Permission
+from busmaster.authorisation.refusals import INTERFACES
+from busmaster.authorisation.rights import RIGHTS, Rights, Role
 from busmaster.bounds import (
     LONGEST_SENDER,
     MOST_CHECKED,
@@ -26,9 +30,6 @@ from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import ORDINARY, Requester, RequestOptions, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import InvalidCommand
-from busmaster.gate.permission import Permission
-from busmaster.gate.refusals import INTERFACES
-from busmaster.gate.rights import RIGHTS, Rights, Role
 from busmaster.service.errands import Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of, said_error
 from busmaster.service.line import ServedLine
@@ -83,7 +84,7 @@ class Client:
         self._role = self.permission.role
         self.reads = _reads_of(self._role)
         """The options of its reads that say none."""
-        self.turn = line.bus.shared.add_client(line.share, self.rights.owner_time, peer.account)
+        self.turn = ext.line_of(line.bus).add_client(line.share, self.rights.owner_time, peer.account)
         """What its requests take turns by, with those of the others."""
         self._holds: dict[int, Hold | str] = {}
         """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
@@ -93,7 +94,7 @@ class Client:
     @property
     def permission(self) -> Permission:
         """Return what it may do, as it is now."""
-        return self.peer.permission(self._line.gate.access)
+        return self.peer.permission(self._line.authorisation.access)
 
     @property
     def rights(self) -> Rights:
@@ -103,7 +104,7 @@ class Client:
     @property
     def read_only(self) -> bool:
         """Return whether nothing that it writes is let through, as it is now."""
-        return self._line.gate.read_only or not self.permission.writes
+        return self._line.authorisation.read_only or not self.permission.writes
 
     @property
     def errands(self) -> tuple[Errand, ...]:
@@ -130,7 +131,7 @@ class Client:
         role = self.permission.role
         if role is not self._role:
             self._role, self.reads = role, _reads_of(role)
-            self._line.bus.shared.arbiter.change_client(self.turn, self.rights.owner_time)
+            ext.line_of(self._line.bus).arbiter.change_client(self.turn, self.rights.owner_time)
         self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
 
     def tell_stops(self, node: NodeRecord) -> None:
@@ -205,7 +206,7 @@ class Client:
             return
         for peer, count in islice(peers.items(), MOST_REPORTED + 1):
             if type(count) is int and 0 < count <= MOST_FAILED and len(peer) <= LONGEST_SENDER and peer.isprintable():
-                self._line.gate.refusals.note_login(str(interface), peer, count)
+                self._line.authorisation.refusals.note_login(str(interface), peer, count)
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
         """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""
@@ -304,17 +305,17 @@ class Client:
         bus, rights = self._line.bus, self.rights
         profile = profile_of(protocol, *sync_reads)
         times = timings_of(timings)
-        if known is None and not bus.has_node(profile, address):
-            if sum(not node.kept for node in self._nodes.values()) >= rights.new_nodes:
+        if known is None and not ext.has_node(bus, profile, address):
+            if sum(not ext.is_kept(node) for node in self._nodes.values()) >= rights.new_nodes:
                 raise InvalidCommand(
                     f"{profile.label(address)}: a program with the role {self._role.value} names {rights.new_nodes} "
                     "nodes at most that the line's owner does not have: add the node to the line's file"
                 )
             if not rights.own_times:
                 check_within(times, profile, address)
-        node = bus.lend_node(profile, address, timings=times, retries=retries, budgeted=rights.budgeted)
+        node = ext.lend_node(bus, profile, address, timings=times, retries=retries, budgeted=rights.budgeted)
         if known is not None:
-            bus.give_back(node)  # it was asked for its complaint alone
+            ext.give_back(bus, node)  # it was asked for its complaint alone
         self._nodes[name, address] = node
         self._stops.setdefault((name, address), node.stops)
         return node
@@ -346,7 +347,7 @@ class Client:
         hold = self._holds.get(sequence)
         if isinstance(hold, str):
             raise InvalidCommand(hold)
-        if hold is None or hold.node is not node.record:
+        if hold is None or hold.node is not ext.record_of(node):
             raise InvalidCommand(f"{node.label}: no sequence {sequence} was begun for it, of {MOST_HOLDS} at most")
         return hold
 
@@ -367,12 +368,12 @@ class Client:
             raise InvalidCommand(
                 f"{node.label}: {self.permission.who} may not hold the line for it: who may write to it does"
             )
-        return node.hold(seconds(params["max_hold"], "max_hold"), self.turn)
+        return ext.hold(node, seconds(params["max_hold"], "max_hold"), self.turn)
 
     def _release(self, sequence: int) -> None:
         hold = self._holds.pop(sequence, None)
         if isinstance(hold, Hold):
-            self._line.bus.shared.release(hold)
+            ext.line_of(self._line.bus).release(hold)
 
     # streams
 
@@ -443,7 +444,7 @@ class Client:
         await self.requests.give_up()
         for sequence in list(self._holds):
             self._release(sequence)
-        self._line.bus.shared.remove_client(self.turn)
+        ext.line_of(self._line.bus).remove_client(self.turn)
         for node in self._nodes.values():
-            self._line.bus.give_back(node)
+            ext.give_back(self._line.bus, node)
         self._nodes.clear()

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from math import inf
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from busmaster.authorisation.refusals import peer_of
 from busmaster.bounds import MOST_FRAMES, SEND_WITHIN
 from busmaster.errors import InvalidCommand
-from busmaster.gate.refusals import peer_of
 from busmaster.service.frames import NO_MASK, look_at, new_key, text_frame
 from busmaster.service.peers import CREDENTIALS
 
@@ -58,8 +58,12 @@ class Hearer(Protocol):
         ...
 
 
-class Doorkeeper(Hearer, Protocol):
+class TokenCheck(Hearer, Protocol):
     """Who hears what comes to one that serves, and decides whether it may."""
+
+    def delay(self, origin: int | str | None, process: int, /) -> float | None:
+        """Return after how many seconds a connection that was made is read; None if it is closed."""
+        ...
 
     def refusal(self, request: Request, /) -> tuple[int, str] | None:
         """Return the HTTP status and words with which a request to connect is refused; None if it is not."""
@@ -281,10 +285,10 @@ class ServedConnection(Connection):
     """The end of whoever serves."""
 
     _core: ServerProtocol
-    _hearer: Doorkeeper
+    _hearer: TokenCheck
     _serves = True
 
-    def __init__(self, hearer: Doorkeeper, *, longest: int, read_at_once: int) -> None:
+    def __init__(self, hearer: TokenCheck, *, longest: int, read_at_once: int) -> None:
         server = check_installed()[0]
         core = server(origins=[None], max_size=longest, logger=_quiet())
         super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
@@ -295,8 +299,15 @@ class ServedConnection(Connection):
         """When it was begun to count frames."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.origin = origin_of(transport.get_extra_info("socket"))
+        connected = transport.get_extra_info("socket")
+        self.origin = origin_of(connected)
         super().connection_made(transport)
+        delay = self._hearer.delay(self.origin, process_number(connected))
+        if delay is None:
+            self.abort()
+        elif delay:
+            self.pause()
+            self._set_timer("delay", delay, self.resume)
 
     def _check_frame(self) -> None:
         """Close the connection of a client that sends so many of them that it would take the time of others."""
@@ -379,6 +390,17 @@ class AskingConnection(Connection):
     def _shake_hands(self, event: Response) -> None:
         if self._core.state == _OPEN:
             self._open()
+
+
+def process_number(connected: socket.socket | None) -> int:
+    """Return the number of the process that has connected a Unix socket; 0 for a peer of the network."""
+    if connected is None or connected.family != socket.AF_UNIX:
+        return 0
+    try:
+        pid: int = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))[0]
+    except OSError:  # it has gone already
+        return 0
+    return pid
 
 
 def origin_of(connected: socket.socket | None) -> int | str | None:

@@ -7,20 +7,20 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
+from busmaster import ext
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.transaction import Transaction
+from busmaster.authorisation.authorisation import FRESH, NEVER_SENT, Wish, outcome_of
+from busmaster.authorisation.permission import Permission
+from busmaster.authorisation.rights import Rights
 from busmaster.bounds import LONGEST_WAIT
-from busmaster.bus.node import Journey, Node
+from busmaster.bus.node import Node, Request
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, RequestOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
-from busmaster.gate.gate import FRESH, NEVER_SENT, Wish, outcome_of
-from busmaster.gate.permission import Permission
-from busmaster.gate.rights import Rights
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import value_of
 from busmaster.service.peers import Peer
@@ -29,7 +29,7 @@ from busmaster.service.telling import protocol_of
 
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 """Of a request, those that a client may say."""
-DOOR = "service"
+INTERFACE = "service"
 RAW_COMMAND = "raw command"
 """What the record of a write names in place of a point, where no poll group has one: its value says the rest."""
 
@@ -111,9 +111,9 @@ class Task(NamedTuple):
             return cls(point.node, _encoded(point, value), point.command, value, point)
         except NEVER_SENT as error:
             by, permission = str(asker.peer), asker.permission
-            wish = Wish(door=DOOR, by=by, name=point.key, point=point, value=value, permission=permission)
-            refusal = line.gate.refusal(wish) or outcome_of(error)[1]
-            line.gate.refuse(wish, refusal)
+            wish = Wish(interface=INTERFACE, by=by, name=point.key, point=point, value=value, permission=permission)
+            refusal = line.authorisation.refusal(wish) or outcome_of(error)[1]
+            line.authorisation.refuse(wish, refusal)
             raise InvalidCommand(refusal) from None
 
 
@@ -126,7 +126,7 @@ class Reading:
     loop that a future takes is a part of what a program waits beyond what the line takes.
     """
 
-    __slots__ = ("_client", "_options", "_over", "_stops_seen", "_told", "_transaction", "command", "given_up", "node")
+    __slots__ = ("_over", "_request", "_told", "command", "given_up", "node")
 
     _told: Told
 
@@ -141,16 +141,13 @@ class Reading:
         self.node = node
         self.command = command
         self.given_up = False
-        self._client = client
-        self._stops_seen = stops_seen
-        self._options = options
-        self._transaction: Transaction | None = None
+        self._request = Request(command, options, stops_seen=stops_seen, client=client)
         self._over = False
 
     @property
     def sent(self) -> bool:
         """Return whether an attempt of it was handed to the line."""
-        return self._transaction is not None and self._transaction.attempts > 0
+        return self._request.sent
 
     def begin(self, told: Told) -> None:
         """Have it done; `told` hears its end once, perhaps before this returns.
@@ -158,15 +155,13 @@ class Reading:
         Raises BusError or InvalidCommand where nothing could be begun.
         """
         self._told = told
-        self._transaction = self.node.begin_reading(
-            self.command, self, self._options, stops_seen=self._stops_seen, client=self._client
-        )
+        ext.start(self.node, self._request, self)
 
     def cancel(self) -> None:
         """Give it up: what is on the wire runs out unheard."""
         if not self._over:
-            if self._transaction is not None:
-                self.node.give_up(self._transaction)
+            if self._request.transaction is not None:
+                ext.give_up(self.node, self._request.transaction)
             self._over = self.given_up = True
             self._told(self, None, None)
 
@@ -188,7 +183,7 @@ class Reading:
 
 
 class Writing:
-    """A command that writes, with its options, for one client. It passes the gate."""
+    """A command that writes, with its options, for one client. It passes authorisation."""
 
     def __init__(
         self,
@@ -207,14 +202,12 @@ class Writing:
         self.given_up = False
         self.doing: asyncio.Task[Any] | None = None
         """What is done for it, once it is begun."""
-        self._journey = Journey()
+        self._request = Request(task.command, ORDINARY, task.touches, stops_seen, stop, client)
         self._task = task
         self._options = options
         self._line = line
         self._asker = asker
-        self._client = client
         self._asked = asked
-        self._stops_seen = stops_seen
         self._stop = stop
         self._begun = False
         self._told: Told
@@ -222,17 +215,17 @@ class Writing:
     @property
     def sent(self) -> bool:
         """Return whether an attempt of it was handed to the line."""
-        return self._journey.sent
+        return self._request.sent
 
     def check(self) -> None:
         """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
         wish = self._wish()
         try:
-            if refusal := self._line.gate.refusal(wish):
+            if refusal := self._line.authorisation.refusal(wish):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             self.node.check(self.command, stop=self._stop)
         except InvalidCommand as error:
-            self._line.gate.refuse(wish, str(error))
+            self._line.authorisation.refuse(wish, str(error))
             raise
 
     def begin(self, told: Told) -> None:
@@ -252,14 +245,14 @@ class Writing:
 
     def _stop_node(self) -> None:
         """Count the stop that this write is, if it may be written; else its program is told how many count."""
-        if self._line.gate.refusal(self._wish()):
-            self._asker.tell_stops(self.node.record)
+        if self._line.authorisation.refusal(self._wish()):
+            self._asker.tell_stops(ext.record_of(self.node))
         else:
             self.node.note_stop()
 
     def _written(self, writing: asyncio.Task[Any]) -> None:
         if not self._begun:  # a task that is cancelled before its first step runs nothing of it
-            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
+            self._line.authorisation.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
         self.given_up = writing.cancelled()
         error = None if self.given_up else writing.exception()
         self._told(self, None if self.given_up or error is not None else writing.result(), error)
@@ -267,9 +260,9 @@ class Writing:
     async def _write(self) -> Any:
         self._begun = True
         wish = self._wish()
-        passage = self._line.gate.begin(wish)
+        passage = self._line.authorisation.begin(wish)
         try:
-            if refusal := self._line.gate.refusal(wish):
+            if refusal := self._line.authorisation.refusal(wish):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
                 raise NotStarted(
@@ -278,15 +271,10 @@ class Writing:
                     command=str(self.command),
                     hint="see whether the program that asked, or the one that owns the line, stood still meanwhile",
                 )
-            value = await self.node.followed_request(
-                self.command,
-                self._journey,
-                touches=self._task.touches,
-                stops_seen=self._stops_seen,
-                stop=self._stop,
-                client=self._client,
-                **_left(self._options, self._line.bus.now() - self._asked),
+            self._request.options = ext.checked_options(
+                self.node, _left(self._options, self._line.bus.now() - self._asked)
             )
+            value = await ext.run(self.node, self._request)
         except BaseException as error:
             passage.end(self._truth(error))
             raise
@@ -314,7 +302,7 @@ class Writing:
                 value = _value(point, changes, value)
         point = point or Point(self.node, RAW_COMMAND, command)
         return Wish(
-            door=DOOR,
+            interface=INTERFACE,
             by=str(self._asker.peer),
             name=point.key,
             point=point,
@@ -342,7 +330,7 @@ def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLin
     stops_seen = None if stops_seen is None else stops_seen + asker.stops_before(node)
     client = asker.client_of(said.get("sequence"), node)
     stop = said.get("stop") is True and _check_stop(node, command)
-    asked = min(now, seconds(said.get("asked", now), "asked"))
+    asked = min(now, seconds(said.get("requested", now), "requested"))
     if not command.writes:
         options = RequestOptions.of(_left(given, now - asked), node.label)
         options = replace(options, priority=max(options.priority, asker.rights.reads))

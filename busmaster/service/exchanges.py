@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from typing import Any
 
+from busmaster import ext
 from busmaster.arbiter.tap import Attempt
 from busmaster.bus.bus import Bus
 from busmaster.outputs.values import value_text
@@ -20,7 +21,7 @@ ENCODED_AT_ONCE = 40
 MOST_KEPT = 500
 """Exchanges between two messages: of more, the oldest are left out, and counted."""
 MOST_BYTES = 256
-"""Of one exchange, or of what came unasked, that are told."""
+"""Of one exchange, or of what came unexpected, that are told."""
 LONGEST_RESULT = 200
 HEARD_AT_ONCE = 200
 """Pieces of what passes that are put into their order at once."""
@@ -118,7 +119,7 @@ class ExchangesBroadcast(Broadcast):
 
     async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         listener = Listener()
-        self._bus.taps.add(listener)
+        ext.add_tap(self._bus, listener)
         try:
             while True:
                 parts: list[str] = []
@@ -131,7 +132,7 @@ class ExchangesBroadcast(Broadcast):
                 yield "exchanges", f'{head[:-1]},"exchanges":[{",".join(parts)}]}}'
                 await asyncio.sleep(INTERVAL)
         finally:
-            self._bus.taps.remove(listener)
+            ext.remove_tap(self._bus, listener)
 
 
 def said_passage(passage: Passage) -> list[Any]:
@@ -155,7 +156,7 @@ def said_passage(passage: Passage) -> list[Any]:
         attempt.verdict.value,
         _result(attempt.result),
         attempt.late,
-        round(attempt.settled * 1e6),
+        round(attempt.quiet_time * 1e6),
     ]
 
 

@@ -7,15 +7,16 @@ from functools import partial
 from math import inf, nextafter
 from typing import Any
 
+from busmaster import ext
 from busmaster.arbiter.health import NodeRecord
+from busmaster.authorisation.authorisation import Authorisation
+from busmaster.authorisation.rights import RIGHTS, Role
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
-from busmaster.gate.gate import Gate
-from busmaster.gate.rights import RIGHTS, Role
 from busmaster.service.exchanges import ExchangesBroadcast
 from busmaster.service.overview import Journal, Overview
 from busmaster.service.safe import SafeWishes
@@ -26,15 +27,15 @@ MOST_NAMED = 50
 
 
 class ServedLine:
-    """One line with its gate. `share` weighs the line time of each program: the owner's own share is 1."""
+    """One line with its authorisation. `share` weighs the line time of each program: the owner's own share is 1."""
 
-    def __init__(self, bus: Bus, gate: Gate, share: float, title: str) -> None:
+    def __init__(self, bus: Bus, authorisation: Authorisation, share: float, title: str) -> None:
         self.bus = bus
-        self.gate = gate
+        self.authorisation = authorisation
         self.share = share
         self.title = title
         """What is written over what a person sees of the line."""
-        self.safe_wishes = SafeWishes(gate)
+        self.safe_wishes = SafeWishes(authorisation)
         self.journal = Journal(bus)
         """What happens from now on, also before it is served."""
         self._demanded: dict[tuple[str, Role], float] = {}
@@ -61,7 +62,9 @@ class ServedLine:
     def overview(self) -> Broadcast:
         """Return what tells what a person sees of the line."""
         if self._overview is None:
-            self._overview = Overview(self.bus, self.gate, self.journal, lambda: self.title, self._end_overview)
+            self._overview = Overview(
+                self.bus, self.authorisation, self.journal, lambda: self.title, self._end_overview
+            )
         return self._overview
 
     def exchanges(self) -> Broadcast:
@@ -121,7 +124,7 @@ class ServedLine:
         """
         before = nextafter(when, -inf)
         points = {point.item: point for group in self.bus.groups for point in group.points_of(record)}
-        stale = [item for item, point in points.items() if self.bus.shared.is_stale(point, before)]
+        stale = [item for item, point in points.items() if ext.line_of(self.bus).is_stale(point, before)]
         return stale if len(stale) <= MOST_NAMED else None
 
     def _forget_group(self, group: PollGroup) -> None:

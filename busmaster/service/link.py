@@ -1,4 +1,4 @@
-"""The client's end of a connection: questions and their answers, and what comes unasked."""
+"""The client's end of a connection: questions and their answers, and what comes unexpected."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _text(command: Command[Any] | None) -> str | None:
 
 
 class Link:
-    """One connection to the owner of a line. `on_news` is told, in its order, what comes unasked."""
+    """One connection to the owner of a line. `on_news` is told, in its order, what comes unexpected."""
 
     def __init__(
         self,

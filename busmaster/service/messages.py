@@ -14,8 +14,8 @@ from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 
-VERSIONS = (2,)
-"""Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
+VERSIONS = (3,)
+"""Versions of the service protocol. A client names those that it knows first; the highest common one holds."""
 
 
 BEFORE_NUMBER = ',"id":'
@@ -112,7 +112,7 @@ def said_timings(timings: Timings | Learned | None) -> Any:
         return {"learned": said_timings(timings.document)}
     if timings is None:
         return None
-    return {leg: _said_timing(getattr(timings, leg)) for leg in ("read", "write", "packet")}
+    return {step: _said_timing(getattr(timings, step)) for step in ("read", "write", "packet")}
 
 
 def timings_of(said: Any) -> Timings | Learned | None:
@@ -125,12 +125,15 @@ def timings_of(said: Any) -> Timings | Learned | None:
             if isinstance(document, Learned):
                 raise TypeError("learned twice")
             return Learned(document)
-        legs = {leg: ReplyTiming(**timing) for leg, timing in said.items()}
-        times = Timings(**legs)
+        steps = {step: ReplyTiming(**timing) for step, timing in said.items()}
+        times = Timings(**steps)
     except (TypeError, KeyError) as error:
         raise InvalidCommand(f"these are no reply times: {error}") from None
-    for leg in legs.values():
-        if max(leg.lateness, leg.byte_gap, leg.turnaround, leg.silence or 0.0) > LONGEST_REPLY:
+    for step in steps.values():
+        if (
+            max(step.max_reply_delay, step.inter_byte_timeout, step.driver_release_time, step.silence or 0.0)
+            > LONGEST_REPLY
+        ):
             raise InvalidCommand(f"a program may have the line wait {LONGEST_REPLY:g} s for a reply, and no longer")
     return times
 
@@ -141,10 +144,10 @@ def check_within(times: Timings | Learned | None, profile: Profile, address: int
     The line sends nothing else while it waits for a reply.
     """
     times, limits = documented(times), profile.timings
-    for leg in () if times is None else ("read", "write", "packet"):
-        for name in ("lateness", "byte_gap", "turnaround", "silence"):
-            asked, limit = getattr(getattr(times, leg), name), getattr(getattr(limits, leg), name)
-            if asked is not None and asked > (getattr(limits, leg).lateness if limit is None else limit):
+    for step in () if times is None else ("read", "write", "packet"):
+        for name in ("max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence"):
+            asked, limit = getattr(getattr(times, step), name), getattr(getattr(limits, step), name)
+            if asked is not None and asked > (getattr(limits, step).max_reply_delay if limit is None else limit):
                 raise InvalidCommand(
                     f"{profile.label(address)}: {name} of {asked:g} s is longer than that of {profile.name}: "
                     "set it for the node in the line's file, or use a program with the role admin"
@@ -152,7 +155,7 @@ def check_within(times: Timings | Learned | None, profile: Profile, address: int
 
 
 def _said_timing(timing: ReplyTiming) -> dict[str, float]:
-    names = ("nominal", "window", "lateness", "byte_gap", "turnaround", "silence")
+    names = ("late_after", "window", "max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence")
     return {name: value for name in names if (value := getattr(timing, name)) is not None}
 
 

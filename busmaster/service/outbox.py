@@ -31,8 +31,8 @@ class _Letter:
 class Outbox:
     """Says what is put in at once, while the way is not full; what comes then waits here until `flush`.
 
-    Answers are never dropped, but where it is `crowded` a client is not to ask more; of news, which come unasked, the
-    oldest are dropped beyond MOST_UNREAD. `on_drop` is told whose that was.
+    Answers are never dropped, but where it is `crowded` a client is not to ask more; of news, which come unexpected,
+    the oldest are dropped beyond MOST_UNREAD. `on_drop` is told whose that was.
     """
 
     def __init__(self, way: Way, on_drop: Callable[[Hashable], None]) -> None:

@@ -13,9 +13,10 @@ from itertools import islice
 from operator import is_
 from typing import Any
 
-from busmaster.arbiter.counters import RecentUtilisation
+from busmaster import ext
+from busmaster.arbiter.counters import LineState, RecentUtilisation
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.state import LineState
+from busmaster.authorisation.authorisation import Authorisation
 from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
@@ -24,7 +25,6 @@ from busmaster.bus.polling import PollGroup
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
 from busmaster.contract.places import Placed
-from busmaster.gate.gate import Gate
 from busmaster.outputs.values import event_text, value_text
 from busmaster.service.messages import encoded
 from busmaster.service.streams import READERS_IN_A_TURN, Broadcast, Place
@@ -44,7 +44,7 @@ MOST_COUNTED = 2_000
 KEPT_EVENTS = 20
 UTILISATION_WINDOW = 1.0
 """Seconds."""
-STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
+STATES = {LineState.OFFLINE: "offline", LineState.RESYNCHRONISING: "resynchronising"}
 """What is worth a word: a line in use is ready."""
 
 
@@ -99,7 +99,7 @@ class Part:
 
     def say_values(self, number: int, bus: Bus) -> bool:
         """Work out what these points hold now, and return whether that is something else than before."""
-        snapshot, line = self.group.latest, bus.shared
+        snapshot, line = self.group.latest, ext.line_of(bus)
         if snapshot is None:
             return False
         touched = line.last_touched if line.last_touched > snapshot.due else None  # an older write changes nothing here
@@ -118,11 +118,16 @@ class Overview(Broadcast):
     """The pictures of one line. `title` says what is written over them."""
 
     def __init__(
-        self, bus: Bus, gate: Gate, journal: Journal, title: Callable[[], str], on_end: Callable[[], None]
+        self,
+        bus: Bus,
+        authorisation: Authorisation,
+        journal: Journal,
+        title: Callable[[], str],
+        on_end: Callable[[], None],
     ) -> None:
         super().__init__(on_end)
         self._bus = bus
-        self._gate = gate
+        self._authorisation = authorisation
         self._journal = journal
         self._title = title
         self._fresh: list[Place] = []
@@ -220,7 +225,7 @@ class Overview(Broadcast):
             "title": self._title(),
             "line": self._bus.endpoint.name,
             "settings": f"{settings.baudrate} {settings.framing}" if settings else "",
-            "read_only": self._gate.read_only,
+            "read_only": self._authorisation.read_only,
             "now": now,
             "elapsed": statistics.elapsed,
             "state": state_text(self._bus),
@@ -238,7 +243,7 @@ class Overview(Broadcast):
 
 
 def state_text(bus: Bus) -> str:
-    """Return what a line does: ready, settling or offline."""
+    """Return what a line does: ready, resynchronising or offline."""
     return STATES.get(bus.state, "ready")
 
 

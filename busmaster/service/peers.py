@@ -10,7 +10,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from busmaster.gate.permission import Access, Permission
+from busmaster.authorisation.permission import Access, Permission
 
 CREDENTIALS = struct.Struct("3i")
 PEER_GROUPS = 59

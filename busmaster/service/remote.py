@@ -61,7 +61,7 @@ class RemoteBus:
     """A line that another program owns. Use it in `async with`: entering connects, leaving lets go.
 
     Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
-    program counts for all, limits and the record of writes are the owner's. A node that the owner does not have is
+    program counts for all, limits and the audit log are the owner's. A node that the owner does not have is
     asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, or none
     of that name: it may be served later; and InvalidCommand for a write that was prepared before and that the line
     would not take. A lost connection is not made again: enter a new RemoteBus.
@@ -121,7 +121,7 @@ class RemoteBus:
                 self._ahead = max([await self._hear_clock() for _ in range(CLOCK_IS_HEARD)])
             for node, commands, stop in self._prepared:
                 for first in range(0, len(commands), MOST_CHECKED):
-                    await self._ask("check", node.said_check(commands[first : first + MOST_CHECKED], stop))
+                    await self._ask("check", node.said_sync_read(commands[first : first + MOST_CHECKED], stop))
         except BaseException:
             await link.close()
             raise

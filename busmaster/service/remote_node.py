@@ -185,7 +185,7 @@ class RemoteNode:
             "protocol": self._profile.name,
             "address": self._address,
             "command": self._protocol.write_down(command),
-            "asked": self._bus.now(),
+            "requested": self._bus.now(),
         }
         if touches is not None:
             params["touches"] = self._protocol.write_down(touches)
@@ -200,7 +200,7 @@ class RemoteNode:
             params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return words("request", params)
 
-    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
+    def said_sync_read(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
         """Return writes of this node as the line is asked whether it would take them."""
         said = [self._protocol.write_down(command) for command in commands]
         return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}

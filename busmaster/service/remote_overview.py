@@ -58,7 +58,13 @@ class RemoteOverview:
 
     async def write(self, group: str, key: str, value: Any) -> None:
         """Write a point of a group. Raises BusError or InvalidCommand as `Point.write`; the owner's limits hold."""
-        params = {"group": group, "key": key, "value": value, "asked": self._now(), "options": {"start_within": SOON}}
+        params = {
+            "group": group,
+            "key": key,
+            "value": value,
+            "requested": self._now(),
+            "options": {"start_within": SOON},
+        }
         asked = self._link.ask("write", params, writes=True)
         await self._link.answer(asked)
 

@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
+from busmaster.authorisation.authorisation import Authorisation, SafeWrites
 from busmaster.errors import BusError, InvalidCommand
-from busmaster.gate.gate import Gate, SafeWrites
 from busmaster.service.failures import bus_error_of, error_data
 from busmaster.service.peers import Peer
 
@@ -15,8 +15,8 @@ from busmaster.service.peers import Peer
 class SafeWishes:
     """Sends it: once begun it goes on, also when whoever asked for it has gone."""
 
-    def __init__(self, gate: Gate) -> None:
-        self._gate = gate
+    def __init__(self, authorisation: Authorisation) -> None:
+        self._authorisation = authorisation
         self._sending: asyncio.Task[dict[str, Any]] | None = None
 
     @property
@@ -30,7 +30,7 @@ class SafeWishes:
         Whoever asks while it is being sent has a part in that. Raises InvalidCommand where he may not, and where he
         expects something else.
         """
-        state = self._gate.safe_state
+        state = self._authorisation.safe_state
         if state is None or not state.values:
             raise InvalidCommand("the program that owns this line knows no safe state: end it, then send yours")
         if dict(wanted) != dict(state.values):
@@ -39,7 +39,9 @@ class SafeWishes:
                 "have it read the file again"
             )
         refusal = (
-            "this line is read-only" if self._gate.read_only else state.refusal(peer.permission(self._gate.access))
+            "this line is read-only"
+            if self._authorisation.read_only
+            else state.refusal(peer.permission(self._authorisation.access))
         )
         if refusal:
             raise InvalidCommand(refusal)
@@ -54,7 +56,7 @@ class SafeWishes:
             await asyncio.wait([self._sending])
 
     async def _send(self, state: SafeWrites, by: str) -> dict[str, Any]:
-        outcomes = await state.enter(self._gate, by, leaving=False)
+        outcomes = await state.enter(self._authorisation, by, leaving=False)
         return {name: None if error is None else error_data(error) for name, error in outcomes.items()}
 
 

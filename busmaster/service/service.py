@@ -15,14 +15,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from busmaster import ext
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
+from busmaster.authorisation.authorisation import Authorisation
+from busmaster.authorisation.refusals import Logins, wait_text
 from busmaster.bus.bus import Bus
 from busmaster.errors import InvalidCommand
-from busmaster.gate.gate import Gate
-from busmaster.gate.refusals import Logins, wait_text
 from busmaster.registry import protocols
-from busmaster.service.admission import Admission, stranger_to_close
+from busmaster.service.admission import Admission, ConnectionRate, connecting_peer, stranger_to_close
 from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
@@ -48,21 +49,21 @@ NAME_WITHIN = 1.0
 class Service:
     """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
 
-    `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
-    line, by default its port's: letters, digits, and _.- between them. Every write passes `gate`, which says who may do
-    what: without one, its own, which keeps a record in the log "busmaster.audit", and lets this user write and others
-    read. `mode` and `group`, a number, are the socket's. `listen` is a host and a port where programs may come by TCP
-    too: off this machine only where the gate knows tokens. Each program takes turns with the others and with this one;
-    `share`, 0.1 to 10, weighs its line time: with 0.5, half as much as this one has, as long as both wait. `title` is
-    written over what a person sees of the line. Raises InvalidCommand for what cannot be; so does entering where the
-    socket is served by another process, which it names, or cannot be made.
+    `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the line,
+    by default its port's: letters, digits, and _.- between them. Every write passes `authorisation`, which says who may
+    do what: without one, its own, which keeps a record in the log "busmaster.audit", and lets this user write and
+    others read. `mode` and `group`, a number, are the socket's. `listen` is a host and a port where programs may come
+    by TCP too: off this machine only where authorisation knows tokens. Each program takes turns with the others and
+    with this one; `share`, 0.1 to 10, weighs its line time: with 0.5, half as much as this one has, as long as both
+    wait. `title` is written over what a person sees of the line. Raises InvalidCommand for what cannot be; so does
+    entering where the socket is served by another process, which it names, or cannot be made.
     """
 
     def __init__(
         self,
         bus: Bus,
         *,
-        gate: Gate | None = None,
+        authorisation: Authorisation | None = None,
         name: str | None = None,
         path: Path | str | None = None,
         mode: int = 0o600,
@@ -74,11 +75,11 @@ class Service:
         if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
             raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
         self.bus = bus
-        self.gate = gate or Gate(bus)
+        self.authorisation = authorisation or Authorisation(bus)
         if listen is not None:
-            check_listening(listen, tokens=bool(self.gate.access.secrets))
+            check_listening(listen, tokens=bool(self.authorisation.access.secrets))
         self.name = line_name(bus.endpoint.name) if name is None else checked_name(name)
-        self.line = ServedLine(bus, self.gate, share, title or self.name)
+        self.line = ServedLine(bus, self.authorisation, share, title or self.name)
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
@@ -92,8 +93,9 @@ class Service:
         """Connections of which no first message has come, the oldest first."""
         self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
-        self._admission = Admission(self.gate.refusals)
-        self._logins = Logins(partial(self.gate.refusals.note_login, "service"), time.monotonic)
+        self._admission = Admission(self.authorisation.refusals)
+        self._rate = ConnectionRate(time.monotonic)
+        self._logins = Logins(partial(self.authorisation.refusals.note_login, "service"), time.monotonic)
         self._log = logging.getLogger("busmaster.service")
         self.tell: Callable[[str], None] = self._log.warning
         """Told, at most once a minute, of connections and logins that were refused."""
@@ -152,21 +154,21 @@ class Service:
                 server.close()
             served.__exit__(None, None, None)
             raise
-        self.bus.on_stop.append(self._tell_stop)
+        ext.line_of(self.bus).on_stop.append(self._tell_stop)
         self.line.journal.begin()
-        self.bus.on_touched.append(self._tell_touched)
-        self.gate.on_access.append(self._tell_access)
-        self.gate.refusals.on_report.append(self._report)
+        ext.line_of(self.bus).on_touched.append(self._tell_touched)
+        self.authorisation.on_access.append(self._tell_access)
+        self.authorisation.refusals.on_report.append(self._report)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
-        self.bus.on_stop.remove(self._tell_stop)
-        self.bus.on_touched.remove(self._tell_touched)
-        self.gate.on_access.remove(self._tell_access)
-        self.gate.refusals.on_report.remove(self._report)
+        ext.line_of(self.bus).on_stop.remove(self._tell_stop)
+        ext.line_of(self.bus).on_touched.remove(self._tell_touched)
+        self.authorisation.on_access.remove(self._tell_access)
+        self.authorisation.refusals.on_report.remove(self._report)
         await self.line.safe_wishes.close()
         for server in self._servers:
             server.close()
@@ -227,6 +229,14 @@ class Service:
         self._strangers[visit] = None
         return visit.connection
 
+    def delay(self, origin: int | str | None, process: int, /) -> float | None:
+        """Return after how many seconds a connection from there is read; None if it is closed, and counted."""
+        delay = self._rate.delay(connecting_peer(origin, process))
+        if delay is None:
+            self.refused += 1
+            self.authorisation.refusals.note_rate(origin if isinstance(origin, str) else f"user {origin}")
+        return delay
+
     def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
         """Note who has come. Refuse what may be a page's, whoever shows no token, and one too many.
 
@@ -248,7 +258,7 @@ class Service:
                 return HTTPStatus.TOO_MANY_REQUESTS, f"{wait_text(wait)}\n"
         if peer is None:
             return HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n"
-        permission = peer.permission(self.gate.access)
+        permission = peer.permission(self.authorisation.access)
         # One that may write says in `hello` whether it only sends the safe state, which has places of its own.
         if not permission.writes and (refusal := self._admission.refusal(permission, self._clients)):
             return HTTPStatus.SERVICE_UNAVAILABLE, f"{refusal}\n"
@@ -262,12 +272,12 @@ class Service:
         """Return who has connected; None for whoever shows no token where one is needed."""
         if connected.family == socket.AF_UNIX:
             return process_of(connected)
-        return holder(connected, shown, self.gate.access)
+        return holder(connected, shown, self.authorisation.access)
 
     def _tell_access(self) -> None:
         """Let those go whose token holds no more, and tell the others what they may do now."""
         for client, visit in self._clients.items():
-            if client.peer.may_stay(self.gate.access):
+            if client.peer.may_stay(self.authorisation.access):
                 client.tell_access()
             else:
                 visit.connection.abort()
@@ -280,10 +290,14 @@ class Service:
             raise Malformed("the first message is hello, with the versions that its client knows")
         common = [version for version in VERSIONS if version in wanted]
         if not common:
-            raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
-        if not visit.peer.may_stay(self.gate.access):
+            raise Malformed(
+                f"the service protocol has version {VERSIONS[-1]} here, not {wanted}: "
+                "update the older of the two programs",
+                INVALID_PARAMS,
+            )
+        if not visit.peer.may_stay(self.authorisation.access):
             raise Malformed("this token is known no more")
-        permission, safe_only = visit.peer.permission(self.gate.access), params.get("safe_only") is True
+        permission, safe_only = visit.peer.permission(self.authorisation.access), params.get("safe_only") is True
         in_safe_place = self._admission.admit(permission, self._clients, safe_only=safe_only)
 
         def drop(stream: object) -> None:
@@ -339,8 +353,8 @@ class Service:
             "process": owner.pid,
             "read_only": client.read_only,
             "clients": len(self._clients),
-            "refused_connections": self.gate.refusals.connections.total(),
-            "failed_logins": self.gate.refusals.logins.total(),
+            "refused_connections": self.authorisation.refusals.connections.total(),
+            "failed_logins": self.authorisation.refusals.logins.total(),
             "state": state_text(self.bus),
             "nodes": nodes,
         }

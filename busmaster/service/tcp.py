@@ -6,8 +6,8 @@ import ipaddress
 import socket
 from collections.abc import Sequence
 
+from busmaster.authorisation.permission import Access
 from busmaster.errors import InvalidCommand
-from busmaster.gate.permission import Access
 from busmaster.service.peers import Holder, holder_of
 
 HostPort = tuple[str, int]

@@ -10,10 +10,10 @@ from typing import Any, Protocol, cast
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, Quantiles
 from busmaster.arbiter.events import (
-    LatenessLowered,
-    LatenessRaised,
     LineChange,
     LineChanged,
+    MaxReplyDelayLowered,
+    MaxReplyDelayRaised,
     NodeChanged,
     PortFailed,
     RepliesLate,
@@ -53,11 +53,11 @@ def said_sync_reads(profile: Profile) -> dict[str, Any]:
     """Return the probe and the sync reads of a kind of node, as they are sent, where they are not its protocol's."""
     protocol = protocol_of(profile.name)
     usual = protocol.profile
-    if (profile.probe, tuple(profile.checks)) == (usual.probe, tuple(usual.checks)):
+    if (profile.probe, tuple(profile.sync_reads)) == (usual.probe, tuple(usual.sync_reads)):
         return {}
     return {
         "probe": protocol.write_down(profile.probe),
-        "sync_reads": [protocol.write_down(command) for command in profile.checks],
+        "sync_reads": [protocol.write_down(command) for command in profile.sync_reads],
     }
 
 
@@ -74,7 +74,7 @@ def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
     for command in (first, *others):
         if command.writes:
             raise InvalidCommand(f"{protocol.name}: a probe or sync read must read, and {command} writes")
-    return replace(protocol.profile, probe=first, checks=tuple(others))
+    return replace(protocol.profile, probe=first, sync_reads=tuple(others))
 
 
 # snapshots
@@ -169,10 +169,10 @@ def said_event(event: BusEvent) -> dict[str, Any] | None:
     match event:
         case NodeChanged():
             said |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
-        case LatenessRaised():
-            said |= {"age": event.age, "lateness": event.lateness}
-        case LatenessLowered():
-            said |= {"lateness": event.lateness}
+        case MaxReplyDelayRaised():
+            said |= {"age": event.age, "max_reply_delay": event.max_reply_delay}
+        case MaxReplyDelayLowered():
+            said |= {"max_reply_delay": event.max_reply_delay}
         case RepliesLate():
             said |= {"age": event.age, "window": event.window}
         case LineChanged():
@@ -200,17 +200,17 @@ def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
     if name == "AlarmChanged":
         point = owners_point_of(said["point"], find)
         return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
-    if name not in ("NodeChanged", "LatenessRaised", "LatenessLowered", "RepliesLate"):
+    if name not in ("NodeChanged", "MaxReplyDelayRaised", "MaxReplyDelayLowered", "RepliesLate"):
         return None
     # It has all that an event's reader asks of a node: label, address, profile, line.
     node = cast("NodeRecord", find(said["protocol"], said["address"]))
     if name == "NodeChanged":
         return NodeChanged(node, Health(said["before"]), Health(said["after"]), said["returning"])
-    if name == "LatenessRaised":
-        return LatenessRaised(node, said["age"], said["lateness"])
+    if name == "MaxReplyDelayRaised":
+        return MaxReplyDelayRaised(node, said["age"], said["max_reply_delay"])
     if name == "RepliesLate":
         return RepliesLate(node, said["age"], said["window"])
-    return LatenessLowered(node, said["lateness"])
+    return MaxReplyDelayLowered(node, said["max_reply_delay"])
 
 
 # statistics

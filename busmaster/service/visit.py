@@ -56,6 +56,10 @@ class Host(Protocol):
     @property
     def reception(self) -> Reception: ...
 
+    def delay(self, origin: int | str | None, process: int, /) -> float | None:
+        """Return after how many seconds a connection from there is read; None if it is closed."""
+        ...
+
     def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
         """Note who has come; return the HTTP status and words with which one is refused, None if it is not."""
         ...
@@ -89,6 +93,10 @@ class Visit:
         self._stranger = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
 
     # what the connection tells
+
+    def delay(self, origin: int | str | None, process: int, /) -> float | None:
+        """Return what its host says."""
+        return self._host.delay(origin, process)
 
     def refusal(self, request: Request, /) -> tuple[int, str] | None:
         """Return what its host says."""

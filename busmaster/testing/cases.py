@@ -16,14 +16,14 @@ from busmaster.errors import Refused
 class Case:
     """One exchange as the protocol's document has it.
 
-    `legs` is what the node says, one item a leg: one for most protocols; in MSC the ACK and the packet; none for a
-    broadcast. A node that has to be asked again (a NAK that the reader answers by itself) says one leg each time.
+    `steps` is what the node says, one item a step: one for most protocols; in MSC the ACK and the packet; none for a
+    broadcast. A node that has to be asked again (a NAK that the reader answers by itself) says one step each time.
     It ends with `value`, or `raises` Refused or its subclass. `request` is what must be sent, if that is to be checked.
     """
 
     command: Command[Any]
     address: int
-    legs: Sequence[bytes]
+    steps: Sequence[bytes]
     value: Any = None
     raises: type[Refused] | None = None
     request: bytes | None = None

@@ -41,7 +41,7 @@ def check_command(command: Command[Any], address: int, timings: Timings) -> Iter
         yield f"{command!r} opens the same exchange twice: each attempt needs a fresh one"
     if not first.request or first.request != second.request:
         yield f"{command!r} sends {first.request.hex(' ')!r}, and then {second.request.hex(' ')!r}"
-    own = replace(command.open(address, OTHER_TIMINGS).timing, turnaround=0.0)
+    own = replace(command.open(address, OTHER_TIMINGS).timing, driver_release_time=0.0)
     if own not in (OTHER_TIMINGS.read, OTHER_TIMINGS.write):
         yield f"{command!r} does not take the read or write timing that its node has"
     yield from _check_announcements(command, first)
@@ -68,7 +68,7 @@ def _check_immutable(command: Command[Any]) -> Iterator[str]:
 
 
 def _check_announcements(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]:
-    for sizes in (exchange.sizes, *(leg.sizes for leg in exchange.later)):
+    for sizes in (exchange.sizes, *(step.sizes for step in exchange.later)):
         if not 0 <= sizes.typical <= sizes.longest:
             yield f"{command!r} announces a reply of typically {sizes.typical} and at most {sizes.longest} bytes"
     if not exchange.answered and not command.writes:
@@ -81,7 +81,7 @@ def _check_keys(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]
 
     They are a tuple, and no key is empty, for that fits every byte.
     """
-    for name in ("answers", "owed"):
+    for name in ("answers", "overdue"):
         keys: object = getattr(exchange, name, None)
         if not isinstance(keys, tuple) or not all(isinstance(key, bytes) and key for key in keys):
             yield f"{command!r}: {name} is a tuple of what its replies begin with, not {keys!r}"
@@ -106,7 +106,7 @@ def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
 def check_checks(profile: Profile) -> Iterator[str]:
     """Say which of the checks write, or have answers that could be taken for each other."""
     seen: dict[bytes, Command[Any]] = {}
-    for check in profile.checks:
+    for check in profile.sync_reads:
         if check.writes:
             yield f"the check {check!r} writes"
             continue

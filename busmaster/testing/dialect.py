@@ -49,7 +49,7 @@ def _check(protocol: Protocol, case: Case) -> Iterator[str]:
     if (found := _hear(protocol, said, NOISE)) != frames:
         yield f"behind noise it is {_told(found)} in place of {_told(frames)}"
     yield from _check_request(protocol, case, frames)
-    if case.legs:
+    if case.steps:
         yield from _check_answer(case, frames)
     yield from _check_written(protocol, case.command)
 
@@ -59,9 +59,9 @@ def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
     driver = Driver(case.command.open(case.address, protocol.profile.timings))
     yield Direction.HOST, driver.exchange.request
     heard = 0
-    for leg in case.legs:
-        yield Direction.NODE, leg
-        driver.feed(leg)
+    for step in case.steps:
+        yield Direction.NODE, step
+        driver.feed(step)
         yield from ((Direction.HOST, word) for word in driver.said[heard:])
         heard = len(driver.said)
     ending = driver.ending

@@ -22,8 +22,8 @@ hold:
 - no reply to another case is accepted, unless `names` says that replies cannot tell the two apart; no `foreign` one;
 - any bytes at all end in a value, FrameError or Refused, and every exchange has an end; the profile's listener, if it
   has one, takes any bytes too;
-- what follows a reply is handed back; sizes, legs, starts and closing bytes are as announced;
-- so are `answers` and `owed` (R15): good replies begin so, and commands whose good replies could be exchanged share
+- what follows a reply is handed back; sizes, steps, starts and closing bytes are as announced;
+- so are `answers` and `overdue` (R15): good replies begin so, and commands whose good replies could be exchanged share
   one; the profile's `checks` are reads, and share none;
 - commands are immutable, hashable values with a text; bad arguments raise InvalidCommand (`invalid`);
 - every attempt sends the same bytes, and no two addresses do;
@@ -49,7 +49,7 @@ from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks
 
 FINDINGS_EACH = 3
 """How many findings of one kind a case may add: the rest would only repeat them."""
-UNASKED = b"\x00\x7f"
+UNEXPECTED = b"\x00\x7f"
 
 
 def check_protocol(
@@ -119,13 +119,13 @@ class _Kit:
         return self.listen(case.command, case.address).feed(*chunks)
 
     def turns(self, case: Case) -> list[list[bytes]]:
-        """Return the legs, those in one list that come without a word of the host between: they may be one chunk."""
+        """Return the steps, those in one list that come without a word of the host between: they may be one chunk."""
         driver = self.listen(case.command, case.address)
         turns: list[list[bytes]] = [[]]
-        for leg in case.legs:
+        for step in case.steps:
             said = len(driver.said)
-            driver.feed(leg)
-            turns[-1].append(leg)
+            driver.feed(step)
+            turns[-1].append(step)
             if len(driver.said) > said:
                 turns.append([])
         return turns
@@ -147,24 +147,24 @@ class _Kit:
         silence = self.listen(case.command, case.address).run_out()
         if silence.delivered is exchange.answered or silence.is_bug or silence.is_whole:
             yield f"{case}: with no reply at all it ends with {silence}"
-        ending = driver.feed(*case.legs).ending if exchange.answered else driver.run_out()
+        ending = driver.feed(*case.steps).ending if exchange.answered else driver.run_out()
         if ending is None:
-            yield f"{case}: the reply {_hex(case.legs)} does not end it"
+            yield f"{case}: the reply {_hex(case.steps)} does not end it"
         elif case.raises is not None:
             if type(ending.error) is not case.raises:
-                yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.raises.__name__}"
+                yield f"{case}: the reply {_hex(case.steps)} gives {ending} in place of {case.raises.__name__}"
         elif not ending.delivered or ending.value != case.value or ending.rest:
-            yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.value!r}"
-        elif exchange.answered and len(b"".join(driver.said)) == sum(leg.sent for leg in exchange.later):
+            yield f"{case}: the reply {_hex(case.steps)} gives {ending} in place of {case.value!r}"
+        elif exchange.answered and len(b"".join(driver.said)) == sum(step.sent for step in exchange.later):
             yield from self._check_announced(case, exchange, ending)
 
     def _check_announced(self, case: Case, exchange: Exchange[Any], ending: Ending) -> Iterator[str]:
-        sizes = [exchange.sizes, *(leg.sizes for leg in exchange.later)]
-        if len(case.legs) != len(sizes):
-            yield f"{case}: {len(case.legs)} legs in place of the {len(sizes)} announced"
-        for leg, size in zip(case.legs, sizes, strict=False):
-            if len(leg) > size.longest:
-                yield f"{case}: a leg of {len(leg)} bytes is longer than the {size.longest} announced"
+        sizes = [exchange.sizes, *(step.sizes for step in exchange.later)]
+        if len(case.steps) != len(sizes):
+            yield f"{case}: {len(case.steps)} steps in place of the {len(sizes)} announced"
+        for step, size in zip(case.steps, sizes, strict=False):
+            if len(step) > size.longest:
+                yield f"{case}: a step of {len(step)} bytes is longer than the {size.longest} announced"
         if len(ending.send) != exchange.closing:
             yield f"{case}: closes with {len(ending.send)} bytes, not with the {exchange.closing} announced"
         fresh = case.command.open(case.address, self.profile.timings)
@@ -181,8 +181,8 @@ class _Kit:
                 if parts.said != whole.said or not _alike(parts.ending, whole.ending):
                     yield f"{case}: {run.hex(' ')} gives {whole.ending}, and {parts.ending} as {_hex(chunks)}"
             if whole.ending is not None and whole.ending.delivered:
-                more = self.hear(case, *before, run + UNASKED).ending
-                if more is None or more.rest != UNASKED:
+                more = self.hear(case, *before, run + UNEXPECTED).ending
+                if more is None or more.rest != UNEXPECTED:
                     yield f"{case}: what follows the reply in the same chunk is not handed back: {more}"
 
     def check_truncations(self, case: Case) -> Iterator[str]:
@@ -221,21 +221,21 @@ class _Kit:
 
     def check_starts(self, case: Case) -> Iterator[str]:
         """Check that a byte that begins no reply gives none, whatever follows it."""
-        if not case.legs:
+        if not case.steps:
             return
         starts = self.listen(case.command, case.address).exchange.starts
-        if case.legs[0][0] not in starts:
-            yield f"{case}: its reply begins with {case.legs[0][0]:02x}, which is not in starts"
+        if case.steps[0][0] not in starts:
+            yield f"{case}: its reply begins with {case.steps[0][0]:02x}, which is not in starts"
         for byte in range(1 << self.profile.line.bytesize):
             if byte not in starts:
-                ending = self.hear(case, bytes((byte,)), *case.legs).run_out()
+                ending = self.hear(case, bytes((byte,)), *case.steps).run_out()
                 if ending.delivered or isinstance(ending.error, Refused) or ending.is_bug:
                     yield f"{case}: {byte:02x}, which is not in starts, and then the reply gives {ending}"
 
     def check_garbage(self, case: Case, count: int) -> Iterator[str]:
         for _ in range(count):
             self.tally["garbage"] += 1
-            chunks = list(garbage_chunks(self._random, b"".join(case.legs)))
+            chunks = list(garbage_chunks(self._random, b"".join(case.steps)))
             ending = self.hear(case, *chunks).run_out()
             if ending.is_bug:
                 yield f"{case}: {_hex(chunks)} gives {ending}"
@@ -243,7 +243,7 @@ class _Kit:
                 yield from self._check_listener(self.profile.listen(), chunks)
 
     def _check_listener(self, listener: Listener, chunks: Iterable[bytes]) -> Iterator[str]:
-        """Check that one listener serves all that comes unasked: it goes on after whatever it was fed."""
+        """Check that one listener serves all that comes unexpected: it goes on after whatever it was fed."""
         for chunk in chunks:
             try:
                 listener.feed(chunk)
@@ -274,7 +274,7 @@ class _Kit:
         good = [case for case in self.cases if self._first_turn(case)]
         for mine in good:
             for other in good:
-                exchanged = self.hear(mine, *other.legs).ending
+                exchanged = self.hear(mine, *other.steps).ending
                 if other is not mine and exchanged is not None and exchanged.delivered:
                     asked, answered = (case.command.open(case.address, self.profile.timings) for case in (mine, other))
                     if what := check_exchangeable(asked, answered):
@@ -285,8 +285,8 @@ class _Kit:
 
         It is empty for a broadcast, a refusal, and where something had to be repeated.
         """
-        driver = self.hear(case, *case.legs)
-        repeated = len(b"".join(driver.said)) != sum(leg.sent for leg in driver.exchange.later)
+        driver = self.hear(case, *case.steps)
+        repeated = len(b"".join(driver.said)) != sum(step.sent for step in driver.exchange.later)
         return b"" if repeated or case.raises is not None else b"".join(self.turns(case)[0])
 
     def check_foreign(self, foreign: Iterable[Foreign]) -> Iterator[str]:
@@ -298,7 +298,7 @@ class _Kit:
     ) -> Iterator[str]:
         """Check that `heard` is not accepted.
 
-        `good` replies may stand at the front of `heard`: what follows them is left over and settles the line.
+        `good` replies may stand at the front of `heard`: what follows them is left over and resynchronises the line.
         """
         self.tally["foreign"] += 1
         ending = self.listen(command, address).feed(heard).run_out()

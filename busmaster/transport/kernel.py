@@ -165,7 +165,7 @@ class Socket(_Descriptor):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     def _usual_acknowledgement(self) -> float:
-        """Return it in seconds, as the kernel reckons for its own repeats; 0 where it does not tell."""
+        """Return it in seconds, as the kernel calculates for its own repeats; 0 where it does not tell."""
         if not hasattr(socket, "TCP_INFO"):
             return 0.0
         try:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import serial
 
-from busmaster.arbiter.mark import Mark
+from busmaster.arbiter.counters import Mark
 
 ESCAPE = 0xFF
 _INPUT_FLAGS = termios.INPCK | termios.PARMRK

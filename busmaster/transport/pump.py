@@ -16,10 +16,8 @@ from typing import Any, Protocol, cast
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.counters import DriverErrors
+from busmaster.arbiter.counters import DriverErrors, LineState, Mark
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
-from busmaster.arbiter.mark import Mark
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.errors import BusError, cause_text
@@ -29,7 +27,7 @@ from busmaster.transport.kernel import OpenPort, open_port
 
 STUCK_AFTER = 5.0
 """Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
-network that lost a segment let go within one or two; whatever holds it longer does not mend by itself, and a request
+network that lost a segment let go within one or two; whatever holds it longer does not fix by itself, and a request
 that old may move a machine when nobody expects it any more."""
 
 
@@ -97,18 +95,14 @@ class Pump(asyncio.Protocol):
 
     # what the bus calls
 
-    def transact(self, transaction: Transaction) -> asyncio.Future[Any]:
-        """Submit a transaction; the future gets its value or its error."""
-        assert self._loop is not None
-        transaction.tag = future = self._loop.create_future()
-        if self.arbiter.submit(transaction, self.clock()):  # as begin does: this is done for every request
-            self.turn()
-        return future
+    def begin(self, transaction: Transaction, waiter: Waiter | None) -> None:
+        """Submit a transaction; `waiter` gets its value or its error, perhaps before this returns.
 
-    def begin(self, transaction: Transaction, waiter: Waiter) -> None:
-        """Submit a transaction; `waiter` is told its value or its error, perhaps before this returns."""
-        transaction.tag = waiter
-        # A request that only waits changes nothing that is to be sent, told or timed.
+        Without a waiter, the transaction's tag becomes a future, which gets them.
+        """
+        assert self._loop is not None
+        transaction.tag = self._loop.create_future() if waiter is None else waiter
+        # A request that only waits changes nothing that is to be sent, reported or timed.
         if self.arbiter.submit(transaction, self.clock()):
             self.turn()
 

@@ -1,8 +1,8 @@
-"""A serial port, on pyserial and pyserial-asyncio with the latter's traps mended.
+"""A serial port, on pyserial and pyserial-asyncio with the latter's traps fixed.
 
 pyserial opens and configures the port. Inherited from pyserial-asyncio is little: how reader and writer are registered
 with the loop and removed, pausing and resuming of reading, the limits of the write buffer and the pausing of the
-protocol by them. Mended is all that costs time or hides something: a write leaves at once instead of a turn of the loop
+protocol by them. Fixed is all that costs time or hides something: a write leaves at once instead of a turn of the loop
 later; reading asks no select(), which fails above descriptor 1023; every loss is reported, once, and never from within
 a write; bytes with parity or framing errors come marked; and nothing that can block (opening, configuring, draining,
 closing) runs on the loop's thread. Why stands at each method of `PortTransport`.
@@ -138,6 +138,7 @@ class SerialPort:
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> PortTransport:
         """Open and configure it in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
+        # In a thread: an open() on a USB adapter that hangs would stop every line of this loop.
         opening = in_own_thread(functools.partial(_open, self, only), f"open {self.path}")
         try:
             async with asyncio.timeout(OPEN_DEADLINE):
@@ -148,6 +149,7 @@ class SerialPort:
             if any(closing.name == self.path for closing in tuple(_closings)):
                 raise _still_closing(self.path) from None
             raise LineDown(f"{self.path} did not open within {OPEN_DEADLINE:g} s", hint="replug the adapter") from None
+        # The thread cannot be cancelled, so whatever it opens later is released when it comes back.
         except asyncio.CancelledError:
             opening.add_done_callback(_drop)
             raise
@@ -186,6 +188,7 @@ class PortTransport(_SerialTransport):
         self._deadline: asyncio.TimerHandle | None = None
         device.is_open = False  # the base class sets timeouts, which would configure an open port anew, on the loop
         super().__init__(loop, protocol, device)
+        # From here on the base class may change settings: `tune` relies on it.
         device.is_open = True
         self.set_write_buffer_limits(high=0)  # whatever is buffered pauses the protocol: it has not left yet
 
@@ -234,6 +237,7 @@ class PortTransport(_SerialTransport):
         """Write at once if nothing is buffered: else bytes would leave a turn of the loop later than their stamp."""
         if self._closing:
             return  # reported already, or asked for
+        # Bytes must not overtake those that are buffered.
         if not self._write_buffer:
             try:
                 sent = os.write(self._fd, data)
@@ -270,6 +274,7 @@ class PortTransport(_SerialTransport):
         """
         if self._closing:
             return
+        # Detached first: no byte may be delivered after close() was called.
         closed = self._detach()
         self._deadline = self._loop.call_later(CLOSE_DEADLINE, self._report, None)
         asyncio.wrap_future(closed, loop=self._loop).add_done_callback(lambda _: self._report(None))
@@ -285,6 +290,7 @@ class PortTransport(_SerialTransport):
         self._detach()
         why = "it hung up" if error is None or error.errno == errno.EIO else error.strerror
         cause = LineDown(f"{self._port.name} was lost: {why}", hint="")
+        # Not at once: the protocol may be inside its own write() and would see its state change under it.
         self._loop.call_soon(self._report, cause)
 
     def _detach(self) -> Future[None]:
@@ -351,6 +357,7 @@ def _names_pty(path: str) -> bool:
 def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool, Identity]:
     """Open and configure the device; also says whether it is paced, and which it is. Blocks. Raises LineDown."""
     scan = identity.Scan()
+    # One scan of the ttys for both: a replug between two scans could make them disagree.
     port = replace(port, path=resolve(port.path, scan))
     found = _found(port, only, scan)
     device = MarkingSerial()
@@ -369,6 +376,7 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
             raise
         raise _refusal(port, error) from None
     try:
+        # The name may have been given to another adapter between the check and the open.
         if not found.is_behind(device.fileno()):
             raise LineDown(f"{port.path} became another device while it was opened", hint="try again")
         _equip(port, device)
@@ -410,6 +418,7 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
     """Touch what only some drivers have only if it is asked for. Raises LineDown where it is refused."""
     if port.exclusive:  # flock is advisory, and this does not stop root: only both together keep others out
         fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
+    # Only if the user sets it: most adapters reject the ioctl, and a pty has none (ENOTTY).
     if port.rs485:
         try:
             device.rs485_mode = RS485Settings() if port.rs485 is True else port.rs485
@@ -444,6 +453,7 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Return why it did not open, in words, and what to try."""
     path, code = port.path, _code(error)
     if code in IN_USE:
+        # The name of the other program saves a search: nearly always it is a second instance of the same one.
         owner = holders.lock_owner(path) or next(iter(holders.holders(path)), "another program")
         return LineDown(
             f"{path} is in use by {owner}", hint="end that first: two masters on one line garble each other"

@@ -60,7 +60,7 @@ class TcpPort:
 
     @property
     def settings(self) -> LineSettings | None:
-        """Return what tau is reckoned from: the framing is the server's business."""
+        """Return what tau is calculated from: the framing is the server's business."""
         return None if self.baudrate is None else LineSettings(self.baudrate)
 
     def presence(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
-from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply, other_format
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterStep, Need, Sizes, no_reply, other_format
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 from busmaster.wire.characters import made_of
@@ -72,17 +72,17 @@ def _await_end(head: bytes, tail: bytes, start: int, longest: int, check: Callab
 
 
 def telegram_sizes(echo: int, typical: int, longest: int) -> Sizes:
-    """Reckon the bytes of a telegram from the characters of its echo and of its data."""
+    """Calculate the bytes of a telegram from the characters of its echo and of its data."""
     return Sizes(_ENVELOPE + echo + typical, _ENVELOPE + echo + longest)
 
 
-class SingleLeg:
+class SingleStep:
     """What the exchanges of the character protocols share."""
 
     __slots__ = ("request", "timing")
 
     refusals: ClassVar[Mapping[int, type[Refused]]] = _REFUSALS
-    later: ClassVar[Sequence[LaterLeg]] = ()
+    later: ClassVar[Sequence[LaterStep]] = ()
     closing: ClassVar[int] = 0
     answered: ClassVar[bool] = True
 
@@ -98,7 +98,7 @@ class SingleLeg:
         raise FrameError(f"a reply cannot begin with {heard[0]:02x}", heard=heard)
 
 
-class TelegramReader(SingleLeg, Generic[T]):
+class TelegramReader(SingleStep, Generic[T]):
     """One read: a telegram, or a refusal. `header` is what the telegram begins with: STX and the echo.
 
     A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
@@ -118,7 +118,7 @@ class TelegramReader(SingleLeg, Generic[T]):
         self._buffer = b""
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         return self.answers
 
     def parse(self, field: bytes) -> T:
@@ -146,7 +146,7 @@ class TelegramReader(SingleLeg, Generic[T]):
         raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()
 
 
-class AcknowledgeReader(SingleLeg):
+class AcknowledgeReader(SingleStep):
     """One write: a lone ACK, or a refusal."""
 
     __slots__ = ()
@@ -154,7 +154,7 @@ class AcknowledgeReader(SingleLeg):
     sizes: ClassVar[Sizes] = Sizes(1, 1)
     starts: ClassVar[bytes] = ACK + NAK
     answers: ClassVar[tuple[bytes, ...]] = (ACK,)
-    owed: ClassVar[tuple[bytes, ...]] = answers
+    overdue: ClassVar[tuple[bytes, ...]] = answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[None]:
         if not data:
@@ -176,7 +176,7 @@ __all__ = [
     "NAK",
     "STX",
     "AcknowledgeReader",
-    "SingleLeg",
+    "SingleStep",
     "TelegramReader",
     "find_field",
     "telegram_sizes",

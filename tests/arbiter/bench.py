@@ -6,10 +6,10 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import set_members
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -31,8 +31,8 @@ WRITE_5 = "07 30 31 02 30 31 35 03 34"
 ACK = "06"
 NAK = "15"
 QUIET = 0.020 + TAU
-"""The silence that ends a settle: of HCP2's byte gap, and one byte time."""
-LATENESS = 0.150 + TAU
+"""The silence that ends a resynchronisation: of HCP2's inter-byte timeout, and one byte time."""
+MAX_REPLY_DELAY = 0.150 + TAU
 """From the end of an HCP2 request until no reply to it can be heard any more."""
 
 
@@ -80,11 +80,11 @@ class Bench:
         self.events: list[Event] = []
         self.cycles: list[Poll] = []
         self.asked = ""
-        self.checks = 0
+        self.sync_reads = 0
         self._out = b""
         self.arbiter.line_up(0.0, paced=paced)
         if not fresh:
-            self.arbiter._in_step.lone_bytes_until = -inf
+            self.arbiter._in_sync.lone_bytes_until = -inf
         self.to(1.0)
         self.events.clear()
 
@@ -136,10 +136,10 @@ class Bench:
         return asked
 
     def checked(self) -> str:
-        """The line proves first that it is in step (R15): a check goes out, and is answered. Returns the check."""
+        """The line proves first that it is in sync (R15): a check goes out, and is answered. Returns the check."""
         self.until_sent()
-        self.checks += 1
-        assert self.arbiter.statistics(self.now).checks == self.checks, f"not a check: {self.sent()}"
+        self.sync_reads += 1
+        assert self.arbiter.statistics(self.now).sync_reads == self.sync_reads, f"not a check: {self.sent()}"
         return self.answer(99)
 
     def served(self, transaction: Transaction, after: float = 0.004) -> Transaction:
@@ -228,7 +228,8 @@ def up(bench: Bench, address: int = 1) -> NodeRecord:
 
 
 def lost(bench: Bench, record: NodeRecord, command: Command[Any] | None = None) -> Transaction:
-    """What was asked of it, once, and not answered, on a line that has settled since: its reply is owed (R15)."""
+    """What was asked of it, once, and not answered, on a line that has resynchronised since: its reply is overdue
+    (R15)."""
     asked = bench.ask(record, command, retries=0)
     bench.until_sent()
     bench.sent()

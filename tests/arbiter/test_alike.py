@@ -8,7 +8,7 @@ from random import Random
 
 import pytest
 
-from busmaster.arbiter.alike import LONGEST_STEADY, Alike
+from busmaster.arbiter.choice import LONGEST_STEADY, Alike
 from busmaster.arbiter.transaction import Transaction
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import TAU, Bench, reply_of, up
@@ -98,8 +98,8 @@ class Saturated:
         return self.quiet
 
     @property
-    def checks(self) -> int:
-        return self.bench.arbiter.statistics(self.bench.now).checks
+    def sync_reads(self) -> int:
+        return self.bench.arbiter.statistics(self.bench.now).sync_reads
 
 
 KINDS = {
@@ -120,7 +120,7 @@ PATIENCE = pytest.mark.parametrize("patient", [False, True], ids=["each as it co
 def test_a_steady_line_is_checked_after_128_answers_alike(kind: str) -> None:
     line = Saturated(KINDS[kind]).run(3 * LONGEST_STEADY)
     assert line.wrong == []
-    assert line.checks <= 4, "the first one is sooner: no node's usual time is known yet"
+    assert line.sync_reads <= 4, "the first one is sooner: no node's usual time is known yet"
 
 
 def test_a_steady_line_is_checked_at_every_128th_answer() -> None:
@@ -130,12 +130,12 @@ def test_a_steady_line_is_checked_at_every_128th_answer() -> None:
 
 def test_a_line_whose_answers_vary_by_more_than_half_a_request_is_checked_after_32() -> None:
     line = Saturated(KINDS["erratic"]).run(3 * LONGEST_STEADY)
-    assert line.checks >= 3 * LONGEST_STEADY // MOST_ALIKE - 1
+    assert line.sync_reads >= 3 * LONGEST_STEADY // MOST_ALIKE - 1
 
 
 def test_a_port_whose_bytes_do_not_leave_at_the_baud_rate_is_checked_after_32() -> None:
     line = Saturated(KINDS["one"], paced=False).run(3 * LONGEST_STEADY)
-    assert line.checks >= 3 * LONGEST_STEADY // MOST_ALIKE - 1
+    assert line.sync_reads >= 3 * LONGEST_STEADY // MOST_ALIKE - 1
 
 
 @PATIENCE
@@ -184,7 +184,7 @@ def test_a_byte_from_before_the_request_says_nothing_of_the_time_that_a_node_usu
     node.usual = None
     alike = Alike(bench.arbiter._wire)
     alike.node = node
-    bench.arbiter._leg.end = 1.0
+    bench.arbiter._step.end = 1.0
     assert not alike.another(hcp2.Read(1).open(1, hcp2.PROFILE.timings), 0.99, 1.0)
     assert node.usual is None
 

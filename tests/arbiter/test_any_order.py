@@ -14,19 +14,19 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from busmaster.arbiter import failing_transactions
+from busmaster.arbiter import dispatcher
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import NodeChanged, Polled
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.schedule import set_members
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.errors import BusError
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
 from tests.arbiter.bench import TAU
 
-LATENESS = 0.150
+MAX_REPLY_DELAY = 0.150
 ROUNDING = 1e-9
 MOST_STEPS = 1000
 """Of one `advance`."""
@@ -35,7 +35,7 @@ MOST_STEPS = 1000
 @pytest.fixture(scope="module", autouse=True)
 def few_fail_at_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(failing_transactions, "AT_ONCE", 2)
+        patch.setattr(dispatcher, "AT_ONCE", 2)
         yield
 
 
@@ -165,7 +165,7 @@ class AnyOrder(RuleBasedStateMachine):
     @precondition(lambda self: self.asked is not None and self.now < self.asked_until)
     @rule()
     def answer(self) -> None:
-        """The node's one reply, right and whole; it may be a straggler."""
+        """The node's one reply, right and whole; it may be an overdue reply."""
         assert self.asked is not None
         request, self.asked = self.asked, None
         if request[6] == 0x05:
@@ -219,7 +219,7 @@ class AnyOrder(RuleBasedStateMachine):
             assert self.arbiter.state is LineState.EXCHANGE
             self.asked = data
             self.asked_at = self.now
-            self.asked_until = self.now + len(data) * TAU + LATENESS + TAU
+            self.asked_until = self.now + len(data) * TAU + MAX_REPLY_DELAY + TAU
         while (event := self.arbiter.poll_event()) is not None:
             match event:
                 case Transaction() as transaction:

@@ -9,9 +9,8 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-from busmaster.arbiter.backlog import SHARE, Backlog
+from busmaster.arbiter.backlog import SHARE, SLACK, Backlog
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.queues import SLACK
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.protocols.hcp2 import codec as hcp2
 

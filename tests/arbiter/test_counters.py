@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.counters import DriverErrors, Histogram, LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.histogram import Histogram
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench
 
@@ -27,7 +26,7 @@ def node_statistics() -> NodeStatistics:
 
 
 def test_nothing_is_counted_before_anything_has_happened() -> None:
-    counts = ("exchanges", "tainted", "collisions", "noisy", "losses", "checks", "doubted", "breaks")
+    counts = ("exchanges", "tainted", "collisions", "noisy", "losses", "sync_reads", "ambiguous", "breaks")
     line, node = line_statistics(), node_statistics()
     assert [getattr(line, name) for name in counts] == [0] * len(counts)
     assert (node.attempts, node.failed, node.latency.count) == (0, 0, 0)
@@ -77,7 +76,7 @@ def is_asked_and_not_waited_for(bench: Bench, node: NodeRecord) -> None:
     bench.answer()
 
 
-def speaks_unasked(count: int) -> Story:
+def speaks_unexpected(count: int) -> Story:
     def story(bench: Bench, node: NodeRecord) -> None:
         for _ in range(count):
             bench.hear("FF", after=0.010)
@@ -101,18 +100,18 @@ FAILED = ONE | {"failed": 1}
     [
         (is_late, {}, ONE | {"ok": 1, "late": 1}),
         (is_overdue, {}, ONE | {"ok": 1, "late": 1, "overdue": 1}),
-        (is_refused_twice, {}, FAILED | {"attempts": 2, "exchanges": 2, "refused": 2, "settles": 2}),
-        (is_silent, {}, {"attempts": 1, "exchanges": 1, "no_reply": 1, "retries": 1, "settles": 1, "checks": 1}),
-        (answers_something_else(BAD_CHECKSUM, 0.004), {}, FAILED | {"garbled": 1, "settles": 1}),
-        (answers_something_else(FIVE, 0.0001), {"paced": True}, FAILED | {"garbled": 1, "tainted": 1, "settles": 1}),
-        (answers_something_else(SEVEN, 0.001), {"echo": True}, FAILED | {"garbled": 1, "collisions": 1, "settles": 1}),
+        (is_refused_twice, {}, FAILED | {"attempts": 2, "exchanges": 2, "refused": 2, "resyncs": 2}),
+        (is_silent, {}, {"attempts": 1, "exchanges": 1, "no_reply": 1, "retries": 1, "resyncs": 1, "sync_reads": 1}),
+        (answers_something_else(BAD_CHECKSUM, 0.004), {}, FAILED | {"garbled": 1, "resyncs": 1}),
+        (answers_something_else(FIVE, 0.0001), {"paced": True}, FAILED | {"garbled": 1, "tainted": 1, "resyncs": 1}),
+        (answers_something_else(SEVEN, 0.001), {"echo": True}, FAILED | {"garbled": 1, "collisions": 1, "resyncs": 1}),
         (
             is_asked_and_not_waited_for,
             {},
             {"attempts": 1, "exchanges": 1, "ok": 1, "unheard": 1, "cancelled": 2},
         ),
-        (speaks_unasked(2), {}, {"unasked_bytes": 2, "settles": 1}),
-        (speaks_unasked(120), {}, {"unasked_bytes": 120, "settles": 1, "noisy": 1}),
+        (speaks_unexpected(2), {}, {"unexpected_bytes": 2, "resyncs": 1}),
+        (speaks_unexpected(120), {}, {"unexpected_bytes": 120, "resyncs": 1, "noisy": 1}),
         (vanishes_with_the_port, {}, FAILED | {"losses": 1}),
     ],
 )
@@ -140,8 +139,8 @@ def test_quantiles_are_of_what_the_histogram_holds() -> None:
 
 
 def test_the_utilisation_of_a_line_is_the_share_of_the_time_in_which_it_was_in_use() -> None:
-    for busy, settling, elapsed, share in ((0.25, 0.5, 1.5, 0.5), (0.0, 0.0, 0.0, 0.0), (0.6, 0.5, 1.0, 1.0)):
-        assert replace(line_statistics(), busy=busy, settling=settling, elapsed=elapsed).utilisation == share
+    for busy, quiet_time, elapsed, share in ((0.25, 0.5, 1.5, 0.5), (0.0, 0.0, 0.0, 0.0), (0.6, 0.5, 1.0, 1.0)):
+        assert replace(line_statistics(), busy=busy, quiet_time=quiet_time, elapsed=elapsed).utilisation == share
 
 
 def test_statistics_never_change() -> None:

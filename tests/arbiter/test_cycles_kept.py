@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import set_members
 from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
-from busmaster.gate.rights import READ, RIGHTS, WRITE, Role
+from busmaster.authorisation.rights import READ, RIGHTS, WRITE, Role
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import Bench, request_of, right_answer, up
 
@@ -130,6 +130,49 @@ def absent(plant: Plant, number: int, client: LineClient) -> Callable[[], None]:
     return plant.keep(client, 1, lambda one: Transaction(node, hcp2.Read(1), plant.rights.reads, client=client))
 
 
+def sequences(longest: float, priority: Priority, *, busy: bool) -> Attack:
+    """Sequences one after the other, each held as long as it may be; `busy`: it always has a request waiting."""
+
+    def attack(plant: Plant, number: int, client: LineClient) -> Callable[[], None]:
+        def ask(hold: Hold, element: int) -> Transaction:
+            return plant.bench.submit(Transaction(plant.node, hcp2.Read(element), priority, client=hold, retries=0))
+
+        def begin() -> tuple[Hold, Transaction]:
+            hold = plant.bench.arbiter.exclusive(plant.node, client, longest)
+            return hold, ask(hold, 60)
+
+        hold, asked = begin()
+
+        def again() -> None:
+            nonlocal hold, asked
+            if hold.over:
+                hold, asked = begin()
+            elif busy and asked.phase is Phase.ENDED:
+                asked = ask(hold, 61)
+
+        return again
+
+    return attack
+
+
+def with_urgent_writes(attack: Attack) -> Attack:
+    """Half of the clients make the attack, the others write with URGENT."""
+    return lambda plant, number, client: (attack, urgent_writes)[number % 2](plant, number, client)
+
+
+def with_reads(attack: Attack) -> Attack:
+    """Half of the clients make the attack, the others read."""
+    return lambda plant, number, client: (attack, reads)[number % 2](plant, number, client)
+
+
+SEQUENCES = [
+    sequences(longest, priority, busy=busy)
+    for longest in (0.1, 5.0)
+    for priority in (COMMAND, URGENT)
+    for busy in (True, False)
+]
+
+
 def test_the_line_is_three_quarters_busy_and_keeps_its_cycles_without_attackers() -> None:
     plant = Plant()
     assert plant.run() == 1.0
@@ -153,7 +196,29 @@ def test_r9_the_owner_keeps_half_of_the_line_against_clients_that_may_write(atta
     assert plant.busy >= 0.45
 
 
-@pytest.mark.parametrize("attack", [reads, urgent_writes, groups])
+@pytest.mark.parametrize("attack", SEQUENCES)
+def test_r9_the_owner_keeps_half_of_its_cycles_against_sequences_in_a_row(attack: Attack) -> None:
+    assert Plant(WRITE).run(attack) >= 0.45
+
+
+@pytest.mark.parametrize("busy", [True, False])
+@pytest.mark.parametrize("priority", [COMMAND, URGENT])
+def test_r9_the_owner_keeps_half_of_the_line_against_sequences_of_5_s(priority: Priority, busy: bool) -> None:
+    plant = Plant(WRITE)
+    assert plant.run(sequences(5.0, priority, busy=busy)) >= 0.65
+    assert plant.busy >= 0.5
+
+
+@pytest.mark.parametrize("other", [with_urgent_writes, with_reads])
+def test_r9_sequences_beside_other_requests_leave_the_owner_half_of_the_line(
+    other: Callable[[Attack], Attack],
+) -> None:
+    plant = Plant(WRITE)
+    assert plant.run(other(sequences(5.0, COMMAND, busy=False))) >= 0.45
+    assert plant.busy >= 0.4
+
+
+@pytest.mark.parametrize("attack", [reads, urgent_writes, groups, *SEQUENCES])
 def test_r9_an_urgent_write_of_an_operator_waits_for_two_exchanges_whatever_other_users_ask(attack: Attack) -> None:
     """That on the wire, and one more: the operator's part is a 65th of half of the line, and it uses less."""
     plant = Plant(WRITE, every=15.0)

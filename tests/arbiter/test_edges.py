@@ -1,4 +1,4 @@
-"""When the last byte of what was said can have been received: R3's edges, each row of the table in leg.py."""
+"""When the last byte of what was said can have been received: R3's edges, each row of the table in step.py."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, SEVEN, TAU, WRITE_5, Bench, up
+from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, NAK, QUIET, SEVEN, TAU, WRITE_5, Bench, up
 
 REQUEST = 8 * TAU
 JUST = 1e-6
@@ -25,12 +25,12 @@ MSC_TAU = 10 / 9600
 MSC_REQUEST = 16 * MSC_TAU
 
 
-# a request, one leg
+# a request, one step
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.016])
 @pytest.mark.parametrize("inside", [0.0001, 0.001])
-def test_r3_a_start_bit_within_the_lateness_is_heard_a_byte_time_later_and_is_delivered(
+def test_r3_a_start_bit_within_the_max_reply_delay_is_heard_a_byte_time_later_and_is_delivered(
     inside: float, latency: float
 ) -> None:
     bench = Bench(latency=latency)
@@ -47,7 +47,7 @@ def test_r3_a_start_bit_within_the_lateness_is_heard_a_byte_time_later_and_is_de
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.016])
-def test_r3_a_line_that_stays_silent_is_free_one_byte_time_past_lateness_and_latency(latency: float) -> None:
+def test_r3_a_line_that_stays_silent_is_free_one_byte_time_past_max_reply_delay_and_latency(latency: float) -> None:
     bench = Bench(latency=latency)
     bench.ask(bench.node())
     bench.sent()
@@ -55,7 +55,8 @@ def test_r3_a_line_that_stays_silent_is_free_one_byte_time_past_lateness_and_lat
 
 
 def test_r3_on_a_slow_line_a_byte_time_is_two_milliseconds() -> None:
-    """Mentor II at 4800 baud, where a reply one millisecond within its lateness was given to the next request."""
+    """Mentor II at 4800 baud, where a reply one millisecond within its maximum reply delay was given to the next
+    request."""
     bench = Bench()
     bench.arbiter.byte_time = tau = 10 / 4800
     drive = bench.node(12, mentor.PROFILE)
@@ -103,7 +104,7 @@ def test_r3_an_answer_that_is_not_believed_proves_not_that_its_request_has_left(
     bench.hear(ACK, after=TAU)
     assert isinstance(disabled.error, WriteUnconfirmed)
     bench.ask(node)
-    assert bench.until_sent() == pytest.approx(said - TAU + LATENESS)
+    assert bench.until_sent() == pytest.approx(said - TAU + MAX_REPLY_DELAY)
 
 
 # the silence
@@ -126,7 +127,7 @@ def test_r3_a_pause_within_a_frame_is_no_silence_however_long_an_adapter_holds_b
     assert bench.until_sent() == pytest.approx(0.020 + latency + TAU)
 
 
-def test_r3_the_silence_is_at_least_twenty_milliseconds_and_the_byte_gap_if_that_is_longer() -> None:
+def test_r3_the_silence_is_at_least_twenty_milliseconds_and_the_inter_byte_timeout_if_that_is_longer() -> None:
     for gap, silence in ((0.005, 0.020), (0.050, 0.050)):
         bench = Bench()
         timing = ReplyTiming(0.05, 0.1, 0.1, gap)
@@ -137,7 +138,7 @@ def test_r3_the_silence_is_at_least_twenty_milliseconds_and_the_byte_gap_if_that
         assert bench.now - last == pytest.approx(silence + TAU)
 
 
-def test_r2_a_byte_gap_bounds_the_pause_to_the_next_start_bit_which_is_heard_a_byte_time_later() -> None:
+def test_r2_an_inter_byte_timeout_bounds_the_pause_to_the_next_start_bit_which_is_heard_a_byte_time_later() -> None:
     bench = Bench()
     read = bench.ask(bench.node())
     bench.hear("02 30 31", after=REQUEST + 0.003)
@@ -169,7 +170,7 @@ def test_r3_noise_before_a_checksum_makes_no_frame_whole_enough_to_release_the_l
     assert (bench.ended(write), write.error) == (1, None)
 
 
-def test_r3_a_whole_frame_with_a_bad_checksum_is_spared_the_lateness() -> None:
+def test_r3_a_whole_frame_with_a_bad_checksum_is_spared_the_max_reply_delay() -> None:
     bench = Bench()
     bench.ask(up(bench))
     bench.sent()
@@ -177,8 +178,8 @@ def test_r3_a_whole_frame_with_a_bad_checksum_is_spared_the_lateness() -> None:
     assert bench.until_sent() == pytest.approx(QUIET)
 
 
-def test_r15_while_something_is_owed_no_frame_is_spared_the_lateness() -> None:
-    """It may be the owed one, and its own still to come."""
+def test_r15_while_something_is_overdue_no_frame_is_spared_the_max_reply_delay() -> None:
+    """It may be the overdue one, and its own still to come."""
     bench = Bench()
     node, other = up(bench), up(bench, 2)
     bench.ask(other, retries=0)
@@ -187,35 +188,35 @@ def test_r15_while_something_is_owed_no_frame_is_spared_the_lateness() -> None:
     bench.ask(node, hcp2.Read(3))
     bench.sent()
     bench.hear("02 30 33 31 35 03 41", after=REQUEST + 0.003)
-    assert bench.until_sent() == pytest.approx(LATENESS - 0.003)
+    assert bench.until_sent() == pytest.approx(MAX_REPLY_DELAY - 0.003)
 
 
 # noise on an unpaced port
 
 
-def test_r3_noise_before_a_request_is_out_does_not_bring_its_lateness_forward() -> None:
+def test_r3_noise_before_a_request_is_out_does_not_bring_its_max_reply_delay_forward() -> None:
     bench = Bench()
     bench.ask(bench.node())
     bench.sent()
     bench.hear("FF")
-    assert bench.until_sent() == pytest.approx(REQUEST + LATENESS)
+    assert bench.until_sent() == pytest.approx(REQUEST + MAX_REPLY_DELAY)
 
 
 # MSC: an ACK, then a packet, then the host's ACK
 
 
 def msc_line(packet: float = 1.0, *, echo: bool = False) -> tuple[Bench, NodeRecord]:
-    """A line at 9600 baud that has rested, and its node, with that lateness of packets."""
+    """A line at 9600 baud that has rested, and its node, with that maximum reply delay of packets."""
     bench = Bench(echo=echo)
     bench.arbiter.byte_time = MSC_TAU
     timings = msc.PROFILE.timings
-    node = bench.node(1, msc.PROFILE, replace(timings, packet=replace(timings.packet, lateness=packet)))
+    node = bench.node(1, msc.PROFILE, replace(timings, packet=replace(timings.packet, max_reply_delay=packet)))
     bench.wait(2.0)
     return bench, node
 
 
 @pytest.mark.parametrize("packet", [1.0, 1.5])
-def test_r3_behind_an_ack_the_packets_lateness_counts_from_that_acks_end(packet: float) -> None:
+def test_r3_behind_an_ack_the_packets_max_reply_delay_counts_from_that_acks_end(packet: float) -> None:
     bench, node = msc_line(packet)
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
@@ -224,7 +225,7 @@ def test_r3_behind_an_ack_the_packets_lateness_counts_from_that_acks_end(packet:
     bench.until_sent()
     assert bench.sent() == ACK, "whatever comes now is acknowledged already"
     bench.until_sent()
-    gap = msc.PROFILE.timings.packet.byte_gap
+    gap = msc.PROFILE.timings.packet.inter_byte_timeout
     assert bench.now - acked == pytest.approx(packet + MSC_TAU + MSC_TAU + gap + MSC_TAU), "our ACK, and a silence"
 
 
@@ -236,7 +237,7 @@ def test_r3_where_the_ack_was_lost_its_packet_is_waited_for_from_the_requests_en
     assert bench.until_sent() == pytest.approx(MSC_REQUEST + packet + MSC_TAU)
 
 
-def test_r3_an_unasked_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for_anew() -> None:
+def test_r3_an_unexpected_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for_anew() -> None:
     bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
@@ -388,11 +389,11 @@ def test_a_closing_ack_is_over_when_it_is_out() -> None:
 # echo, and broadcasts
 
 
-def test_r3_on_an_echoing_port_the_lateness_counts_from_the_last_byte_of_the_echo() -> None:
+def test_r3_on_an_echoing_port_the_max_reply_delay_counts_from_the_last_byte_of_the_echo() -> None:
     bench = Bench(echo=True)
     bench.ask(bench.node())
     bench.hear(bench.sent(), after=0.030)
-    assert bench.until_sent() == pytest.approx(LATENESS)
+    assert bench.until_sent() == pytest.approx(MAX_REPLY_DELAY)
 
 
 @pytest.mark.parametrize("inside", [0.0001, 0.001])
@@ -401,14 +402,14 @@ def test_r3_on_an_echoing_port_a_reply_at_its_last_moment_is_delivered(inside: f
     node = bench.node()
     first, second = bench.ask(node, retries=0), bench.ask(node, retries=0)
     bench.hear(bench.sent(), after=0.030)
-    bench.wait(LATENESS - inside)
+    bench.wait(MAX_REPLY_DELAY - inside)
     assert second.attempts == 0
     bench.hear(FIVE)
     assert (first.value, second.value) == (5.0, None)
 
 
 def test_r3_where_the_echo_is_lost_no_late_reply_is_awaited() -> None:
-    """What came could not be told from the echo: the attempt is over with its window, and the line settles."""
+    """What came could not be told from the echo: the attempt is over with its window, and the line resynchronises."""
     bench = Bench(echo=True)
     read = bench.ask(bench.node(), retries=0)
     bench.ask(bench.node(2))
@@ -416,33 +417,46 @@ def test_r3_where_the_echo_is_lost_no_late_reply_is_awaited() -> None:
     bench.wait(REQUEST + 0.1001)
     assert str(read.error).startswith("node 1: no reply within 100 ms, and no echo of the request")
     bench.hear(FIVE, after=0.020)
-    assert bench.until_sent() == pytest.approx(LATENESS - 0.1201)
+    assert bench.until_sent() == pytest.approx(MAX_REPLY_DELAY - 0.1201)
 
 
-def test_a_broadcast_is_over_when_it_is_out_and_the_turnaround_later() -> None:
+def test_r1_a_node_whose_reply_was_lost_has_let_go_of_the_line_before_the_next_request() -> None:
+    """The reply may have begun at the last moment: behind it the node's driver holds the line for its time."""
+    released = 0.008
+    reads = replace(hcp2.PROFILE.timings.read, driver_release_time=released)
+    bench = Bench()
+    node = bench.node(1, timings=replace(hcp2.PROFILE.timings, read=reads))
+    bench.wait(1.0)
+    bench.ask(node, retries=0)
+    request = len(bytes.fromhex(bench.sent())) * TAU
+    bench.ask(bench.node(2))
+    assert bench.until_sent() == pytest.approx(request + MAX_REPLY_DELAY + released)
+
+
+def test_a_broadcast_is_over_when_it_is_out_and_the_driver_release_time_later() -> None:
     bench = Bench()
     everybody, drive = bench.node(0, mentor.PROFILE), bench.node(12, mentor.PROFILE)
     bench.wait(1.0)
     bench.ask(everybody, mentor.Write(1, 17, 100))
     bench.ask(drive, mentor.Read(1, 17))
     said = len(bytes.fromhex(bench.sent())) * TAU
-    turnaround = mentor.Write(1, 17, 100).open(0, mentor.PROFILE.timings).timing.turnaround
-    assert turnaround > 0
-    assert bench.until_sent() == pytest.approx(said + turnaround)
+    driver_release_time = mentor.Write(1, 17, 100).open(0, mentor.PROFILE.timings).timing.driver_release_time
+    assert driver_release_time > 0
+    assert bench.until_sent() == pytest.approx(said + driver_release_time)
 
 
-def test_a_broadcast_that_echoes_is_over_a_turnaround_behind_its_echo() -> None:
+def test_a_broadcast_that_echoes_is_over_a_driver_release_time_behind_its_echo() -> None:
     bench = Bench(echo=True)
     everybody, drive = bench.node(0, mentor.PROFILE), bench.node(12, mentor.PROFILE)
     bench.wait(1.0)
     bench.ask(everybody, mentor.Write(1, 17, 100))
     bench.ask(drive, mentor.Read(1, 17))
     bench.hear(bench.sent(), after=0.030)
-    turnaround = mentor.Write(1, 17, 100).open(0, mentor.PROFILE.timings).timing.turnaround
-    assert bench.until_sent() == pytest.approx(turnaround)
+    driver_release_time = mentor.Write(1, 17, 100).open(0, mentor.PROFILE.timings).timing.driver_release_time
+    assert bench.until_sent() == pytest.approx(driver_release_time)
 
 
-def test_r1_what_is_said_behind_an_ack_is_reckoned_from_the_end_of_both() -> None:
+def test_r1_what_is_said_behind_an_ack_is_calculated_from_the_end_of_both() -> None:
     bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008))
     bench.ask(node, msc.DataRead(2008))

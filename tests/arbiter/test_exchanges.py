@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import RepliesLate
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.state import LineState
 from busmaster.contract.exchange import Exchange
 from busmaster.contract.timing import Timings
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
@@ -16,7 +16,7 @@ from tests.arbiter.bench import (
     ANOTHER_ELEMENT,
     BAD_CHECKSUM,
     FIVE,
-    LATENESS,
+    MAX_REPLY_DELAY,
     NAK,
     QUIET,
     READ_1_OF_NODE_1,
@@ -54,7 +54,7 @@ def test_r1_the_next_request_leaves_only_when_the_reply_is_complete() -> None:
 def test_r2_the_window_runs_from_the_end_of_the_request_on_the_wire() -> None:
     bench = Bench()
     read = bench.ask(bench.node(), retries=0)
-    bench.wait(REQUEST + LATENESS - 0.0001)
+    bench.wait(REQUEST + MAX_REPLY_DELAY - 0.0001)
     assert not bench.ended(read)
     bench.wait(0.0002)
     assert isinstance(read.error, NoReply)
@@ -64,7 +64,7 @@ def test_r2_the_window_runs_from_the_end_of_the_request_on_the_wire() -> None:
 @pytest.mark.parametrize(
     ("delay", "late"), [(0.049, False), (0.051, True), (0.099, True), (0.101, True), (0.149, True)]
 )
-def test_r2_a_reply_after_nominal_is_accepted_and_counted_late(delay: float, late: bool) -> None:
+def test_r2_a_reply_after_late_after_is_accepted_and_counted_late(delay: float, late: bool) -> None:
     bench = Bench()
     node = bench.node()
     read = bench.ask(node)
@@ -143,7 +143,7 @@ def test_r7_a_late_refusal_of_a_write_is_one_and_is_confirmed_at_once() -> None:
         assert request
         bench.hear(NAK, after=request + 0.130)
     assert isinstance(write.error, Refused)
-    assert node.lateness == pytest.approx(1.6 * 0.130)
+    assert node.max_reply_delay == pytest.approx(1.6 * 0.130)
 
 
 def test_r2_where_the_bus_is_closed_no_late_reply_is_awaited() -> None:
@@ -174,7 +174,7 @@ def test_r4_on_a_paced_line_bytes_before_the_request_is_out_taint_the_attempt() 
     read = bench.ask(bench.node(), retries=0)
     bench.hear(FIVE, after=REQUEST * 0.8)
     assert isinstance(read.error, GarbledReply)
-    assert bench.arbiter.state is LineState.SETTLING
+    assert bench.arbiter.state is LineState.RESYNCHRONISING
 
 
 def test_r4_on_an_unpaced_line_the_reply_may_come_at_once() -> None:

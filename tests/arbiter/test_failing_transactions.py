@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from math import inf
 
+from busmaster.arbiter.counters import LineState
+from busmaster.arbiter.dispatcher import AT_ONCE
 from busmaster.arbiter.events import Sampled
-from busmaster.arbiter.failing_transactions import AT_ONCE
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import BusClosed, LineDown
 from busmaster.protocols.hcp2 import codec as hcp2

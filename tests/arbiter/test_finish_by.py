@@ -7,12 +7,10 @@ from math import nextafter
 
 import pytest
 
-from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.endings import TOO_LATE, too_late
+from busmaster.arbiter.deadlines import SLACK, Deadlines, Expiries
 from busmaster.arbiter.events import Overdue
-from busmaster.arbiter.expiries import SLACK, Expiries
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import TOO_LATE, Phase, Priority, Transaction, too_late
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
@@ -186,7 +184,7 @@ def test_a_retry_that_cannot_finish_is_not_sent(command: hcp2.Read | hcp2.Write,
     asked = bench.ask(heard(bench), command, finish_by=bench.now + 0.165)
     assert bench.sent()
     bench.hear("FF", after=0.150)
-    assert asked.phase is Phase.QUEUED  # failed once, while the line settles
+    assert asked.phase is Phase.QUEUED  # failed once, while the line resynchronises
     bench.wait(0.014)
     bench.wait(0.002)
     assert (bench.ended(asked), type(asked.error), asked.attempts) == (1, kind, 1)
@@ -215,8 +213,8 @@ def test_a_retry_whose_time_is_over_does_not_go_before_another_either() -> None:
     bench.hear("FF", after=0.12)
     assert (asked.phase, asked.attempts) == (Phase.QUEUED, 1)
     asked.node.health = Health.UP
-    may_go = bench.arbiter.dispatcher.may_go
-    assert (may_go(asked, bench.now), may_go(asked, asked.finish_by)) == (True, False)
+    proves = bench.arbiter.dispatcher.proves
+    assert (proves(asked, bench.now), proves(asked, asked.finish_by)) == (True, False)
 
 
 def test_a_retry_may_go_before_another_though_the_time_to_start_is_over() -> None:
@@ -226,7 +224,7 @@ def test_a_retry_may_go_before_another_though_the_time_to_start_is_over() -> Non
     bench.hear("FF", after=0.12)
     assert (asked.phase, asked.attempts) == (Phase.QUEUED, 1)
     asked.node.health = Health.UP
-    assert bench.arbiter.dispatcher.may_go(asked, bench.now)
+    assert bench.arbiter.dispatcher.proves(asked, bench.now)
 
 
 def test_an_urgent_write_that_comes_too_late_is_not_sent_and_what_it_overtook_is_not_either() -> None:

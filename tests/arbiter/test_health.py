@@ -79,7 +79,7 @@ def test_a_node_that_waits_for_no_hook_is_not_let_go_twice() -> None:
 
 def test_a_line_of_which_nothing_more_is_known_has_counted_nothing() -> None:
     known = {each.name: each.default for each in fields(LineStatistics) if each.default is not MISSING}
-    assert known == {"checks": 0, "doubted": 0, "damaged": 0, "breaks": 0, "driver": None}
+    assert known == {"sync_reads": 0, "ambiguous": 0, "damaged": 0, "breaks": 0, "driver": None}
 
 
 # what a node's health is

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.arbiter.histogram import BATCH, Histogram
+from busmaster.arbiter.counters import BATCH, Histogram
 
 TIMES = st.lists(st.just(0.0) | st.floats(1e-9, 1e6), min_size=1, max_size=3 * BATCH)
 

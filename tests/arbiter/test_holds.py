@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from busmaster.arbiter.clients import Hold, LineClient
-from busmaster.arbiter.state import LineState
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import HoldEnded, LineDown, NoReply, Superseded, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -130,7 +130,7 @@ def test_a_sequence_that_goes_on_asking_ends_all_the_same() -> None:
         if hold.over:
             bench.until_sent()
             break
-        read = bench.ask(table.node, hcp2.Read(1 + bench.checks), client=hold)
+        read = bench.ask(table.node, hcp2.Read(1 + bench.sync_reads), client=hold)
         bench.served(read)
         bench.wait(0.03)
     bench.served(other)
@@ -164,14 +164,14 @@ def test_what_fails_within_a_sequence_is_repeated_within_it() -> None:
     others = table.ask_one_of_each()
     bench.until_sent()
     bench.sent()
-    bench.until_sent()  # settled; a check, or again
+    bench.until_sent()  # resynchronised; a check, or again
     bench.served(read)
     assert read.error is None
     assert read.attempts == 2
     assert not any(other.attempts for other in others)
 
 
-def test_r15_only_what_proves_that_the_line_is_in_step_comes_between() -> None:
+def test_r15_only_what_proves_that_the_line_is_in_sync_comes_between() -> None:
     table = Table()
     bench, hold = table.bench, table.hold(longest=5.0)
     lost(bench, table.there, hcp2.Read(1))
@@ -179,12 +179,12 @@ def test_r15_only_what_proves_that_the_line_is_in_step_comes_between() -> None:
     bench.served(others[0])
     first = bench.ask(table.node, hcp2.Read(1), client=hold)
     bench.served(first)
-    checks = table.arbiter.statistics(bench.now).checks
+    checks = table.arbiter.statistics(bench.now).sync_reads
     gone = [one.attempts for one in others]
     for n in range(3):
         bench.served(bench.ask(table.node, hcp2.Read(n + 1), client=hold))
     assert [one.attempts for one in others] == gone
-    assert table.arbiter.statistics(bench.now).checks >= checks
+    assert table.arbiter.statistics(bench.now).sync_reads >= checks
 
 
 def test_r9_sequences_of_one_program_in_a_row_alternate_with_the_requests_of_all_others() -> None:
@@ -383,3 +383,190 @@ def test_the_request_of_a_sequence_is_that_of_its_node() -> None:
     bench, hold = table.bench, table.hold()
     bench.ask(table.node, hcp2.Read(3), client=hold)
     assert bench.sent() == request_of(3)
+
+
+def test_r9_no_urgent_sequence_begins_while_the_line_is_held_for_another() -> None:
+    table = Table()
+    bench = table.bench
+    first, second = table.hold(table.arbiter.add_client()), table.hold(table.arbiter.add_client())
+    bench.served(bench.ask(table.node, WRITE, client=first))
+    begins = bench.ask(table.there, WRITE, priority=URGENT, client=second)
+    bench.served(bench.ask(table.node, hcp2.Read(1), client=first))
+    assert table.is_silent()
+    assert not begins.attempts
+    table.release(first)
+    bench.served(begins)
+    assert second.holds
+
+
+def test_r9_a_stop_passes_a_held_line_though_it_is_the_first_request_of_a_sequence() -> None:
+    table = Table()
+    bench = table.bench
+    first, second = table.hold(table.arbiter.add_client()), table.hold(table.arbiter.add_client())
+    bench.served(bench.ask(table.node, WRITE, client=first))
+    bench.served(bench.ask(table.there, WRITE, priority=URGENT, client=second, stop=True))
+    assert first.holds
+    assert not second.holds
+    bench.served(bench.ask(table.node, hcp2.Read(1), client=first))
+    table.release(first)
+    bench.served(bench.ask(table.there, hcp2.Read(1), client=second))
+    assert second.holds
+
+
+def test_r9_a_stop_waits_for_no_sequence_of_its_own_program_that_may_not_begin() -> None:
+    table = Table()
+    bench, program = table.bench, table.arbiter.add_client()
+    first, second = table.hold(table.arbiter.add_client()), table.hold(program)
+    bench.served(bench.ask(table.node, WRITE, client=first))
+    write = bench.ask(table.there, WRITE, priority=URGENT, client=second)
+    stop = bench.ask(table.there, hcp2.Write(2, (0.0,)), priority=URGENT, client=program, stop=True)
+    bench.served(stop)
+    assert first.holds
+    assert write.started < stop.started
+    assert not second.holds
+
+
+def paused(table: Table) -> Hold:
+    """Hold the line for half a second while the owner waits, and begin another sequence, which has to wait."""
+    bench = table.bench
+    first, second = (table.hold(table.arbiter.add_client(owner_time=1.0)) for _ in range(2))
+    write = bench.ask(table.node, WRITE, client=first)
+    polled = bench.ask(table.there, hcp2.Read(20), priority=POLL)
+    bench.served(write)
+    bench.wait(LONGEST)
+    assert first.over
+    bench.served(polled)
+    return second
+
+
+def test_r9_a_sequence_waits_until_the_owner_has_had_twice_as_long_as_the_last_one() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    began = bench.now
+    begins = bench.ask(table.node, WRITE, client=second)
+    assert table.is_silent(LONGEST)
+    bench.served(begins)  # nothing else wakes the line
+    assert 2 * LONGEST - 0.02 < begins.started - began < 2 * LONGEST + 0.05
+    assert second.holds
+
+
+def test_r9_a_sequence_that_kept_nobody_waiting_delays_no_other() -> None:
+    table = Table()
+    bench = table.bench
+    first, second = (table.hold(table.arbiter.add_client(owner_time=1.0)) for _ in range(2))
+    bench.served(bench.ask(table.node, WRITE, client=first))
+    bench.wait(LONGEST)
+    bench.ask(table.node, WRITE, client=second)
+    assert bench.until_sent() < 0.01
+
+
+def test_r9_sequences_of_the_owner_wait_for_no_pause() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    begins = bench.ask(table.node, WRITE, client=second)
+    own = table.hold()
+    bench.served(bench.ask(table.node, hcp2.Write(3, (1.0,)), client=own))
+    assert own.holds
+    assert not begins.attempts
+
+
+def test_r9_what_a_program_asks_outside_its_sequence_does_not_wait_for_it() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    begins = bench.ask(table.node, hcp2.Read(1), client=second)
+    bench.served(bench.ask(table.node, hcp2.Read(2), client=second.client))
+    assert not begins.attempts
+
+
+@pytest.mark.parametrize("ends", ["released", "cancelled", "lost"])
+def test_r8_a_request_of_a_sequence_that_may_not_begin_ends_once(ends: str) -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    backlog = table.arbiter.dispatcher.backlog
+    begins = bench.ask(table.node, WRITE, client=second)
+    assert len(backlog) == backlog.waiting_of(COMMAND, second.client) == 1
+    match ends:
+        case "released":
+            table.release(second)
+        case "cancelled":
+            table.arbiter.cancel(begins, bench.now)
+        case _:
+            table.arbiter.line_down("pulled out", bench.now)
+            table.arbiter.line_up(bench.now)
+    bench.listen()
+    assert begins.phase is Phase.ENDED
+    assert len(backlog) == 0
+    assert table.is_silent(3 * LONGEST)
+    assert begins.attempts == 0
+
+
+def hold_and_ask(table: Table, client: LineClient, seconds: float) -> None:
+    """Hold the line for so long, with one request behind the other, while the owner waits."""
+    bench, hold = table.bench, table.hold(client, longest=5.0)
+    begun = bench.now
+    while bench.now < begun + seconds:
+        bench.served(bench.ask(table.node, hcp2.Read(2), client=hold), after=0.05)
+    table.release(hold)
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_r9_a_sequence_is_charged_whole_in_however_many_pieces_it_asks(others: bool) -> None:
+    """Also if another program of the role has a short exchange behind it."""
+    table = Table()
+    bench = table.bench
+    client, other = (table.arbiter.add_client(owner_time=1.0) for _ in range(2))
+    hold_and_ask(table, client, 3.0)
+    ended = bench.now
+    for element in range(1, 101):
+        bench.ask(table.there, hcp2.Read(element), priority=POLL)
+    if others:
+        bench.served(bench.ask(table.node, hcp2.Read(4), priority=URGENT, client=other))
+    again = bench.ask(table.node, hcp2.Read(3), client=other if others else client)
+    bench.served(again, after=0.05)
+    assert again.started > ended + 2.8
+
+
+def test_r9_an_urgent_request_behind_an_urgent_sequence_does_not_wait_as_long_as_that_held_the_line() -> None:
+    table = Table()
+    bench, client = table.bench, table.arbiter.add_client(owner_time=1.0)
+    hold = table.hold(client, longest=5.0)
+    bench.served(bench.ask(table.node, WRITE, client=hold, priority=URGENT))
+    bench.wait(2.0)
+    table.release(hold)
+    for element in range(1, 101):
+        bench.ask(table.there, hcp2.Read(element), priority=POLL)
+    stop = bench.ask(table.node, hcp2.Read(3), priority=URGENT, client=client)
+    assert bench.served(stop, after=0.05).started - stop.queued < 0.3
+
+
+def test_r9_an_urgent_request_of_an_operator_goes_next_in_a_sequence_whatever_others_have_waiting() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(table.arbiter.add_client(), longest=5.0)
+    floods = [table.arbiter.add_client(owner_time=1.0) for _ in range(8)]
+    operator = table.arbiter.add_client(owner_time=1.0)
+    for client in floods:
+        bench.served(bench.ask(table.there, hcp2.Read(2), priority=URGENT, client=client), after=0.05)
+    bench.served(bench.ask(table.node, hcp2.Read(2), client=hold))
+    for client in floods:
+        bench.ask(table.there, hcp2.Read(2), priority=URGENT, client=client)
+    bench.until_sent()
+    stop = bench.ask(table.there, hcp2.Read(3), priority=URGENT, client=operator)
+    bench.answer()
+    bench.until_sent()
+    assert stop.attempts == 1
+
+
+def test_r9_a_sequence_that_waits_for_others_keeps_its_place_among_the_programs() -> None:
+    """Each sequence of another program, while it lasts, puts it aside."""
+    table = Table()
+    bench, program = table.bench, table.arbiter.add_client()
+    others = [table.arbiter.add_client() for _ in range(3)]
+    waits = bench.ask(table.node, hcp2.Read(1), client=table.hold(program))
+    for _ in range(20):
+        turns = [(hold := table.hold(other), bench.ask(table.node, WRITE, client=hold)) for other in others]
+        for hold, write in turns:
+            bench.served(write)
+            table.release(hold)
+        if waits.attempts:
+            break
+    assert waits.attempts == 1

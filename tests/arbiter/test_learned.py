@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter.choice import MOST_BEFORE
-from busmaster.arbiter.events import LatenessRaised
+from busmaster.arbiter.events import MaxReplyDelayRaised
 from busmaster.arbiter.health import SILENT, Health, NodeRecord
-from busmaster.arbiter.in_step import MOST_UNHEARD
+from busmaster.arbiter.in_sync import MOST_UNHEARD
 from busmaster.arbiter.learned import (
     MARGIN,
     SLOWER,
@@ -27,7 +27,7 @@ from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, LATENESS, TAU, Bench, reply_of, request_of, up
+from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, TAU, Bench, reply_of, request_of, up
 
 REQUEST = 8 * TAU
 TOOK = 0.004
@@ -131,7 +131,7 @@ def test_a_read_of_the_node_that_waits_anyway_goes_in_place_of_a_check_whatever_
     bench.ask(node, hcp2.Read(3), priority=Priority.BACKGROUND)
     assert bench.sent() == request_of(1)
     bench.until_sent()
-    assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(3), 0)
+    assert (bench.sent(), bench.arbiter.statistics(bench.now).sync_reads) == (request_of(3), 0)
 
 
 def test_a_read_of_the_node_does_not_go_in_place_of_a_check_before_a_write_that_waits_for_the_node() -> None:
@@ -142,7 +142,7 @@ def test_a_read_of_the_node_does_not_go_in_place_of_a_check_before_a_write_that_
     bench.ask(node, hcp2.Read(3), priority=Priority.BACKGROUND)
     assert bench.sent() == request_of(1)
     bench.until_sent()
-    assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(10), 1)
+    assert (bench.sent(), bench.arbiter.statistics(bench.now).sync_reads) == (request_of(10), 1)
 
 
 def test_r15_a_last_attempt_does_not_go_in_place_of_a_check() -> None:
@@ -152,7 +152,7 @@ def test_r15_a_last_attempt_does_not_go_in_place_of_a_check() -> None:
     bench.ask(node, hcp2.Read(3), retries=0, priority=Priority.BACKGROUND)
     assert bench.sent() == request_of(1)
     bench.until_sent()
-    assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(10), 1)
+    assert (bench.sent(), bench.arbiter.statistics(bench.now).sync_reads) == (request_of(10), 1)
 
 
 def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
@@ -243,14 +243,14 @@ def test_r15_no_last_attempt_of_a_read_leaves_in_place_of_a_write_while_a_reply_
     assert repeatable.attempts == 1
 
 
-def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_lateness() -> None:
+def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_max_reply_delay() -> None:
     bench = Bench()
     node, other = trained(bench, 1), trained(bench, 2)
     bench.ask(node, retries=1)
     asked = requests_before(bench, bench.ask(other, hcp2.Write(1, (7,))))
     checks = [request_of(element) for element in (10, 11, 2, 3)]
     assert [request for request, _ in asked[:5]] == [request_of(1), *checks], "then it is taken to be silent"
-    assert asked[5][1] - (asked[4][1] + REQUEST) >= LATENESS - 1e-9
+    assert asked[5][1] - (asked[4][1] + REQUEST) >= MAX_REPLY_DELAY - 1e-9
 
 
 def test_r15_a_write_waits_for_the_packet_too_that_may_come_behind_a_late_ack() -> None:
@@ -268,10 +268,10 @@ def test_r15_a_write_waits_for_the_packet_too_that_may_come_behind_a_late_ack() 
     node.unheard = MOST_UNHEARD  # it is taken to be silent, and not asked for a check
     [lost, after, *_] = requests_before(bench, bench.ask(bench.node(2, msc.PROFILE), msc.DataWrite(2024, 5)))
     times = msc.PROFILE.timings
-    assert after[1] - lost[1] >= times.read.lateness + times.packet.lateness
+    assert after[1] - lost[1] >= times.read.max_reply_delay + times.packet.max_reply_delay
 
 
-def test_r15_all_that_owe_are_asked_before_a_write_waits_for_a_lateness() -> None:
+def test_r15_all_that_owe_are_asked_before_a_write_waits_for_a_max_reply_delay() -> None:
     bench = Bench()
     other = trained(bench, 9)
     nodes = [trained(bench, address) for address in (1, 2, 3)]
@@ -293,7 +293,7 @@ def test_r15_who_has_lost_two_replies_is_asked_for_a_check_before_an_answer_that
     bench = Bench()
     node, other = trained(bench, 1), trained(bench, 2)
     lost = [bench.ask(node, hcp2.Read(element)) for element in (1, 3)]
-    for number in range(40):  # until the lateness of both is over, and the other has answered since
+    for number in range(40):  # until the maximum reply delay of both is over, and the other has answered since
         bench.ask(other, hcp2.Read(20 + number))
     to_node = []
     while not all(bench.ended(read) for read in lost):
@@ -345,7 +345,7 @@ def test_r9_what_goes_before_a_write_takes_no_longer_than_three_exchanges_that_n
     asked = requests_before(bench, bench.ask(other, hcp2.Write(1, (7,))))
     held_at = asked[len(nodes)][1]
     assert len(asked) > len(nodes) + MOST_BEFORE + 1, "more checks than that went, each in vain"
-    assert asked[-1][1] - held_at <= MOST_BEFORE * (REQUEST + LATENESS)
+    assert asked[-1][1] - held_at <= MOST_BEFORE * (REQUEST + MAX_REPLY_DELAY)
 
 
 def test_r9_three_exchanges_at_most_go_before_an_urgent_read() -> None:
@@ -385,7 +385,7 @@ def test_r7_a_write_is_awaited_for_as_long_as_the_document_says() -> None:
 # back to the document's times
 
 
-def test_a_straggler_brings_the_documents_times_back_until_enough_replies_have_come() -> None:
+def test_an_overdue_reply_brings_the_documents_times_back_until_enough_replies_have_come() -> None:
     bench = Bench()
     node = trained(bench)
     asked = bench.ask(node)
@@ -430,7 +430,7 @@ def test_a_node_that_has_always_been_as_slow_as_the_document_allows_is_trusted_a
 ) -> None:
     bench = Bench()
     slow = 0.9 * TIMINGS.read.window
-    write = replace(TIMINGS.write, window=writes_window, lateness=writes_window)
+    write = replace(TIMINGS.write, window=writes_window, max_reply_delay=writes_window)
     node = bench.arbiter.add_node(hcp2.PROFILE, 1, bench.now, Learned(replace(TIMINGS, write=write)))
     for number in range(TRUSTED_AFTER + 10):
         bench.served(bench.ask(node, hcp2.Read(10 + number % 2)), after=REQUEST + slow)
@@ -439,7 +439,9 @@ def test_a_node_that_has_always_been_as_slow_as_the_document_allows_is_trusted_a
     bench.ask(node)
     bench.sent()
     waited = bench.until_sent()
-    assert waited == pytest.approx(REQUEST + TIMINGS.read.window), "no longer: for what is owed the line does not wait"
+    assert waited == pytest.approx(REQUEST + TIMINGS.read.window), (
+        "no longer: for what is overdue the line does not wait"
+    )
 
 
 def test_a_node_that_was_away_begins_again() -> None:
@@ -468,15 +470,15 @@ def test_a_node_that_has_failed_is_awaited_for_as_long_as_the_document_says() ->
     bench.ask(node, hcp2.Read(5), retries=2)
     assert bench.sent() == request_of(5)
     asked = bench.now
-    bench.wait(REQUEST + LATENESS - 0.0001)
+    bench.wait(REQUEST + MAX_REPLY_DELAY - 0.0001)
     assert node.counters.no_reply == 1
     bench.wait(0.0002)
     assert node.counters.no_reply == 2
     bench.until_ready()
-    assert bench.now - asked < REQUEST + LATENESS + 0.001, "nothing is left to wait for"
+    assert bench.now - asked < REQUEST + MAX_REPLY_DELAY + 0.001, "nothing is left to wait for"
 
 
-def test_r3_a_straggler_near_its_lateness_raises_it_though_the_line_had_gone_on() -> None:
+def test_r3_an_overdue_reply_near_its_max_reply_delay_raises_it_though_the_line_had_gone_on() -> None:
     bench = Bench()
     node, other = trained(bench, 1), up(bench, 2)
     asked = bench.ask(node)
@@ -487,7 +489,7 @@ def test_r3_a_straggler_near_its_lateness_raises_it_though_the_line_had_gone_on(
         bench.served(bench.ask(other, hcp2.Read(6 + int(bench.now * 1000) % 2)), after=REQUEST + TOOK)
     bench.hear(reply_of(1, 5), after=0.005)
     bench.until_ready()
-    raised = [event for event in bench.events if isinstance(event, LatenessRaised)]
+    raised = [event for event in bench.events if isinstance(event, MaxReplyDelayRaised)]
     assert [event.node for event in raised] == [node]
 
 
@@ -512,7 +514,7 @@ def test_the_line_waits_for_a_late_ack_where_it_would_be_a_command_to_another_no
     out = bench.now
     bench.sent()
     bench.until_sent()
-    assert bench.now - out > profile.timings.write.lateness
+    assert bench.now - out > profile.timings.write.max_reply_delay
 
 
 def test_windows_are_not_learned_where_a_damaged_request_is_answered_with_another_element() -> None:

@@ -15,9 +15,9 @@ from busmaster.arbiter.learned import (
     TRUSTED_AGAIN_AFTER,
     LearnedTimes,
     Learning,
-    LegTimes,
+    StepTimes,
 )
-from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.on_wire import Step
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import TAU
 
@@ -25,7 +25,7 @@ TIMINGS = hcp2.PROFILE.timings
 
 
 def test_the_window_is_half_as_long_again_as_the_largest_reply_time_of_the_last_epochs_and_at_least_the_least() -> None:
-    times = LegTimes()
+    times = StepTimes()
     for place in range(TRUSTED_AFTER):
         assert times.timing(TIMINGS.read, TAU, AT_FIRST) is TIMINGS.read, f"{place} replies are too few"
         times.note(0.001, 0.002, 0.0)
@@ -33,28 +33,30 @@ def test_the_window_is_half_as_long_again_as_the_largest_reply_time_of_the_last_
     times.note(0.010, 0.012, 0.0)
     learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
     assert learned.window == pytest.approx(1.5 * 0.010 + 0.002)
-    assert learned.lateness == TIMINGS.read.lateness, "what is owed is owed for as long as the document says"
-    assert learned.silence == learned.byte_gap == pytest.approx(LEAST_SILENCE * TAU)
+    assert learned.max_reply_delay == TIMINGS.read.max_reply_delay, (
+        "what is overdue is overdue for as long as the document says"
+    )
+    assert learned.silence == learned.inter_byte_timeout == pytest.approx(LEAST_SILENCE * TAU)
     for _ in range(2 * EPOCH):
         times.note(0.001, 0.002, 0.0)
     assert times.window == LEAST
 
 
 def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
-    times = LegTimes()
+    times = StepTimes()
     for _ in range(TRUSTED_AFTER):
         times.note(0.001, 0.018, 0.004)
     learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
     assert learned.window == pytest.approx(0.018 + MARGIN)
-    assert learned.byte_gap == pytest.approx(0.008)
+    assert learned.inter_byte_timeout == pytest.approx(0.008)
 
 
 def test_a_pause_is_what_is_between_two_pieces_of_a_reply_however_early_they_come() -> None:
-    leg = Leg(TIMINGS.read, 0.0, TAU)
-    leg.begun_at = 0.01
+    step = Step(TIMINGS.read, 0.0, TAU)
+    step.begun_at = 0.01
     for now in (0.01, 0.02, 0.025):
-        leg.note_pause(now)
-    assert leg.pause == pytest.approx(0.01)
+        step.note_pause(now)
+    assert step.pause == pytest.approx(0.01)
 
 
 def test_a_reply_that_was_slower_than_any_is_forgotten_after_two_epochs() -> None:
@@ -70,11 +72,11 @@ def test_a_reply_that_was_slower_than_any_is_forgotten_after_two_epochs() -> Non
 
 
 def test_no_learned_time_exceeds_the_documents() -> None:
-    times = LegTimes()
+    times = StepTimes()
     for _ in range(TRUSTED_AFTER):
         times.note(0.080, 0.080, 0.015)
     learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
-    assert (learned.window, learned.byte_gap) == (TIMINGS.read.window, TIMINGS.read.byte_gap)
+    assert (learned.window, learned.inter_byte_timeout) == (TIMINGS.read.window, TIMINGS.read.inter_byte_timeout)
 
 
 def test_reads_and_writes_and_packets_are_kept_apart() -> None:

@@ -20,12 +20,12 @@ def test_line_time_of_a_read_counts_bytes_both_ways_and_one_wait() -> None:
     assert line_time(read, TAU) == pytest.approx((8 + 12) * TAU + 0.025)
 
 
-def test_line_time_of_a_conversation_counts_each_leg_and_the_closing_ack() -> None:
+def test_line_time_of_a_conversation_counts_each_step_and_the_closing_ack() -> None:
     """MSC DREAD: a packet of 16 bytes, ACK, a packet of 18 bytes, ACK."""
     tau = msc.PROFILE.line.byte_time
     read = msc.DataRead(2008).open(1, msc.PROFILE.timings)
     assert line_time(read, tau, 0.01) == pytest.approx((16 + 1 + 18 + 1) * tau + 2 * 0.01)
-    slow = replace(msc.PROFILE.timings.packet, nominal=0.08)
+    slow = replace(msc.PROFILE.timings.packet, late_after=0.08)
     read = msc.DataRead(2008).open(1, replace(msc.PROFILE.timings, packet=slow))
-    nominal = msc.PROFILE.timings.read.nominal
-    assert line_time(read, tau) == pytest.approx((16 + 1 + 18 + 1) * tau + (nominal + 0.08) / 2)
+    late_after = msc.PROFILE.timings.read.late_after
+    assert line_time(read, tau) == pytest.approx((16 + 1 + 18 + 1) * tau + (late_after + 0.08) / 2)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.arbiter.mark import Mark
-from busmaster.arbiter.state import LineState
+from busmaster.arbiter.counters import LineState, Mark
 from busmaster.errors import GarbledReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, TAU, WRITE_5, Bench, request_of, up
+from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, QUIET, TAU, WRITE_5, Bench, request_of, up
 
 REQUEST = 8 * TAU
 
@@ -55,20 +54,20 @@ def test_a_marked_byte_is_no_acknowledgement() -> None:
     assert isinstance(asked.error, WriteUnconfirmed)
 
 
-def test_r3_after_a_marked_byte_the_line_settles_for_the_whole_lateness() -> None:
+def test_r3_after_a_marked_byte_the_line_resynchronises_for_the_whole_max_reply_delay() -> None:
     bench = Bench()
     bench.ask(up(bench))
     bench.sent()
     mark(bench, after=REQUEST + 0.003)
-    assert bench.until_sent() == pytest.approx(LATENESS - 0.003)
+    assert bench.until_sent() == pytest.approx(MAX_REPLY_DELAY - 0.003)
 
 
-def test_r3_a_marked_byte_on_an_idle_line_settles_too() -> None:
+def test_r3_a_marked_byte_on_an_idle_line_resynchronises_too() -> None:
     bench = Bench()
     node = up(bench)
     bench.wait(1.0)
     mark(bench)
-    assert bench.arbiter.state is LineState.SETTLING
+    assert bench.arbiter.state is LineState.RESYNCHRONISING
     bench.ask(node)
     assert bench.sent() == ""
     assert bench.until_sent() == pytest.approx(QUIET)

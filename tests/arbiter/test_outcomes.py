@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.events import LatenessLowered, LatenessRaised, Sampled
-from busmaster.arbiter.health import CALM_LATENESS, Health, NodeRecord
+from busmaster.arbiter.events import MaxReplyDelayLowered, MaxReplyDelayRaised, Sampled
+from busmaster.arbiter.health import CALM_MAX_REPLY_DELAY, Health, NodeRecord
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.exchange import OTHER_FORMAT, Command
 from busmaster.contract.timing import Timings
@@ -19,7 +19,7 @@ from busmaster.protocols.modbus import codec as modbus
 from tests.arbiter.bench import (
     ACK,
     FIVE,
-    LATENESS,
+    MAX_REPLY_DELAY,
     NAK,
     QUIET,
     READ_1_OF_NODE_1,
@@ -145,14 +145,14 @@ def test_r7_a_write_says_what_else_came_after_it_was_not_answered() -> None:
 # a refused read
 
 
-def test_r7_the_first_refusal_of_a_read_settles_for_the_lateness_and_the_second_for_its_silence_alone() -> None:
+def test_r7_a_first_refusal_of_a_read_costs_the_max_reply_delay_and_the_second_its_silence_alone() -> None:
     """A parameter that a drive lacks: the second NAK is what the first one was, and no reply can follow it."""
     bench = Bench()
     node = up(bench)
     refused, following = bench.ask(node, hcp2.Read(9)), bench.ask(node)
     bench.sent()
     bench.hear(NAK, after=REQUEST + 0.002)
-    assert bench.until_sent() == pytest.approx(LATENESS - 0.002)
+    assert bench.until_sent() == pytest.approx(MAX_REPLY_DELAY - 0.002)
     assert bench.sent() == READ_1_OF_NODE_1
     bench.hear(FIVE, after=0.004)
     assert bench.sent() == request_of(9)
@@ -225,7 +225,7 @@ def test_a_bug_in_a_reader_is_no_dead_node_and_the_line_goes_on() -> None:
     assert bench.served(bench.ask(node, hcp2.Read(3))).value == 5.0
 
 
-# a lateness that was raised
+# a maximum reply delay that was raised
 
 
 def raised(bench: Bench) -> NodeRecord:
@@ -234,42 +234,42 @@ def raised(bench: Bench) -> NodeRecord:
     bench.sent()
     bench.hear(FIVE, after=REQUEST + 0.140)
     bench.until_ready()
-    assert [type(event) for event in bench.events if isinstance(event, LatenessRaised)] == [LatenessRaised]
-    assert node.lateness == pytest.approx(0.224)
+    assert [type(event) for event in bench.events if isinstance(event, MaxReplyDelayRaised)] == [MaxReplyDelayRaised]
+    assert node.max_reply_delay == pytest.approx(0.224)
     return node
 
 
-def lowered(bench: Bench) -> list[LatenessLowered]:
-    return [event for event in bench.events if isinstance(event, LatenessLowered)]
+def lowered(bench: Bench) -> list[MaxReplyDelayLowered]:
+    return [event for event in bench.events if isinstance(event, MaxReplyDelayLowered)]
 
 
-def test_r3_a_raised_lateness_comes_down_after_an_hour_of_prompt_replies() -> None:
+def test_r3_a_raised_max_reply_delay_comes_down_after_an_hour_of_prompt_replies() -> None:
     bench = Bench()
     node = raised(bench)
-    bench.wait(CALM_LATENESS - 1.0)
+    bench.wait(CALM_MAX_REPLY_DELAY - 1.0)
     bench.served(bench.ask(node))
-    assert node.lateness == pytest.approx(0.224)
+    assert node.max_reply_delay == pytest.approx(0.224)
     assert not lowered(bench)
     bench.wait(2.0)
     bench.served(bench.ask(node))
-    assert node.lateness == 0.150
-    assert [(event.node, event.lateness) for event in lowered(bench)] == [(node, 0.150)]
+    assert node.max_reply_delay == 0.150
+    assert [(event.node, event.max_reply_delay) for event in lowered(bench)] == [(node, 0.150)]
 
 
-def test_r3_a_late_reply_within_the_hour_keeps_a_raised_lateness_for_another() -> None:
+def test_r3_a_late_reply_within_the_hour_keeps_a_raised_max_reply_delay_for_another() -> None:
     bench = Bench()
     node = raised(bench)
-    bench.wait(CALM_LATENESS / 2)
+    bench.wait(CALM_MAX_REPLY_DELAY / 2)
     bench.ask(node)
     bench.until_sent()
     bench.answer(after=REQUEST + 0.080)
     assert (node.counters.late, node.counters.overdue) == (2, 1), "the one before raised it"
-    bench.wait(CALM_LATENESS / 2 + 2.0)
+    bench.wait(CALM_MAX_REPLY_DELAY / 2 + 2.0)
     bench.served(bench.ask(node))
-    assert node.lateness == pytest.approx(0.224)
+    assert node.max_reply_delay == pytest.approx(0.224)
 
 
-def test_r3_a_lateness_raised_twice_comes_down_to_what_it_was_before_both() -> None:
+def test_r3_a_max_reply_delay_raised_twice_comes_down_to_what_it_was_before_both() -> None:
     bench = Bench()
     node = raised(bench)
     bench.wait(11.0)
@@ -278,10 +278,10 @@ def test_r3_a_lateness_raised_twice_comes_down_to_what_it_was_before_both() -> N
     bench.sent()
     bench.hear(FIVE, after=REQUEST + 0.200)
     bench.until_ready()
-    assert node.lateness == pytest.approx(0.320)
-    bench.wait(CALM_LATENESS + 1.0)
+    assert node.max_reply_delay == pytest.approx(0.320)
+    bench.wait(CALM_MAX_REPLY_DELAY + 1.0)
     bench.served(bench.ask(node))
-    assert node.lateness == 0.150
+    assert node.max_reply_delay == 0.150
 
 
 def test_r7_what_a_read_ends_with_is_of_its_last_attempt() -> None:

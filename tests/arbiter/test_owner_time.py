@@ -9,7 +9,7 @@ import pytest
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.shared_backlog import MOST_LEFT
 from busmaster.arbiter.transaction import Priority
-from busmaster.gate.rights import READ, RIGHTS, WRITE
+from busmaster.authorisation.rights import READ, RIGHTS, WRITE
 from tests.arbiter.test_turns import Desk
 
 URGENT, COMMAND, POLL, BACKGROUND = Priority

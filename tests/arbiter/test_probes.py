@@ -26,7 +26,7 @@ from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import LATENESS, NAK, READ_1_OF_NODE_1, TAU, Bench, dead, request_of, up
+from tests.arbiter.bench import MAX_REPLY_DELAY, NAK, READ_1_OF_NODE_1, TAU, Bench, dead, request_of, up
 
 UNKNOWN, UP, SUSPECT, DOWN, _ = Health
 PROBE_COST = 0.150
@@ -65,18 +65,18 @@ def test_r11_beside_live_nodes_probes_are_cheap_reads_at_delays_that_double_up_t
     record = beside_a_live_node(bench)
     delays, probes = [], []
     until_probed(bench)
-    bench.wait(REQUEST + LATENESS + 0.0001)
+    bench.wait(REQUEST + MAX_REPLY_DELAY + 0.0001)
     for _ in range(8):
         delays.append(record.probe_delay)
         waited = until_probed(bench)
         assert waited == pytest.approx(record.probe_delay, abs=0.2)
         probes.append(bench.asked)
-        bench.wait(REQUEST + LATENESS + 0.0001)
+        bench.wait(REQUEST + MAX_REPLY_DELAY + 0.0001)
     assert delays == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
     assert probes[-3:] == [READ_1_OF_NODE_1] * 3, "its cheapest read"
 
 
-def test_r15_probes_that_follow_one_another_never_ask_for_what_is_owed() -> None:
+def test_r15_probes_that_follow_one_another_never_ask_for_what_is_overdue() -> None:
     """The reply to the one before may still come, and would be taken for its own."""
     bench = Bench()
     dead(bench)

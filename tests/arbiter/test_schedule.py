@@ -12,11 +12,21 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import example, given, settings
 
-import busmaster.arbiter.phases as phases_module
+import busmaster.arbiter.schedule as phases_module
 import busmaster.arbiter.schedule as schedule_module
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.phases import KINKS, ROUNDING, STRIDE, common_divisor, quietest_offset
-from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule, begin_cycle, set_members
+from busmaster.arbiter.schedule import (
+    AT_ONCE,
+    KINKS,
+    ROUNDING,
+    SLICE,
+    STRIDE,
+    Schedule,
+    begin_cycle,
+    common_divisor,
+    quietest_offset,
+    set_members,
+)
 from busmaster.arbiter.transaction import LONGEST_PATIENCE, Poll, Priority, Transaction
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import pytest
 
+from busmaster.arbiter.counters import Mark
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.contract.driver import EndlessExchange
 from busmaster.contract.exchange import Expect, Sizes
@@ -17,7 +17,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import (
     BAD_CHECKSUM,
     FIVE,
-    LATENESS,
+    MAX_REPLY_DELAY,
     NAK,
     QUIET,
     READ_1_OF_NODE_1,
@@ -98,11 +98,11 @@ def test_what_is_not_read_is_spoilt() -> None:
         assert one.verdict is Verdict.SPOILT
 
 
-def test_a_good_answer_that_may_be_anothers_is_doubted() -> None:
+def test_a_good_answer_that_may_be_anothers_is_ambiguous() -> None:
     bench = Bench(tapped=True)
     bench.ask(bench.node(), retries=0)
     bench.hear(f"{FIVE} {FIVE}", after=0.004)
-    assert said(bench) == ["1.1 doubted: read element 1: two answers came where one was due"]
+    assert said(bench) == ["1.1 ambiguous: read element 1: two answers came where one was due"]
 
 
 def test_the_loss_of_the_line_cuts_it_off() -> None:
@@ -132,7 +132,7 @@ def test_polls_probes_and_checks_say_why_they_are_asked() -> None:
     bench.ask(node, probe=True)
     bench.hear(FIVE, after=0.004)
     bench.ask(node)  # is not answered, so the next answer of its kind could be its
-    bench.wait(0.1 + LATENESS)
+    bench.wait(0.1 + MAX_REPLY_DELAY)
     assert [one.purpose for one in ended(bench)] == ["poll group", "probe", ""]
     check = bench.arbiter.attempt
     assert check is not None
@@ -159,7 +159,7 @@ def test_a_line_that_nobody_taps_tells_and_pays_nothing() -> None:
 
 @dataclass(frozen=True)
 class Endless:
-    """A command whose exchange wants one leg after the other."""
+    """A command whose exchange wants one step after the other."""
 
     writes: bool = False
     idempotent: bool = True
@@ -210,10 +210,10 @@ def test_a_retry_of_a_request_that_began_before_anybody_listened_is_told() -> No
     assert said(bench) == ["1.2 no reply: read element 1: no reply within 150 ms"]
 
 
-def test_an_attempt_says_how_long_the_line_had_settled() -> None:
+def test_an_attempt_says_how_long_the_line_had_resynchronised() -> None:
     bench = Bench(tapped=True)
     bench.ask(bench.node(), retries=1)
     bench.hear(BAD_CHECKSUM, after=0.004)
     bench.wait(QUIET + 0.152)
     first, second = ended(bench)
-    assert second.settled - first.settled == pytest.approx(QUIET, abs=0.01)
+    assert second.quiet_time - first.quiet_time == pytest.approx(QUIET, abs=0.01)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import (
     BacklogFull,
@@ -323,7 +323,7 @@ def test_a_timeline_says_what_a_request_waited_for() -> None:
     timeline = second.timeline()
     assert timeline.queued == start
     assert timeline.exchanges_ahead == 2, "the one that failed, and the check behind it"
-    assert timeline.settling_ahead == pytest.approx(0.050 + TAU)
+    assert timeline.quiet_time_ahead == pytest.approx(0.050 + TAU)
     assert timeline.attempts == 1
 
 
@@ -391,7 +391,7 @@ def test_a_timeline_that_spans_a_reset_of_the_statistics_counts_on() -> None:
     bench.checked()
     timeline = waiting.timeline()
     assert timeline.exchanges_ahead == 2, "the one that failed, and the check behind it"
-    assert timeline.settling_ahead == pytest.approx(0.050 + TAU)
+    assert timeline.quiet_time_ahead == pytest.approx(0.050 + TAU)
     assert bench.arbiter.statistics(bench.now).exchanges == 2
 
 
@@ -509,8 +509,8 @@ def test_while_the_line_is_down_a_request_fails_with_the_latest_reason_and_what_
     usual = LineDown.hint
     assert error() == f"node 1: the line is down: unplugged (read element 1); {usual}".removesuffix("; ")
     for reason in ("it does not exist", "another has its name"):
-        bench.arbiter.still_down(reason, f"mend that {reason}")
-        assert error() == f"node 1: the line is down: {reason} (read element 1); mend that {reason}"
+        bench.arbiter.still_down(reason, f"fix that {reason}")
+        assert error() == f"node 1: the line is down: {reason} (read element 1); fix that {reason}"
     bench.arbiter.line_up(bench.now)
     bench.arbiter.line_down("unplugged", bench.now)
     assert error() == f"node 1: the line is down: unplugged (read element 1); {usual}".removesuffix("; ")

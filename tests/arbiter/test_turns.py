@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.shared_backlog import URGENT_RUN
+from busmaster.arbiter.shared_backlog import PASSED_BY_EACH, URGENT_RUN
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.arbiter.turns import PASSED_BY_EACH
 from busmaster.errors import BacklogFull, Superseded
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import Bench, up
@@ -331,3 +330,37 @@ def test_r8_whatever_waits_of_all_programs_ends_when_the_line_is_lost() -> None:
     bench.listen()
     assert all(bench.ended(transaction) == 1 for transaction in asked)
     assert len(bench.arbiter.dispatcher.backlog) == 0
+
+
+@pytest.mark.parametrize("why", ["too late", "behind its own write"])
+def test_r9_a_turn_in_which_nothing_is_sent_is_no_turn(why: str) -> None:
+    """Else a program whose requests all wait for something loses one turn with each, and is passed over for long."""
+    arbiter = Arbiter(0.001)
+    dispatcher = arbiter.dispatcher
+    dispatcher.fault = None
+    one, other = arbiter.add_client(), arbiter.add_client()
+    node = arbiter.add_node(hcp2.PROFILE, 1, 0.0)
+
+    def ask(client: LineClient, command: hcp2.Read | hcp2.Write, start_by: float = 100.0) -> Transaction:
+        transaction = Transaction(node, command, COMMAND, client=client, start_by=start_by)
+        dispatcher.submit(transaction, 0.0)
+        return transaction
+
+    if why == "too late":
+        held = [ask(one, READ, start_by=0.5) for _ in range(10)]
+    else:
+        first = ask(one, hcp2.Write(1, (1,)))
+        assert dispatcher.next(0.0) is first
+        dispatcher.started(first, 0.0)
+        held = [ask(one, hcp2.Write(1, (n,))) for n in range(10)]
+    good = ask(one, READ)
+    for _ in range(20):
+        ask(other, READ)
+    passed = 0
+    while (transaction := dispatcher.next(1.0)) is not good:
+        assert transaction is not None
+        assert transaction.client is other
+        passed += 1
+        transaction.phase = Phase.ENDED
+    assert passed <= PASSED_BY_EACH
+    assert {transaction.phase for transaction in held} <= {Phase.ENDED, Phase.PARKED}

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from busmaster.arbiter.state import LineState
+from busmaster.arbiter.counters import LineState
 from busmaster.errors import GarbledReply, NoReply
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, LATENESS, READ_1_OF_NODE_1, SEVEN, TAU, Bench, up
+from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, READ_1_OF_NODE_1, SEVEN, TAU, Bench, up
 
 REQUEST = 8 * TAU
 LOOK = 0.002
@@ -32,18 +32,18 @@ def test_r2_the_wait_for_a_reply_counts_from_when_the_port_took_the_request(stal
     bench = Bench()
     read = bench.ask(bench.node(), retries=0)
     given_late(bench, stall)
-    bench.wait(REQUEST + LATENESS - 0.0001)
+    bench.wait(REQUEST + MAX_REPLY_DELAY - 0.0001)
     assert not bench.ended(read)
     bench.wait(0.0002)
     assert isinstance(read.error, NoReply)
 
 
 @pytest.mark.parametrize("stall", [0.160, 0.410])
-def test_r3_a_stall_before_the_write_shifts_the_lateness_too(stall: float) -> None:
+def test_r3_a_stall_before_the_write_shifts_the_max_reply_delay_too(stall: float) -> None:
     bench = Bench()
     bench.ask(bench.node())
     given_late(bench, stall)
-    assert bench.until_sent() == pytest.approx(REQUEST + LATENESS)
+    assert bench.until_sent() == pytest.approx(REQUEST + MAX_REPLY_DELAY)
 
 
 def test_r2_a_reply_is_not_late_because_its_request_was() -> None:
@@ -70,20 +70,47 @@ def test_r4_a_stall_before_the_write_taints_no_reply_that_came_in_its_time() -> 
     assert read.value == 5.0
 
 
-def test_r3_a_stall_before_a_closing_ack_shifts_the_settle() -> None:
+def test_r3_a_stall_before_a_closing_ack_shifts_the_resynchronisation() -> None:
     """MSC: a stale packet is ACKed; the line is free no sooner than a silence after the ACK is out."""
     bench = Bench()
     bench.arbiter.byte_time = tau = 10 / 9600
     node = bench.node(1, msc.PROFILE)
     bench.wait(2.0)
     bench.hear("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
-    assert bench.arbiter.state is LineState.SETTLING
+    assert bench.arbiter.state is LineState.RESYNCHRONISING
     due = bench.arbiter.poll_timeout()
     assert given_late(bench, 0.300) == ACK
     assert bench.arbiter.poll_timeout() == pytest.approx(due + 0.300)
     bench.ask(node, msc.DataRead(2008))
     bench.until_sent()
     assert bench.now >= due + 0.300 + tau - 0.002
+
+
+def test_a_stall_before_an_ack_within_an_exchange_makes_no_request_later() -> None:
+    """MSC repeats its packet; the value may be as old as the request, so nobody may take it for a later one."""
+    bench = Bench()
+    bench.arbiter.byte_time = 10 / 9600
+    node = bench.node(1, msc.PROFILE)
+    bench.wait(2.0)
+    read = bench.ask(node, msc.DataRead(2008))
+    assert bench.sent() == "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
+    asked = read.started
+    bench.hear("02 0D 00 0A 00 00 44 52 45 41 44 2C 41 48 79 CB 03 70")  # node 13 says again what it was asked before
+    assert read.started == bench.now == asked
+    assert given_late(bench, 0.300) == ACK
+    assert read.started == asked
+
+
+def test_a_request_that_waits_behind_an_ack_starts_when_both_are_taken() -> None:
+    bench = Bench()
+    bench.arbiter.byte_time = 10 / 9600
+    node = bench.node(1, msc.PROFILE)
+    bench.wait(2.0)
+    read = bench.ask(node, msc.DataRead(2008))
+    bench.hear("02 0D 00 0A 00 00 44 52 45 41 44 2C 41 48 79 CB 03 70")
+    sent = given_late(bench, 0.300)
+    assert sent.endswith(" 02 74 " + ACK)
+    assert read.started == bench.now
 
 
 def test_a_stall_is_no_part_of_how_slow_a_node_is() -> None:
@@ -128,14 +155,14 @@ def test_r2_the_wait_for_a_reply_counts_from_when_the_last_byte_has_left(held: f
     bench.wait(REQUEST + held)
     bench.unsent = 0
     left = bench.now
-    bench.to(left + LATENESS - 0.0001)
+    bench.to(left + MAX_REPLY_DELAY - 0.0001)
     assert not bench.ended(read)
-    bench.to(left + LATENESS + 0.0001 + LOOK)
+    bench.to(left + MAX_REPLY_DELAY + 0.0001 + LOOK)
     assert isinstance(read.error, NoReply)
 
 
 @pytest.mark.parametrize("held", [0.120, 0.350, 3.0])
-def test_r3_the_lateness_counts_from_when_the_last_byte_has_left(held: float) -> None:
+def test_r3_the_max_reply_delay_counts_from_when_the_last_byte_has_left(held: float) -> None:
     bench = Bench()
     bench.ask(bench.node())
     bench.sent()
@@ -144,7 +171,7 @@ def test_r3_the_lateness_counts_from_when_the_last_byte_has_left(held: float) ->
     bench.unsent = 0
     left = bench.now
     bench.until_sent()
-    assert LATENESS <= bench.now - left <= LATENESS + 2 * LOOK
+    assert MAX_REPLY_DELAY <= bench.now - left <= MAX_REPLY_DELAY + 2 * LOOK
 
 
 def test_r2_a_reply_to_what_was_held_is_believed_and_prompt() -> None:
@@ -169,7 +196,7 @@ def test_what_is_held_is_asked_for_no_sooner_than_it_can_have_left() -> None:
     assert bench.arbiter.poll_timeout() == pytest.approx(bench.now + 5 * slow)
 
 
-def test_r3_a_settle_does_not_run_out_while_the_port_holds_an_ack() -> None:
+def test_r3_a_resynchronisation_does_not_run_out_while_the_port_holds_an_ack() -> None:
     """MSC: the ACK of a stale packet is held; the packet is said again, and its ACK must not meet a request."""
     bench = Bench()
     bench.arbiter.byte_time = 10 / 9600
@@ -204,10 +231,10 @@ def test_r1_a_holdoff_does_not_run_out_while_the_port_holds_a_closing_ack() -> N
     assert bench.sent().startswith("02 01 00 08"), "the next read, and nothing lies before it in the port"
 
 
-def test_r1_a_turnaround_counts_from_when_a_held_closing_ack_has_left() -> None:
+def test_r1_a_driver_release_time_counts_from_when_a_held_closing_ack_has_left() -> None:
     bench = Bench()
     bench.arbiter.byte_time = 10 / 9600
-    slow = replace(msc.PROFILE.timings, packet=replace(msc.PROFILE.timings.packet, turnaround=0.300))
+    slow = replace(msc.PROFILE.timings, packet=replace(msc.PROFILE.timings.packet, driver_release_time=0.300))
     node = bench.node(1, msc.PROFILE, slow)
     bench.wait(2.0)
     bench.ask(node, msc.DataRead(2008))
@@ -222,7 +249,7 @@ def test_r1_a_turnaround_counts_from_when_a_held_closing_ack_has_left() -> None:
 
 
 def test_r4_bytes_that_come_while_the_whole_request_is_held_are_not_its_reply() -> None:
-    """A straggler of before: nothing of the request has been said yet."""
+    """An overdue reply of before: nothing of the request has been said yet."""
     bench = Bench(paced=True)
     read = bench.ask(bench.node(), retries=0)
     bench.unsent = 8
@@ -273,7 +300,7 @@ def test_r13_what_a_lost_port_held_is_not_held_by_the_next_one() -> None:
 # a loop that stood still
 
 
-def test_r3_a_reply_that_lay_unread_while_the_loop_stood_still_raises_no_lateness() -> None:
+def test_r3_a_reply_that_lay_unread_while_the_loop_stood_still_raises_no_max_reply_delay() -> None:
     bench = Bench()
     node = up(bench)
     bench.ask(node, retries=0)
@@ -281,7 +308,7 @@ def test_r3_a_reply_that_lay_unread_while_the_loop_stood_still_raises_no_latenes
     bench.wait(0.105)
     bench.now += 0.300
     bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now)
-    assert node.lateness == 0.150
+    assert node.max_reply_delay == 0.150
 
 
 def test_r3_a_timer_that_comes_before_the_bytes_that_lie_unread_gives_nothing_up() -> None:
@@ -300,7 +327,7 @@ def test_r3_a_timer_that_comes_before_the_bytes_that_lie_unread_gives_nothing_up
     assert bench.sent() == READ_1_OF_NODE_1
     bench.hear(SEVEN, after=0.004)
     assert following.value == 7.0
-    assert node.lateness == 0.150
+    assert node.max_reply_delay == 0.150
 
 
 def test_a_reply_in_time_is_delivered_when_the_loop_stood_still_past_its_window() -> None:
@@ -313,19 +340,19 @@ def test_a_reply_in_time_is_delivered_when_the_loop_stood_still_past_its_window(
     assert read.value == 5.0
 
 
-def test_r3_a_straggler_that_was_seen_to_come_late_raises_the_lateness() -> None:
+def test_r3_an_overdue_reply_that_was_seen_to_come_late_raises_the_max_reply_delay() -> None:
     """The line was looked at all the while: so late it was."""
     bench = Bench()
     node = up(bench)
     bench.ask(node, retries=0)
     bench.sent()
     bench.hear(FIVE, after=REQUEST + 0.140)
-    assert node.lateness == pytest.approx(0.224)
+    assert node.max_reply_delay == pytest.approx(0.224)
 
 
 @pytest.mark.parametrize("stall", [0.050, 0.200, 1.0])
-def test_r3_a_stall_in_the_midst_of_a_settle_raises_no_lateness(stall: float) -> None:
-    """The straggler came at 0.111 s, and was handed over when the loop went on."""
+def test_r3_a_stall_in_the_midst_of_a_resynchronisation_raises_no_max_reply_delay(stall: float) -> None:
+    """The overdue reply came at 0.111 s, and was handed over when the loop went on."""
     bench = Bench()
     node = up(bench)
     bench.ask(node, retries=0)
@@ -333,4 +360,4 @@ def test_r3_a_stall_in_the_midst_of_a_settle_raises_no_lateness(stall: float) ->
     bench.to(bench.now + REQUEST + 0.110)
     bench.now += stall
     bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now)
-    assert node.lateness == 0.150
+    assert node.max_reply_delay == 0.150

@@ -192,7 +192,7 @@ def test_each_of_several_overheard_values_may_begin_an_alarm() -> None:
         drive = Hcp2Controller(bus, 1)
         speeds = [replace(drive.point(item), meaning=LIMITS) for item in ("10", "11", "12")]
         [sample] = samples(30.0).values()
-        bus.overheard(dict.fromkeys((*speeds, drive.point("13")), sample))
+        bus._overheard(dict.fromkeys((*speeds, drive.point("13")), sample))
         assert {point for point, alarm in bus.alarms.items() if alarm is not None} == set(speeds)
 
     on_a_bus(story)

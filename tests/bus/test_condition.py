@@ -83,7 +83,7 @@ async def test_while_the_line_is_lost_no_node_is_up_and_no_value_is_good() -> No
         [node] = bus.nodes
         assert (node.health, bus.condition) == (Health.UP, PRESENT)
         before = bus.now()
-        transport = bus.pump._transport
+        transport = bus._pump._transport
         assert isinstance(transport, MemoryTransport)
         transport.lose(OSError("unplugged"))
         while not is_lost(bus):  # noqa: ASYNC110  nobody tells it
@@ -101,7 +101,7 @@ async def test_while_the_line_is_lost_no_node_is_up_and_no_value_is_good() -> No
         while is_lost(bus):  # noqa: ASYNC110  it is opened again by itself
             await asyncio.sleep(0.001)
         assert (node.health, qualities(bus, group)) == (Health.UP, [Quality.GOOD] * 3)
-        assert bus.lost_seconds > 0
+        assert bus._lost_seconds > 0
         assert group.good_at(group.points[0]) == read_at
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from busmaster.arbiter.state import LineState
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.bounds import LONGEST_HOLD
 from busmaster.bus.bus import Bus

@@ -85,7 +85,7 @@ def test_two_hundred_groups_added_at_once_fail_nothing_and_exchanges_go_on(monke
         assert sum(group.statistics().bad for group in groups) == 0
         for node in bus.nodes:
             assert node.statistics().no_reply == 0
-            assert node.statistics().lateness == hcp2.PROFILE.timings.read.lateness
+            assert node.statistics().max_reply_delay == hcp2.PROFILE.timings.read.max_reply_delay
 
     on_a_bus(story)
 
@@ -193,7 +193,7 @@ def test_a_plan_in_steps_is_the_plan_and_others_run_meanwhile() -> None:
                 await asyncio.sleep(0)
 
         counting = asyncio.create_task(count_turns())
-        planned = await bus.plan_in_steps()
+        planned = await bus._plan_in_steps()
         counting.cancel()
         assert planned == bus.plan()
         assert turns > 50

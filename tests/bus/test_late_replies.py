@@ -42,12 +42,12 @@ def test_r2_every_value_of_a_node_that_its_document_allows_to_be_so_late_is_deli
             assert [(sample.value, sample.quality) for sample in samples] == [(READS - 1, Quality.LATE)] * READS
             counts = node.statistics()
             assert counts.ok == counts.late == counts.overdue == counts.attempts >= 3 * READS
-            assert (counts.failed, counts.retries, node.record.health) == (0, 0, Health.UP)
+            assert (counts.failed, counts.retries, node._record.health) == (0, 0, Health.UP)
 
     run_in_virtual_time(main())
 
 
-def test_r2_what_begins_after_the_lateness_is_no_reply() -> None:
+def test_r2_what_begins_after_the_max_reply_delay_is_no_reply() -> None:
     async def main() -> None:
         async with Bus(MemoryPort(line(0.152))) as bus:
             with pytest.raises(NoReply, match="no reply within 150 ms"):

@@ -24,11 +24,11 @@ def bus_with(*addresses: int) -> Bus:
 def test_a_lent_node_leaves_with_the_last_who_gives_it_back() -> None:
     async def run() -> None:
         async with bus_with(5) as bus:
-            node = bus.lend_node(PROFILE, 5)
-            assert bus.lend_node(PROFILE, 5) is node
-            bus.give_back(node)
+            node = bus._lend_node(PROFILE, 5)
+            assert bus._lend_node(PROFILE, 5) is node
+            bus._give_back(node)
             assert list(bus.nodes) == [node]
-            bus.give_back(node)
+            bus._give_back(node)
             assert not bus.nodes
             assert await Hcp2Controller(bus, 5).read(1) == 0
 
@@ -38,9 +38,9 @@ def test_a_lent_node_leaves_with_the_last_who_gives_it_back() -> None:
 def test_a_node_that_the_bus_has_itself_stays_whoever_named_it_first() -> None:
     async def run() -> None:
         async with bus_with(5) as bus:
-            lent = bus.lend_node(PROFILE, 5)
+            lent = bus._lend_node(PROFILE, 5)
             own = Node.of(Hcp2Controller(bus, 5))
-            bus.give_back(lent)
+            bus._give_back(lent)
             assert bus.nodes == (own,)
 
     run_in_virtual_time(run())
@@ -49,13 +49,13 @@ def test_a_node_that_the_bus_has_itself_stays_whoever_named_it_first() -> None:
 def test_a_dead_node_that_was_given_back_is_probed_no_more() -> None:
     async def run() -> None:
         async with bus_with(5) as bus:
-            lent = bus.lend_node(PROFILE, ABSENT)
+            lent = bus._lend_node(PROFILE, ABSENT)
             with pytest.raises(NoReply):
                 await lent.request(PROFILE.probe, retries=0)
             await asyncio.sleep(10)
             probed = lent.statistics().probes
             assert probed > 1
-            bus.give_back(lent)
+            bus._give_back(lent)
             await asyncio.sleep(1)
             exchanges = bus.statistics().exchanges
             await asyncio.sleep(60)
@@ -67,11 +67,11 @@ def test_a_dead_node_that_was_given_back_is_probed_no_more() -> None:
 def test_what_is_on_the_wire_when_a_node_is_given_back_runs_out() -> None:
     async def run() -> None:
         async with bus_with(5) as bus:
-            lent = bus.lend_node(PROFILE, ABSENT)
+            lent = bus._lend_node(PROFILE, ABSENT)
             asking = asyncio.ensure_future(lent.request(PROFILE.probe, retries=0))
             await asyncio.sleep(0.01)
             asking.cancel()
-            bus.give_back(lent)
+            bus._give_back(lent)
             assert await Hcp2Controller(bus, 5).read(1) == 0
             assert [node.address for node in bus.nodes] == [5]
 
@@ -81,10 +81,10 @@ def test_what_is_on_the_wire_when_a_node_is_given_back_runs_out() -> None:
 def test_another_protocol_may_be_lent_once_the_line_has_no_node_of_the_first() -> None:
     async def run() -> None:
         async with bus_with(5) as bus:
-            lent = bus.lend_node(find("modbus").profile, 5)
+            lent = bus._lend_node(find("modbus").profile, 5)
             with pytest.raises(InvalidCommand, match="modbus"):
                 Hcp2Controller(bus, 5)
-            bus.give_back(lent)
+            bus._give_back(lent)
             assert await Hcp2Controller(bus, 5).read(1) == 0
 
     run_in_virtual_time(run())
@@ -95,13 +95,13 @@ def test_no_queue_is_kept_of_nodes_that_were_given_back() -> None:
         async with bus_with(5) as bus:
             own = Hcp2Controller(bus, 5)
             for address in (8, 9, 10):
-                lent = bus.lend_node(PROFILE, address)
+                lent = bus._lend_node(PROFILE, address)
                 writing = asyncio.ensure_future(lent.request(Write(1, (1,)), retries=0))
                 await asyncio.sleep(0.01)
                 writing.cancel()  # it is on the wire, and ends after its node has left
-                bus.give_back(lent)
+                bus._give_back(lent)
                 await own.read(1)
-            bus.give_back(bus.lend_node(PROFILE, 11))
-            assert not Node.of(own).shared.arbiter.dispatcher.writes.queues
+            bus._give_back(bus._lend_node(PROFILE, 11))
+            assert not Node.of(own)._shared.arbiter.dispatcher.writes.queues
 
     run_in_virtual_time(run())

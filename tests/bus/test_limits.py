@@ -53,7 +53,7 @@ HCP2_WAYS: dict[str, Way] = {
     "by number": lambda drive, value: drive.write(10, value),
     "in a list": lambda drive, value: drive.write(9, 1.0, value, 2.0),
     "in the second telegram of a list": lambda drive, value: drive.write(1, *[1234.5678] * 9, value),
-    "from the command line": lambda drive, value: drive.prepare_write("10", [value])[0](),
+    "from the command line": lambda drive, value: drive._prepare_write("10", [value])[0](),
     "as a raw command": lambda drive, value: drive.node.request(hcp2.Write(10, (value,))),
     "as a timed request": lambda drive, value: drive.node.timed_request(hcp2.Write(10, (value,))),
     "as an urgent command": lambda drive, value: drive.write(10, value, priority=Priority.URGENT),
@@ -113,7 +113,7 @@ async def test_every_protocol_says_what_its_writes_change(
             await drive.point(item).write(51)
         await drive.point(item).write(0)
         with pytest.raises(InvalidCommand, match="max_step is 40"):
-            await drive.prepare_write(item, [45])[0]()
+            await drive._prepare_write(item, [45])[0]()
 
 
 @in_virtual_time

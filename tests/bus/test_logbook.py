@@ -7,11 +7,11 @@ import logging
 import pytest
 
 from busmaster.arbiter.events import (
-    CameUnasked,
-    LatenessLowered,
-    LatenessRaised,
+    CameUnexpected,
     LineChange,
     LineChanged,
+    MaxReplyDelayLowered,
+    MaxReplyDelayRaised,
     NodeChanged,
     PortFailed,
 )
@@ -46,21 +46,21 @@ def test_r14_each_node_is_limited_by_itself(lines: pytest.LogCaptureFixture) -> 
     assert len(lines.messages) == 3
 
 
-def test_r14_unasked_bytes_are_counted_and_not_logged_but_a_collision_is(lines: pytest.LogCaptureFixture) -> None:
+def test_r14_unexpected_bytes_are_counted_and_not_logged_but_a_collision_is(lines: pytest.LogCaptureFixture) -> None:
     logbook = Logbook("line")
-    logbook.note(CameUnasked(b"\x15"), 0.0)
-    logbook.note(CameUnasked(b"\x07\x31", collision=True), 0.0)
+    logbook.note(CameUnexpected(b"\x15"), 0.0)
+    logbook.note(CameUnexpected(b"\x07\x31", collision=True), 0.0)
     assert lines.messages == ["line: the echo differs from what was sent: a collision (07 31)"]
 
 
-def test_r14_a_raised_lateness_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:
-    Logbook("line").note(LatenessRaised(Bench().node(3), 0.14, 0.224), PAUSE)
-    assert lines.messages == ["line: node 3 answered 140 ms after its request: its lateness is now 224 ms"]
+def test_r14_a_raised_max_reply_delay_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("line").note(MaxReplyDelayRaised(Bench().node(3), 0.14, 0.224), PAUSE)
+    assert lines.messages == ["line: node 3 answered 140 ms after its request: its maximum reply delay is now 224 ms"]
 
 
-def test_r14_a_lateness_that_comes_down_again_names_node_and_time(lines: pytest.LogCaptureFixture) -> None:
-    Logbook("line").note(LatenessLowered(Bench().node(3), 0.15), PAUSE)
-    assert lines.messages == ["line: node 3 has been prompt for an hour: its lateness is 150 ms again"]
+def test_r14_a_max_reply_delay_that_comes_down_again_names_node_and_time(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("line").note(MaxReplyDelayLowered(Bench().node(3), 0.15), PAUSE)
+    assert lines.messages == ["line: node 3 has been prompt for an hour: its maximum reply delay is 150 ms again"]
 
 
 def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(lines: pytest.LogCaptureFixture) -> None:

@@ -17,12 +17,11 @@ from busmaster import (
     NoReply,
     NotStarted,
     Priority,
-    RequestOptions,
     Superseded,
     WriteUnconfirmed,
 )
 from busmaster.bus.node import Node
-from busmaster.bus.requester import ORDINARY, WriteOptions
+from busmaster.bus.requester import ORDINARY, RequestOptions, WriteOptions
 from busmaster.emulator.device import Delay
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -180,7 +179,7 @@ def test_msc_blocks_and_their_verification_have_one_time_too() -> None:
             await press.load_cam(2000, range(64), finish_within=0.3)
         began = bus.now()
         with pytest.raises((NoReply, NotStarted)):
-            await press.read_block(2000, 320, finish_within=0.3)
+            await press.read(2000, 320, finish_within=0.3)
         assert bus.now() - began == pytest.approx(0.3, abs=0.002)
 
     on_a_bus(story, EmulatedMsc(3, address_step=4), settings=msc.PROFILE.line)

@@ -145,7 +145,8 @@ def test_statistics_say_what_was_asked_and_what_was_had() -> None:
 
 
 def test_a_sample_says_what_it_waited_for() -> None:
-    """Node 2 is dead: its failed request is what the poll waited for. Its lateness is over then: nothing settles."""
+    """Node 2 is dead: its failed request is what the poll waited for. Its maximum reply delay is over then: nothing
+    resynchronises."""
 
     async def story(bus: Bus) -> None:
         dead = bus.node(hcp2.PROFILE, 9)
@@ -159,7 +160,7 @@ def test_a_sample_says_what_it_waited_for() -> None:
         assert sample.started is not None
         assert sample.started - sample.due == pytest.approx(0.150 - 0.010, abs=0.002)
         assert sample.timeline.exchanges_ahead == 1
-        assert sample.timeline.settling_ahead == pytest.approx(0.0, abs=0.001)
+        assert sample.timeline.quiet_time_ahead == pytest.approx(0.0, abs=0.001)
         assert group.statistics().exchanges_ahead > 0
 
     on_a_bus(story)

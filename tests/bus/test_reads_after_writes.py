@@ -66,15 +66,15 @@ def test_a_write_is_confirmed_before_the_read_after_it_is_sent() -> None:
         sent, polls = bus.statistics().exchanges, bus.statistics().waits[Priority.POLL].count
         await point.write(7.0)
         assert bus.statistics().exchanges == sent + 1
-        assert bus.reads_after_writes.read == 0
+        assert bus._reads_after_writes.read == 0
         assert bus.latest(point) is None  # the value before is stale
         await settle()
         assert held(group, point) == (7.0, Quality.GOOD)
         assert bus.statistics().exchanges == sent + 2
         assert bus.statistics().waits[Priority.POLL].count == polls + 1  # commands go before it
-        assert bus.reads_after_writes.read == 1
+        assert bus._reads_after_writes.read == 1
         assert await point.read(max_age=SLOW) == 7.0
-        assert Node.of(point).held(point) == 7.0  # what a limit of the step begins with
+        assert Node.of(point)._held(point) == 7.0  # what a limit of the step begins with
         assert bus.statistics().exchanges == sent + 2
         assert group.statistics().cycles == 1
 
@@ -126,7 +126,7 @@ def test_after_a_write_that_was_not_confirmed_nothing_is_read(options: Any) -> N
             await point.write(7.0, **options)
         await settle()
         device.faults.lost = 0.0
-        assert (bus.reads_after_writes.read, bus.reads_after_writes.failed) == (0, 0)
+        assert (bus._reads_after_writes.read, bus._reads_after_writes.failed) == (0, 0)
         assert group.latest is not None
         assert bus.as_of_now(point, group.latest.samples[point]).quality is Quality.STALE
 
@@ -140,7 +140,7 @@ def test_one_read_serves_all_writes_that_are_confirmed_before_it_is_sent() -> No
         await asyncio.gather(*(point.write(float(number)) for number in range(1, 21)))
         await settle()
         assert held(group, point) == (20.0, Quality.GOOD)
-        counts = bus.reads_after_writes
+        counts = bus._reads_after_writes
         assert counts.read <= 4  # the class of polls has a share of the line, too
         assert counts.shared >= 16
         assert counts.failed == 0
@@ -161,7 +161,7 @@ def test_a_read_after_a_write_that_fails_is_counted_and_the_value_stays_stale() 
         device.faults.dead = 1.0
         await settle()
         await settle()
-        assert (bus.reads_after_writes.read, bus.reads_after_writes.failed) == (0, 1)
+        assert (bus._reads_after_writes.read, bus._reads_after_writes.failed) == (0, 1)
         assert group.latest is not None
         assert bus.as_of_now(point, group.latest.samples[point]).quality is Quality.STALE
 
@@ -237,7 +237,7 @@ def test_a_write_to_all_nodes_is_not_followed_by_reads() -> None:
             changes = group.subscribe(changes=True)
             await ModbusUnit(bus, 0).point("holding:10").write(7)
             await settle()
-            assert bus.reads_after_writes.read == 0
+            assert bus._reads_after_writes.read == 0
             group.close()
             assert [(type(one), one[point].quality) async for one in changes] == [(Outdated, Quality.STALE)]
 

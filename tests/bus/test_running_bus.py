@@ -183,8 +183,8 @@ def test_what_a_cycle_takes_is_a_guess_until_it_is_measured() -> None:
         await cycles(group, 5)
         bus.poll_group("h", period=0.1, points=[axis.point("2")])
         read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
-        assert guessed == pytest.approx(line_time(read, bus.byte_time))
-        assert group.poll.cost == pytest.approx(0.002 + (8 + 6) * bus.byte_time, abs=0.0005)
+        assert guessed == pytest.approx(line_time(read, bus._byte_time))
+        assert group.poll.cost == pytest.approx(0.002 + (8 + 6) * bus._byte_time, abs=0.0005)
 
     on_a_bus(story)
 
@@ -197,20 +197,20 @@ def test_a_refused_probe_of_a_suspect_is_an_answer_and_a_request_that_was_not_se
         node.suspend(10.0)
         assert not await node.probe()
         node.suspend(0.0)
-        node.record.health = Health.SUSPECT
-        node.record.profile = replace(hcp2.PROFILE, probe=hcp2.Read(105))
-        node.record.failures = 1
-        node.record.failed_at = bus.now()
+        node._record.health = Health.SUSPECT
+        node._record.profile = replace(hcp2.PROFILE, probe=hcp2.Read(105))
+        node._record.failures = 1
+        node._record.failed_at = bus.now()
         assert await node.probe()
 
     on_a_bus(story, EmulatedMint(1, axes=0, refuse_reserved=True))
 
 
-def test_a_second_handle_with_the_same_timings_is_welcome_after_lateness_was_raised() -> None:
+def test_a_second_handle_with_the_same_timings_is_welcome_after_max_reply_delay_was_raised() -> None:
     async def story(bus: Bus) -> None:
         timings = hcp2.PROFILE.timings.with_window(0.12)
         first = Hcp2Controller(bus, 1, timings=timings)
-        Node.of(first).record.timings = timings.with_lateness(0.3)
+        Node.of(first)._record.timings = timings.with_max_reply_delay(0.3)
         assert Hcp2Controller(bus, 1, timings=timings).node is first.node
         with pytest.raises(InvalidCommand, match="other timings"):
             Hcp2Controller(bus, 1, timings=hcp2.PROFILE.timings)

@@ -65,9 +65,9 @@ ALIKE: dict[str, tuple[Make, Make]] = {
 @pytest.mark.parametrize(("first", "second"), ALIKE.values(), ids=ALIKE.keys())
 def test_handles_that_say_the_same_or_nothing_share_the_node_as_it_was(bus: Bus, first: Make, second: Make) -> None:
     node = Node.of(first(bus))
-    before = (node.profile, node.profile.merge, node.timings, node.record.retries)
+    before = (node.profile, node.profile.merge, node.timings, node._record.retries)
     assert second(bus).node is node
-    assert (node.profile, node.profile.merge, node.timings, node.record.retries) == before
+    assert (node.profile, node.profile.merge, node.timings, node._record.retries) == before
     assert bus.nodes == (node,)
 
 
@@ -99,10 +99,10 @@ def test_a_handle_that_says_something_else_is_refused_and_replaces_nothing(
     bus: Bus, first: Make, second: Make, what: str
 ) -> None:
     node = Node.of(first(bus))
-    before = (node.profile, node.profile.merge, node.timings, node.record.retries)
+    before = (node.profile, node.profile.merge, node.timings, node._record.retries)
     with pytest.raises(InvalidCommand, match=f"in use already, and now asked for with {what}"):
         second(bus)
-    assert (node.profile, node.profile.merge, node.timings, node.record.retries) == before
+    assert (node.profile, node.profile.merge, node.timings, node._record.retries) == before
     assert bus.nodes == (node,)
 
 

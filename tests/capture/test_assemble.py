@@ -24,7 +24,7 @@ READ = bytes.fromhex("07 30 32 02 30 31 05 04")
 VALUE = bytes.fromhex("02 30 31 35 03 37")
 OTHER = bytes.fromhex("07 46 46 02 36 39 05 08")
 ACK, NAK = b"\x06", b"\x15"
-NONE, OK, NO_REPLY, GARBLED, REFUSED, UNASKED, *_ = Outcome
+NONE, OK, NO_REPLY, GARBLED, REFUSED, UNEXPECTED, *_ = Outcome
 HOST, NODE = Direction.HOST, Direction.NODE
 READ_PACKET = bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
 READ_REPLY = bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
@@ -139,7 +139,7 @@ def test_an_exchange_that_goes_on_is_not_written_for_all_its_silence() -> None:
     assert [packet.outcome for packet in tape.packets] == [NONE, OK]
 
 
-@pytest.mark.parametrize("verdict", [Verdict.DOUBTED, Verdict.SPOILT, Verdict.CUT_OFF])
+@pytest.mark.parametrize("verdict", [Verdict.AMBIGUOUS, Verdict.SPOILT, Verdict.CUT_OFF])
 def test_what_only_a_master_can_say_is_on_the_answer(verdict: Verdict) -> None:
     tape = Tape()
     tape.read(1.0)
@@ -175,12 +175,12 @@ def test_what_comes_while_nothing_is_asked_is_a_stray_whatever_it_looks_like() -
     tape.sent(1.15, ACK)
     tape.heard(1.2, b"\x00")
     assert tape.lines() == [
-        (NODE, b"\xff", UNASKED, ""),
+        (NODE, b"\xff", UNEXPECTED, ""),
         (HOST, READ, NONE, ""),
         (NODE, VALUE, OK, "read element 1: 5.0"),
-        (NODE, VALUE, UNASKED, ""),
+        (NODE, VALUE, UNEXPECTED, ""),
         (HOST, ACK, NONE, ""),
-        (NODE, b"\x00", UNASKED, ""),
+        (NODE, b"\x00", UNEXPECTED, ""),
     ]
     assert [packet.transaction for packet in tape.packets] == [0, 1, 1, 0, 0, 0]
 
@@ -190,7 +190,7 @@ def test_noise_behind_a_reply_leaves_its_outcome_alone() -> None:
     tape.read(1.0)
     tape.heard(1.002, VALUE + b"\x00\x00")
     tape.over(1.002, Verdict.OK, 5.0)
-    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (VALUE, OK), (b"\x00\x00", UNASKED)]
+    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (VALUE, OK), (b"\x00\x00", UNEXPECTED)]
 
 
 def test_a_reply_behind_noise_is_none_for_no_reader_looks_for_its_start() -> None:
@@ -198,7 +198,7 @@ def test_a_reply_behind_noise_is_none_for_no_reader_looks_for_its_start() -> Non
     tape.read(1.0)
     tape.heard(1.002, b"\x05" + NAK)
     tape.over(1.002, Verdict.GARBLED, "not a reply")
-    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (b"\x05", GARBLED), (NAK, UNASKED)]
+    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (b"\x05", GARBLED), (NAK, UNEXPECTED)]
 
 
 def test_a_bad_packet_that_is_sent_again_ends_well() -> None:
@@ -250,7 +250,7 @@ def test_a_reply_after_the_masters_verdict_is_a_stray_that_may_be_late() -> None
     tape.heard(1.12, VALUE)
     assert [line[1:] for line in tape.lines()][1:] == [
         (b"", NO_REPLY, "read element 1: no reply within 100 ms"),
-        (VALUE, UNASKED, "perhaps a late answer to read element 1"),
+        (VALUE, UNEXPECTED, "perhaps a late answer to read element 1"),
     ]
 
 
@@ -265,7 +265,7 @@ def test_a_broadcast_is_over_when_it_is_sent() -> None:
     assert overheard.lines() == [(HOST, everybody, OK, "")]
 
 
-def test_a_read_of_several_legs_is_closed_by_what_comes_with_the_next_request() -> None:
+def test_a_read_of_several_steps_is_closed_by_what_comes_with_the_next_request() -> None:
     tape = Tape()
     first = tape.asked(1.0, msc.PROFILE, msc.DataRead(2008), 1)
     tape.heard(1.02, ACK + READ_REPLY)

@@ -20,7 +20,7 @@ from tests.capture.hearing import HOST, NODE, hear, said, sender_of, vectors
 def test_every_frame_of_the_documents_is_one_frame_with_nothing_wrong(protocol: str, name: str, raw: bytes) -> None:
     (frame,) = Decoder(find(protocol).protocol.dialect()).feed(raw, 0.0, sender_of(name))
     assert frame.raw == raw
-    assert frame.fault == ("unasked" if frame.sender is NODE else "")
+    assert frame.fault == ("unexpected" if frame.sender is NODE else "")
 
 
 def test_hcp_in_both_directions() -> None:
@@ -105,7 +105,7 @@ def test_a_lone_eot_says_no_such_parameter_and_one_before_digits_is_a_new_reques
 
 def test_nobody_answers_a_mentor_broadcast() -> None:
     frames = hear("mentor", "04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F", "06")
-    assert said(frames) == ["host 0 write 01.17 = +0000", "node ACK [unasked]"]
+    assert said(frames) == ["host 0 write 01.17 = +0000", "node ACK [unexpected]"]
 
 
 def test_parity_in_bit_7_is_not_looked_at() -> None:
@@ -115,7 +115,7 @@ def test_parity_in_bit_7_is_not_looked_at() -> None:
     assert said(hear("mentor", with_parity.hex())) == ["host 12 read 01.17"]
 
 
-def test_the_legs_of_an_msc_read_and_of_a_write() -> None:
+def test_the_steps_of_an_msc_read_and_of_a_write() -> None:
     frames = hear(
         "msc",
         "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74",
@@ -203,7 +203,7 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
         "node 2 2 = 5 [wrong element: 1 was asked]",
         "node 2 ACK [an ACK answers no read]",
     ]
-    assert said(frames)[-1] == "node ACK [unasked]"
+    assert said(frames)[-1] == "node ACK [unexpected]"
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
         ("hcp2", "07 30 61 02 30 31 05 54", "host read 1 [no node address: '0a']"),
         ("hcp2", "07 30 32 02 30 61 05 54", "host 2 read '0a'"),
         ("hcp2", "07 30 31 02 30 31 35 03 34 02 30 31 35 03 37", "node 1 1 = 5 [a value answers no write]"),
-        ("hcp2", "07 30 31 02 30 31 35 03 34 15 15", "node NAK [unasked]"),
+        ("hcp2", "07 30 31 02 30 31 35 03 34 15 15", "node NAK [unexpected]"),
         ("mentor", "04 31 32 33 34 30 31 31 37 05", "host read 01.17 [no drive address: '1234']"),
         ("mentor", "04 31 31 32 32 30 31 41 37 05", "host 12 read '01A7'"),
         ("mentor", "04 31 31 32 32 30 31 31 37 05 06", "node 12 ACK [an ACK answers no read]"),
@@ -237,8 +237,8 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
             "02 02 00 08 00 00 44 52 45 41 44 2C 07 D8 02 75 06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",
             "node 1 2008 = 1234 [wrong answer: DREAD of unit 2 was asked]",
         ),
-        ("msc", "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", "node 1 ? = 1234 [unasked]"),
-        ("msc", "06", "node ACK [unasked]"),
+        ("msc", "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", "node 1 ? = 1234 [unexpected]"),
+        ("msc", "06", "node ACK [unexpected]"),
         ("dc104", "02 AA 01 AB 06", "node ACK [an ACK answers no read]"),
         ("dc104", "02 AA 01 AB 02 02 00 00 02", "node 2 = 0 [wrong parameter: 1 was asked]"),
         ("dc104", "02 55 01 04 D2 2C 02 01 04 D2 D7", "node 1 = 1234 [a value answers no write]"),
@@ -263,7 +263,7 @@ def test_a_mentor_write_without_an_address_goes_to_the_drive_read_last() -> None
     frames = decoder.feed(bytes.fromhex("02 30 31 31 37 2D 30 34 37 36 03 2C"), 0.02, HOST)
     assert said(frames + decoder.feed(b"\x06", 0.03, NODE)) == ["host 12 write 01.17 = -0476", "node 12 ACK"]
     fresh = Decoder(find("mentor").protocol.dialect())
-    assert said(fresh.feed(b"\x06", 0.0, HOST)) == ["host next [unasked]"]
+    assert said(fresh.feed(b"\x06", 0.0, HOST)) == ["host next [unexpected]"]
 
 
 def test_a_cut_reply_ends_at_the_next_request_or_in_silence() -> None:
@@ -347,7 +347,7 @@ def test_whoever_is_said_to_speak_no_bytes_are_too_odd_for_a_listener(protocol: 
     """Requests with a byte changed, lost or doubled: a capture may hold them, from either side."""
     profile = find(protocol).profile
     rnd = Random(1)
-    requests = [check.open(profile.addresses[0], profile.timings).request for check in profile.checks]
+    requests = [check.open(profile.addresses[0], profile.timings).request for check in profile.sync_reads]
     for _ in range(300):
         decoder = Decoder(find(protocol).protocol.dialect())
         said_of_it = [*garbage_chunks(rnd, rnd.choice(requests)), *garbage_chunks(rnd, rnd.choice(requests))]

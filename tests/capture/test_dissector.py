@@ -270,7 +270,7 @@ def test_replies_are_tied_to_requests_and_what_is_odd_is_noted(tmp_path: Path) -
         packet(201, "mentor", HOST, "04 31 31 32 32 31 37 32 33 05"),
         packet(202, "mentor", NODE, "04"),
     ]
-    packets[3].outcome, packets[7].outcome = Outcome.NO_REPLY, Outcome.UNASKED
+    packets[3].outcome, packets[7].outcome = Outcome.NO_REPLY, Outcome.UNEXPECTED
     packets[3].comment = "read element 1: node 2: no reply within 100 ms"
     fields = ("_ws.col.Info", "busmaster.request_in", "busmaster.time", EXPERT, "frame.comment", "frame.p2p_dir")
     rows = dissect(tmp_path, packets, *fields)
@@ -282,7 +282,7 @@ def test_replies_are_tied_to_requests_and_what_is_odd_is_noted(tmp_path: Path) -
     assert rows[6][0] == "node 2 no frame (3 bytes)"
     assert "cut short" in rows[6][3]
     assert rows[7][:3] == ["NAK", "", ""]
-    assert "Nobody asked" in rows[7][3]
+    assert "No request asked for this" in rows[7][3]
     assert "No such parameter" in rows[9][3]
     assert rows[0][5] == "0"
 
@@ -290,7 +290,7 @@ def test_replies_are_tied_to_requests_and_what_is_odd_is_noted(tmp_path: Path) -
 def test_a_reply_is_tied_to_the_request_of_its_own_exchange_and_to_no_other(tmp_path: Path) -> None:
     packets = [
         replace(packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"), transaction=70_000, attempt=2),
-        replace(packet(3, "hcp2", NODE, "02 30 31 35 03 37"), transaction=70_000, attempt=2, outcome=Outcome.DOUBTED),
+        replace(packet(3, "hcp2", NODE, "02 30 31 35 03 37"), transaction=70_000, attempt=2, outcome=Outcome.AMBIGUOUS),
         replace(packet(4, "hcp2", NODE, "02 30 31 35 03 37"), transaction=70_001, attempt=1),
         packet(5, "hcp2", NODE, "02 30 31 35 03 37"),
     ]
@@ -371,9 +371,9 @@ def test_what_comes_after_its_request_was_given_up_is_called_late(tmp_path: Path
     packets = [
         packet(0, "hcp2", HOST, request),
         replace(packet(100, "hcp2", NODE, "", 2), outcome=Outcome.NO_REPLY),
-        replace(packet(120, "hcp2", NODE, "02 30 32 35 03 34"), outcome=Outcome.UNASKED),
-        replace(packet(130, "hcp2", NODE, reply), outcome=Outcome.UNASKED),
-        replace(packet(140, "hcp2", NODE, reply), outcome=Outcome.UNASKED),
+        replace(packet(120, "hcp2", NODE, "02 30 32 35 03 34"), outcome=Outcome.UNEXPECTED),
+        replace(packet(130, "hcp2", NODE, reply), outcome=Outcome.UNEXPECTED),
+        replace(packet(140, "hcp2", NODE, reply), outcome=Outcome.UNEXPECTED),
         packet(200, "hcp2", HOST, request),
         packet(205, "hcp2", NODE, reply),
     ]
@@ -391,10 +391,10 @@ def test_the_profile_shows_times_of_replies_and_colours_what_went_wrong(tmp_path
         packet(3, "hcp2", NODE, "02 30 31 35 03 37"),
         packet(4, "hcp2", HOST, "07 30 32 02 30 31 05 04"),
         replace(packet(104, "hcp2", NODE, "", 2), outcome=Outcome.NO_REPLY),
-        replace(packet(130, "hcp2", NODE, "02 30 31 35 03 37"), outcome=Outcome.UNASKED),
+        replace(packet(130, "hcp2", NODE, "02 30 31 35 03 37"), outcome=Outcome.UNEXPECTED),
         replace(packet(200, "hcp2", HOST, "07 30 32 02 30 31 05 04"), transaction=1, attempt=2),
         replace(packet(203, "hcp2", NODE, "02 30 31 35 03 38"), outcome=Outcome.GARBLED, transaction=1, attempt=2),
-        replace(packet(210, "hcp2", NODE, "15"), outcome=Outcome.UNASKED),
+        replace(packet(210, "hcp2", NODE, "15"), outcome=Outcome.UNEXPECTED),
     ]
     write_capture(tmp_path / "line.pcapng", packets)
     shutil.copytree(DISSECTOR.parent / "profile", tmp_path / "profiles" / "busmaster")

@@ -11,9 +11,9 @@ from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, PcapngWriter, read_packets
 from busmaster.capture.replay import replay
-from tests.campaigns.hunt import Hunt
-from tests.campaigns.kinds import KINDS
 from tests.tiers import in_turn_by_default
+from tests.verification.campaigns.hunt import Hunt
+from tests.verification.campaigns.kinds import KINDS
 
 MIXES = (
     *("calm", "cancelled", "garbled", "glued-bytewise", "refusals", "echo", "everything"),
@@ -62,7 +62,7 @@ def test_a_replay_says_what_the_arbiter_said(protocol: str, mix: str) -> None:
     assert [packet.micros for packet in packets] == sorted(packet.micros for packet in packets)
     assert tape.ended == tape.begun
 
-    judged = [packet for packet in packets if packet.outcome not in (Outcome.NONE, Outcome.UNASKED)]
+    judged = [packet for packet in packets if packet.outcome not in (Outcome.NONE, Outcome.UNEXPECTED)]
     outcomes = {(packet.transaction, packet.attempt): packet.outcome for packet in judged}
     assert len(outcomes) == len(judged)
     assert outcomes == {(one.transaction, one.number): Outcome[one.verdict.name] for one in tape.ended if one.verdict}

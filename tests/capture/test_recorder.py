@@ -70,4 +70,4 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
 
 
 def test_every_verdict_of_an_arbiter_has_its_outcome_in_a_capture() -> None:
-    assert {verdict.name for verdict in Verdict} == {outcome.name for outcome in Outcome} - {"NONE", "UNASKED"}
+    assert {verdict.name for verdict in Verdict} == {outcome.name for outcome in Outcome} - {"NONE", "UNEXPECTED"}

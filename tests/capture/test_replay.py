@@ -202,9 +202,9 @@ def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None
     ]
 
 
-def test_unasked_bytes_and_what_comes_before_the_first_request_are_left_out() -> None:
+def test_unexpected_bytes_and_what_comes_before_the_first_request_are_left_out() -> None:
     packets = overheard((NODE, "15"), *READ, (NODE, "02 36 39 34 30 39 36 03 07"))
-    assert [packet.outcome for packet in packets] == [Outcome.UNASKED, Outcome.NONE, Outcome.OK, Outcome.UNASKED]
+    assert [packet.outcome for packet in packets] == [Outcome.UNEXPECTED, Outcome.NONE, Outcome.OK, Outcome.UNEXPECTED]
     assert not only(packets).changed
 
 
@@ -235,10 +235,10 @@ def test_the_masters_own_verdict_is_what_counts() -> None:
 
 
 def test_an_answer_that_was_not_believed_is_read_as_one_and_still_not_believed() -> None:
-    one = told(Verdict.DOUBTED, "two answers came where one was due", *read(VALUE))
+    one = told(Verdict.AMBIGUOUS, "two answers came where one was due", *read(VALUE))
     assert one.judged
     assert not one.changed
-    assert told(Verdict.DOUBTED, "two answers came where one was due", *read(NAK)).changed
+    assert told(Verdict.AMBIGUOUS, "two answers came where one was due", *read(NAK)).changed
 
 
 @pytest.mark.parametrize("verdict", [Verdict.SPOILT, Verdict.CUT_OFF])

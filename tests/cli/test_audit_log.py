@@ -1,4 +1,4 @@
-"""The record of writes on standard error: each once, by how much it matters, and never in the line's way."""
+"""The audit log on standard error: each once, by how much it matters, and never in the line's way."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from busmaster.authorisation.authorisation import Authorisation, Wish
 from busmaster.bus.bus import Bus
 from busmaster.cli import audit_log
 from busmaster.cli.audit_log import NAME, AuditLog
@@ -15,14 +16,13 @@ from busmaster.cli.output import Level
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import NoReply, WriteUnconfirmed
-from busmaster.gate.gate import Gate, Wish
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from tests.patience import PATIENCE
 
 
 @pytest.fixture
-def gate() -> Gate:
-    return Gate(Bus(MemoryPort(Line(Hcp2Controller.profile.line))))
+def authorisation() -> Authorisation:
+    return Authorisation(Bus(MemoryPort(Line(Hcp2Controller.profile.line))))
 
 
 class Printed:
@@ -49,17 +49,21 @@ def printed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Printed]:
     printed.goes_on.set()  # the thread ends, whatever the test did
 
 
-def write(gate: Gate, name: str, error: BaseException | None = None) -> None:
-    gate.begin(Wish(door="mqtt", by="line/set/" + name, name=name, point=None, value=7, id="a1")).end(error)
+def write(authorisation: Authorisation, name: str, error: BaseException | None = None) -> None:
+    authorisation.begin(Wish(interface="mqtt", by="line/set/" + name, name=name, point=None, value=7, id="a1")).end(
+        error
+    )
 
 
-def test_each_write_is_a_line_and_one_that_is_unconfirmed_a_warning(gate: Gate, printed: Printed) -> None:
-    write(gate, "before")
+def test_each_write_is_a_line_and_one_that_is_unconfirmed_a_warning(
+    authorisation: Authorisation, printed: Printed
+) -> None:
+    write(authorisation, "before")
     with AuditLog(lambda: True):
-        write(gate, "5/1")
-        write(gate, "5/2", NoReply("no reply within 100 ms"))
-        write(gate, "5/3", WriteUnconfirmed("no reply within 100 ms"))
-    write(gate, "behind")
+        write(authorisation, "5/1")
+        write(authorisation, "5/2", NoReply("no reply within 100 ms"))
+        write(authorisation, "5/3", WriteUnconfirmed("no reply within 100 ms"))
+    write(authorisation, "behind")
     assert [(line.split(" in ")[0], level) for line, level in printed.lines] == [
         ("audit: 5/1 = 7 written", Level.INFO),
         ("audit: 5/2 = 7 not started", Level.INFO),
@@ -68,25 +72,25 @@ def test_each_write_is_a_line_and_one_that_is_unconfirmed_a_warning(gate: Gate, 
     assert " by mqtt line/set/5/1 [a1], " in printed.lines[0][0]
 
 
-def test_nothing_is_printed_into_a_picture(gate: Gate, printed: Printed) -> None:
+def test_nothing_is_printed_into_a_picture(authorisation: Authorisation, printed: Printed) -> None:
     drawn = True
     with AuditLog(lambda: not drawn):
-        write(gate, "5/1")
+        write(authorisation, "5/1")
         drawn = False
-        write(gate, "5/2")
+        write(authorisation, "5/2")
     assert [line.split()[1] for line, _ in printed.lines] == ["5/2"]
 
 
 def test_a_standard_error_that_takes_nothing_holds_up_nobody_and_what_is_lost_is_told(
-    gate: Gate, printed: Printed, monkeypatch: pytest.MonkeyPatch
+    authorisation: Authorisation, printed: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(audit_log, "MOST_WAITING_ENTRIES", 3)
     printed.goes_on.clear()
     with AuditLog(lambda: True):
-        write(gate, "5/0")
+        write(authorisation, "5/0")
         assert printed.began.wait(PATIENCE)  # it is in the thread's hands, and waits no more
         for number in range(1, 6):
-            write(gate, f"5/{number}")
+            write(authorisation, f"5/{number}")
         printed.goes_on.set()
     assert [line.split()[1] for line, _ in printed.lines[:-1]] == ["5/0", "5/1", "5/2", "5/3"]
     assert printed.lines[-1] == ("audit: 2 writes are not listed here: nobody took the lines", Level.WARNING)

@@ -23,6 +23,8 @@ PROMISED = {
     "emulate": "[LINE.toml] [--protocol P] [--nodes N-M,K] [--pty [LINK]] [--tcp HOST:PORT] [--baud N] [--paced]"
     " [--reply-delay MS[-MS]] [--fault NAME=VALUE] [--seed N] [--seconds S]",
     "run": "LINE.toml [--seconds S] [--plain] [--json] [--read-only]",
+    "check": "LINE.toml [--json]",
+    "migrate": "LINE.toml [--write]",
     "plan": "LINE.toml [--json]",
     "monitor": "PORT|LINE.toml [--protocol P] [--json]",
     "doctor": "PORT [--protocol P] [--nodes N-M,K] [--json]",
@@ -55,7 +57,7 @@ BESIDE = {
     "safe": f"{CAPTURE} [--port PORT]",
     "discover": f"{CAPTURE} [--protocol P] [--nodes N-M,K]",
 }
-"""What a line, a node, a recording or a door takes besides."""
+"""What a line, a node, a recording or an interface takes besides."""
 SPOKEN = {"hcp", "hcp2", "microflex", "msc", "mentor", "dc104", "modbus", "ct-ansi"}
 
 

@@ -61,8 +61,8 @@ def test_a_node_that_is_not_there_is_one_clear_line_and_status_1(busmaster: Comm
 
 def test_timeout_and_retries_are_the_callers_to_choose(busmaster: Command, controllers: TcpServer) -> None:
     read = busmaster("read", controllers.path, *HCP2, "--node", "77", "1", "--timeout", "20", "--retries", "0")
-    lateness = "150 ms"  # a late reply is right, too: the window says from when on it is late
-    assert read.err.startswith(f"busmaster: node 77: no reply within {lateness}, 1 attempt")
+    max_reply_delay = "150 ms"  # a late reply is right, too: the window says from when on it is late
+    assert read.err.startswith(f"busmaster: node 77: no reply within {max_reply_delay}, 1 attempt")
 
 
 def test_a_refusal_names_the_command(busmaster: Command, controllers: TcpServer) -> None:
@@ -107,7 +107,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "1"), "missing argument 'ITEM...'"),
         (("read", "PORT", *HCP2, "--node", "1", "axis0.positoin"), "did you mean 'axis0.position'?"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "0"), "a time is above 0"),
-        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and mentor alone"),
+        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and ei-bisynch"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
         (("read", "rfc2217://host:1", *HCP2, "--node", "1", "1"), "use socket://host:1"),
         (("read", "host:5020", *HCP2, "--node", "1", "1"), "a TCP port is written socket://host:5020"),

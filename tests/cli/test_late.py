@@ -46,7 +46,7 @@ def test_a_late_value_is_read_and_what_to_try_is_said(busmaster: Command, slow: 
     assert ": try --timeout 2" in done.err
 
 
-def test_a_read_of_a_node_beyond_its_lateness_says_that_it_is_late_and_what_to_try(
+def test_a_read_of_a_node_beyond_its_max_reply_delay_says_that_it_is_late_and_what_to_try(
     busmaster: Command, slow: TcpServer
 ) -> None:
     done = busmaster("read", slow.path, "--protocol", "hcp", "--node", "4", "1", "--retries", "0")
@@ -57,7 +57,7 @@ def test_a_read_of_a_node_beyond_its_lateness_says_that_it_is_late_and_what_to_t
     assert "check the node's address" not in done.err
 
 
-def test_of_a_node_that_is_not_there_nothing_is_said_of_lateness(busmaster: Command, slow: TcpServer) -> None:
+def test_of_a_node_that_is_not_there_nothing_is_said_of_max_reply_delay(busmaster: Command, slow: TcpServer) -> None:
     done = busmaster("read", slow.path, "--protocol", "hcp", "--node", "3", "1", "--retries", "0")
     assert done.status == 1
     assert "late" not in done.err

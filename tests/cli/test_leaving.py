@@ -343,7 +343,7 @@ async def test_from_the_safe_state_on_no_other_write_is_accepted_and_waiting_one
         drive = line.nodes["winder"]
         waiting = [asyncio.ensure_future(drive.write(10 + number, 1.0)) for number in range(3)]
         await asyncio.sleep(0)
-        leaving = asyncio.ensure_future(line.safe_state.enter(line.gate, "a test"))
+        leaving = asyncio.ensure_future(line.safe_state.enter(line.authorisation, "a test"))
         await asyncio.sleep(0)
         with pytest.raises(Superseded):
             await drive.write(20, 1.0, priority=Priority.URGENT)

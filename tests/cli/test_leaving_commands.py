@@ -60,12 +60,12 @@ class Commander:
         self._sent = 0
         self._client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5)
         self._client.on_message = self._heard
-        self._client.on_subscribe = self._begin
         self._client.connect("127.0.0.1", port)
         self._client.loop_start()
 
     def begin(self) -> None:
-        self._client.subscribe([("line/result/#", 1), ("line/audit", 1), (LAST, 1)])
+        """Begin when `run` listens, as its status says: what is sent before that is lost."""
+        self._client.subscribe([("line/result/#", 1), ("line/audit", 1), ("line/status", 1), (LAST, 1)])
 
     def end(self) -> None:
         """Wait until all is heard that was sent to it before."""
@@ -73,10 +73,6 @@ class Commander:
         assert self._heard_all.wait(PATIENCE)
         self._client.disconnect()
         self._client.loop_stop()
-
-    def _begin(self, *said: object) -> None:
-        for _ in range(UNDER_WAY):
-            self._send()
 
     def _send(self) -> None:
         self._sent += 1
@@ -86,13 +82,17 @@ class Commander:
         if message.topic == LAST:
             self._heard_all.set()
             return
+        if message.topic == "line/status":
+            for _ in range(UNDER_WAY if message.payload == b"online" else 0):
+                self._send()
+            return
         said = json.loads(message.payload)
         if message.topic == "line/audit":
             self.audit[said["id"]] = said
             return
         self.answers[said["id"]] = said
         self._send()
-        if len(self.answers) == UNDER_WAY:
+        if len(self.answers) >= UNDER_WAY:
             self.is_busy.set()
 
 

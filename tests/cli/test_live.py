@@ -40,7 +40,7 @@ class Wishes:
         timeline = {"queued": 1.0, "started": 1.004, "first_byte": 1.009, "last_byte": 1.012, "attempts": 1}
         limit = {"name": "outputs", "minimum": 0, "maximum": 7, "max_step": None, "writable": True}
         told = {"command": "read element 10", "hint": "", "low": None, "high": 5.5, "limits": [limit]}
-        return told | {"timeline": timeline | {"exchanges_ahead": 2, "settling_ahead": 0.0}}
+        return told | {"timeline": timeline | {"exchanges_ahead": 2, "quiet_time_ahead": 0.0}}
 
     async def write(self, group: str, key: str, value: Any, /) -> None:
         self.said.append(("write", group, key, value))

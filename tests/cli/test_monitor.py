@@ -35,7 +35,7 @@ def decoded(protocol: str, text: str) -> list[Frame]:
 
 
 def test_a_frame_is_one_line_with_its_time_its_speaker_and_its_name() -> None:
-    names = find("hcp2").handle.names_of_items()
+    names = find("hcp2").handle._names_of_items()
     lines = [plain_text(frame, names) for frame in decoded("hcp2", HCP2 + "02 36 39 34 30 39 36 03 08")]
     fault = "bad checksum 08, not 07: 02 36 39 34 30 39 36 03 08"
     assert lines == [
@@ -47,7 +47,7 @@ def test_a_frame_is_one_line_with_its_time_its_speaker_and_its_name() -> None:
 
 def test_json_has_numbers_and_nulls() -> None:
     asked, answered = (
-        json.loads(json_text(frame, find("hcp2").handle.names_of_items())) for frame in decoded("hcp2", HCP2)
+        json.loads(json_text(frame, find("hcp2").handle._names_of_items())) for frame in decoded("hcp2", HCP2)
     )
     assert asked == {
         "time": "2023-11-14T22:13:20.250000Z",
@@ -83,8 +83,8 @@ def test_json_values_are_numbers_or_lists_of_them_or_the_text_as_it_came(
 
 
 def test_drives_have_names_of_their_own() -> None:
-    assert find("microflex").handle.names_of_items()["109"] == "status_word"
-    assert find("hcp").handle.names_of_items() == {}
+    assert find("microflex").handle._names_of_items()["109"] == "status_word"
+    assert find("hcp").handle._names_of_items() == {}
 
 
 @pytest.mark.asyncio

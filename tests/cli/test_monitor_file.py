@@ -197,7 +197,7 @@ def test_only_the_answer_to_its_own_request_is_a_value(
     assert heard(tmp_path, *pieces) == values
 
 
-def test_an_answer_that_is_later_than_lateness_may_be_another_requests(tmp_path: Path) -> None:
+def test_an_answer_that_is_later_than_max_reply_delay_may_be_another_requests(tmp_path: Path) -> None:
     assert heard(tmp_path, REQUEST, REPLY, apart=1.0) == []
 
 
@@ -234,7 +234,7 @@ def overheard_of(folder: Path, *pieces: tuple[float, bytes], earlier: float = 0.
     return found
 
 
-MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.lateness
+MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.max_reply_delay
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ async def msc_block_read(drive: MscController) -> AsyncIterator[None]:
     await drive.write(2000, 20)
     await drive.write(2004, 3)
     yield
-    await drive.read_block(1996, 32)
+    await drive.read(1996, 32)
 
 
 async def msc_flags(drive: MscController) -> AsyncIterator[None]:
@@ -141,14 +141,14 @@ async def mentor_run(drive: MentorDrive) -> AsyncIterator[None]:
     await drive.write("1.17", 20)
     await drive.write("1.18", 3)
     yield
-    await drive.read_run("1.17", 2)
+    await drive.read("1.17", 2)
 
 
 async def mentor_backwards(drive: MentorDrive) -> AsyncIterator[None]:
     await drive.write("1.17", 20)
     await drive.write("1.18", 3)
     yield
-    await drive.read_run("1.18", 2, step=-1)
+    await drive.read("1.18", 2, step=-1)
 
 
 async def mentor_to_all(drive: MentorDrive) -> AsyncIterator[None]:

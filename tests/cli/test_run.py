@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture.pcapng import read_packets
+from busmaster.cli.plan import time_text
 from busmaster.cli.run import output_text
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
@@ -27,7 +28,7 @@ from tests.cli.conftest import ROOT, Command, ended_once, started
 from tests.patience import PATIENCE
 
 EXAMPLES = ROOT / "examples"
-TEXT = """
+TEXT = """timing = "learned"
 title = "Slitter"
 port = "PORT"
 [nodes.winder]
@@ -94,6 +95,21 @@ def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None
     assert [cycle["cycle"] for cycle in cycles] == list(range(1, len(cycles) + 1))
     assert cycles[0]["samples"].keys() == {"winder/force", "drive2/1", "drive3/1"}
     assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "quality", "error", "late"}
+
+
+SPARED = "busmaster: with 1% of all frames lost the schedule asks for "
+UNLEARNED = TEXT.replace('timing = "learned"', "")
+FEW = UNLEARNED.replace("period = 0.02", "period = 60").replace("period = 0.1", "period = 60")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("text", "times"), [(TEXT, 0), (UNLEARNED, 1), (FEW, 0)], ids=["learned", "not", "for little"])
+def test_run_says_once_what_learned_reply_times_would_spare(
+    line: Path, controllers: TcpServer, text: str, times: int
+) -> None:
+    line.write_text(text.replace("PORT", controllers.path))
+    ran = ended_once(lambda lines: len(lines) > 12 if times else bool(lines), "run", str(line), "--plain")
+    assert ran.err.count(SPARED) == times
 
 
 @pytest.mark.slow
@@ -185,10 +201,10 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
     healthy, dead = re.findall(r"([\d.]+) ms", outcome.lines[5])
-    assert float(healthy) < float(dead) < 200  # a lateness of HCP2, not a bound that no line comes near
+    assert float(healthy) < float(dead) < 200  # a maximum reply delay of HCP2, not a bound that no line comes near
     assert outcome.lines[6].startswith("the bounds (R9), if every exchange took the longest that one can: urgent ")
-    assert outcome.lines[-2].startswith("reply times are assumed, half of the nominal one, for ")
-    assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
+    assert outcome.lines[-2].startswith("reply times are assumed (half of late_after) for ")
+    assert outcome.lines[-1].startswith("with 1% of all frames lost the schedule asks for ")
     assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
 
 
@@ -204,7 +220,7 @@ def test_plan_names_some_nodes_without_a_reply_time_and_counts_the_others(
         '[groups.g]\nperiod = 5\npoints = ["d1/1"]\n'
     )
     outcome = busmaster("plan", str(path))
-    assert outcome.lines[-2].startswith(f"reply times are assumed, half of the nominal one, for {named} ")
+    assert outcome.lines[-2].startswith(f"reply times are assumed (half of late_after) for {named} ")
 
 
 def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: Command, line: Path) -> None:
@@ -329,4 +345,13 @@ def test_plan_prints_what_programs_can_take_of_a_line_whose_file_has_roles(busma
     line.write_text(line.read_text() + '\n[service.users.root]\nrole = "read"\n')
     text = next(text for text in busmaster("plan", str(line)).lines if "programs of a role" in text)
     assert "read 3%, write 50%; a safe write" in text
-    assert json.loads(busmaster("plan", str(line), "--json").out)["role_parts"] == {"read": 1 / 32, "write": 0.5}
+    fields = json.loads(busmaster("plan", str(line), "--json").out)
+    assert fields["role_parts"] == {"read": 1 / 32, "write": 0.5}
+    urgent = fields["worst_waits"]["urgent"]  # of the owner: the exchange on the wire
+    # R9: each other program may go before it twice, and three further exchanges before each of those and itself (R15).
+    assert fields["program_waits"] == {
+        str(clients): pytest.approx(urgent * (1 + 4 * 2 * clients)) for clients in (1, 8, 64)
+    }
+    [text] = [text for text in busmaster("plan", str(line)).lines if "urgent write of a program" in text]
+    assert f"{time_text(urgent * 9)} with 1, " in text
+    assert text.endswith(f"{time_text(urgent * 513)} with 64")

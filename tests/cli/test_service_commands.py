@@ -28,9 +28,9 @@ HCP2 = ("--protocol", "hcp2")
 
 
 def audit(folder: Path) -> list[tuple[Any, ...]]:
-    """Door, point, value and outcome of each write that is on record."""
+    """Interface, point, value and outcome of each write that is on record."""
     with closing(sqlite3.connect(folder / "line.sqlite", timeout=10)) as database:
-        return database.execute("select door, point, value, outcome from audit order by time").fetchall()
+        return database.execute("select interface, point, value, outcome from audit order by time").fetchall()
 
 
 def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:

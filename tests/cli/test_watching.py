@@ -93,7 +93,7 @@ async def test_a_watch_that_ends_too_early_says_why_nothing_was_asked_but_not_of
         watch = Watch(bus, "test", View())
         watch.summarise()
         assert "nothing was asked: a new line rests" in capfd.readouterr().err
-        bus.pump.data_received(b"?")
+        bus._pump.data_received(b"?")
         watch.summarise()
         assert "nothing was asked" not in capfd.readouterr().err
 
@@ -104,7 +104,7 @@ async def test_what_the_uart_found_wrong_ends_the_summary_if_there_was_anything(
 ) -> None:
     found = DriverErrors(0, 0, 0, 0, 0)
     async with Bus(MemoryPort(Line(hcp2.PROFILE.line, []))) as bus:
-        monkeypatch.setattr(bus.pump, "driver_errors", lambda: found)
+        monkeypatch.setattr(bus._pump, "driver_errors", lambda: found)
         watch = Watch(bus, "test", View())
         watch.summarise()
         assert "uart" not in capfd.readouterr().err

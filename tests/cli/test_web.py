@@ -48,8 +48,8 @@ def points(client: httpx.Client) -> Any:
 def test_it_is_killed_and_started_again_and_the_line_goes_on(file: Path) -> None:
     with owner("serve", str(file)) as (process, address):
         for _ in range(3):
-            with web(address) as (door, client):
-                until_said(door, "is followed")
+            with web(address) as (interface, client):
+                until_said(interface, "is followed")
                 said = client.get("/api/line").json()
                 assert (said["connected"], said["read_only"]) == (True, False)
         assert process.poll() is None
@@ -57,20 +57,20 @@ def test_it_is_killed_and_started_again_and_the_line_goes_on(file: Path) -> None
 
 @pytest.mark.slow
 def test_it_opens_before_its_line_is_there_and_goes_on_when_that_is_killed(file: Path) -> None:
-    with web(str(file)) as (door, client):
+    with web(str(file)) as (interface, client):
         assert not client.get("/api/line").json()["connected"]
         for _ in range(2):
             with owner("serve", str(file)) as (process, _):
-                until_said(door, "is followed")
+                until_said(interface, "is followed")
                 assert client.get("/api/line").json()["connected"]
                 process.kill()
-                until_said(door, "was lost")
+                until_said(interface, "was lost")
 
 
 @pytest.mark.slow
 def test_sigterm_ends_it_while_a_page_looks(file: Path) -> None:
-    with owner("serve", str(file)) as (_, address), web(address) as (door, client):
-        until_said(door, "is followed")
+    with owner("serve", str(file)) as (_, address), web(address) as (interface, client):
+        until_said(interface, "is followed")
         port = client.base_url.port
         assert port is not None
         request = (
@@ -80,8 +80,8 @@ def test_sigterm_ends_it_while_a_page_looks(file: Path) -> None:
         with socket.create_connection(("127.0.0.1", port)) as page:
             page.sendall(request.encode())
             assert page.recv(100).startswith(b"HTTP/1.1 101")
-            door.send_signal(signal.SIGTERM)
-            assert door.wait(PATIENCE) == 128 + signal.SIGTERM
+            interface.send_signal(signal.SIGTERM)
+            assert interface.wait(PATIENCE) == 128 + signal.SIGTERM
 
 
 def test_what_is_mistyped_is_one_line(busmaster: Command, tmp_path: Path) -> None:

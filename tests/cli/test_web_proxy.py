@@ -54,7 +54,7 @@ def certificate(folder: Path) -> None:
 
 def documented() -> str:
     """The configuration of nginx that the page shows."""
-    [text] = re.findall(r"```text\n(map \$http_upgrade.*?)```", (ROOT / "docs/doors.md").read_text(), re.DOTALL)
+    [text] = re.findall(r"```text\n(map \$http_upgrade.*?)```", (ROOT / "docs/interfaces.md").read_text(), re.DOTALL)
     return str(text)
 
 
@@ -124,8 +124,8 @@ def test_behind_a_tls_proxy_the_page_its_stream_and_its_writes_work_under_its_na
     tokens.write_text(f"hmi {TOKEN}\n")
     tokens.chmod(0o600)
     options = ("--host", "other.example", "--host", "Plant.Example", "--token-file", str(tokens))
-    with owner("serve", str(file)) as (_, address), web(address, *options) as (door, client):
-        until_said(door, "is followed")
+    with owner("serve", str(file)) as (_, address), web(address, *options) as (interface, client):
+        until_said(interface, "is followed")
         with nginx(tmp_path, str(client.base_url)) as port:
             asker = Asker(tmp_path, port)
             status, text = asker.ask("GET", "/")
@@ -148,8 +148,8 @@ def test_behind_a_tls_proxy_the_page_its_stream_and_its_writes_work_under_its_na
 
 @pytest.mark.slow
 def test_with_a_name_of_a_proxy_nobody_writes_without_a_token(file: Path) -> None:
-    with owner("serve", str(file)) as (_, address), web(address, "--host", NAME) as (door, client):
-        until_said(door, "is followed")
+    with owner("serve", str(file)) as (_, address), web(address, "--host", NAME) as (interface, client):
+        until_said(interface, "is followed")
         answer = client.put(ONE, json={"value": 1.5})
         assert (answer.status_code, "without a token" in answer.json()["what"]) == (403, True)
         assert client.get("/api/line").json()["read_only"] is True
@@ -173,12 +173,12 @@ def test_idle_connections_beyond_the_descriptors_of_the_process_keep_nobody_out(
     with owner("serve", str(file)) as (_, address), contextlib.ExitStack() as ends:
         resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))  # as the command inherits it
         try:
-            door, client = ends.enter_context(web(address))
+            interface, client = ends.enter_context(web(address))
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        until_said(door, "is followed")
+        until_said(interface, "is followed")
         place = (client.base_url.host, client.base_url.port or 0)
         for _ in range(400):
             ends.enter_context(socket.create_connection(place, PATIENCE))
         assert client.get("/api/line").status_code == 200
-        assert "there are 128 connections to the page, and no more are held" in until_said(door, "connections")
+        assert "there are 128 connections to the page, and no more are held" in until_said(interface, "connections")

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.config import load
 from busmaster.config.line import ConfiguredLine
 from busmaster.emulator.serve import TcpServer
-from busmaster.gate.record import Outcome, WriteRecord
 from tests.cli.conftest import Command, started, without_time
 from tests.cli.test_leaving import SAFE, TEXT, drive_of, force, polls, winder
 from tests.outputs.brokers import Broker, needs_mosquitto, running
@@ -39,9 +39,11 @@ def path(tmp_path: Path, winder: TcpServer) -> Path:
 
 
 def audit(path: Path) -> list[tuple[Any, ...]]:
-    """Door, by whom, point, value, outcome and error of each write that is on record."""
+    """Interface, by whom, point, value, outcome and error of each write that is on record."""
     with sqlite3.connect(path.parent / "line.sqlite", timeout=PATIENCE) as database:
-        rows = database.execute("select door, by, point, value, outcome, error from audit order by time").fetchall()
+        rows = database.execute(
+            "select interface, by, point, value, outcome, error from audit order by time"
+        ).fetchall()
     database.close()
     return rows
 
@@ -132,8 +134,8 @@ def test_a_safe_write_that_is_not_confirmed_is_on_record_as_unconfirmed_once(pat
         winder.call(lambda line, now: line.cut(now, line.device(1)))
         process.terminate()
         process.communicate(timeout=PATIENCE)
-    [(door, _, _, _, outcome, _)] = audit(path)
-    assert (door, outcome) == ("safe", "unconfirmed")
+    [(interface, _, _, _, outcome, _)] = audit(path)
+    assert (interface, outcome) == ("safe", "unconfirmed")
 
 
 def test_busmaster_safe_is_on_record_too(busmaster: Command, path: Path) -> None:
@@ -170,12 +172,12 @@ async def test_what_was_sent_once_stays_unconfirmed_whatever_keeps_it_from_being
     """The line is lost while a safe write is repeated: that one was not started, but the first one may have arrived."""
     records: list[WriteRecord] = []
     line = ConfiguredLine(load(path), outputs=False)
-    line.gate.record = records.append
+    line.authorisation.record = records.append
     async with line.bus:
         await line.point("winder/force").read()
         winder.call(lambda line, now: line.cut(now, line.device(1)))
         [write] = line.safe_state.writes
-        outcomes = await line.safe_state.enter(line.gate, "a test")
+        outcomes = await line.safe_state.enter(line.authorisation, "a test")
     assert outcomes[write.point.key] is not None
     assert [(record.outcome, record.by) for record in records] == [(Outcome.UNCONFIRMED, "a test")]
 
@@ -200,5 +202,5 @@ def test_mqtt_hears_of_the_write_and_nothing_of_a_line_that_another_process_may_
     with running(tmp_path) as broker:
         path.write_text(f'{path.read_text()}[outputs.mqtt]\nport = {broker.port}\nallow_commands = ["winder/force"]\n')
         topics = asyncio.run(told_by_mqtt(broker, str(path)))
-    assert topics.pop("busmaster/audit")["door"] == "command line"
+    assert topics.pop("busmaster/audit")["interface"] == "command line"
     assert set(topics) <= {"busmaster/events", "busmaster/over"}

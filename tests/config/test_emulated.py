@@ -52,8 +52,8 @@ def values_of(text: str, *points: str, after: float = 0.0) -> list[Any]:
 # options
 
 
-def sample(option: Option) -> Any:
-    """Something that the option can be, as its argument."""
+def sample(option: Option, item: str = "7.05") -> Any:
+    """Something that the option can be, as its argument. `item` names a table."""
     match option.kind:
         case "flag":
             return True
@@ -72,13 +72,13 @@ def sample(option: Option) -> Any:
         case "addresses":
             return {"name": 8}
         case "tables":
-            return {"7.05": {field.name: 1 for field in option.fields if field.kind == "number"}}
+            return {item: {field.name: 1 for field in option.fields if field.kind == "number"}}
 
 
 @pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
 def test_a_device_takes_every_option_that_its_kind_declares(kind: NodeKind) -> None:
     assert kind.emulated
-    options = {option.name: sample(option) for option in kind.emulated}
+    options = {option.name: sample(option, kind.probe_item) for option in kind.emulated}
     make_device(kind.name, kind.profile.addresses[-1], **options)
     with pytest.raises(TypeError):
         make_device(kind.name, kind.profile.addresses[-1], nonsense=True)
@@ -199,6 +199,16 @@ VALUES: list[tuple[str, str, dict[str, Any]]] = [
         node("ct-ansi", 12, "points.ref = { item = '1.17', decimals = 1 }", "values = { ref = -47.6, '7.05' = 9 }"),
         "ct-ansi",
         {"ref": -47.6, "7.05": 9},
+    ),
+    (
+        node(
+            "ei-bisynch",
+            12,
+            'template = "eurotherm-2000"\npoints.watts = { item = "tag247", factor = 0.5 }',
+            "lag = 1e6\nvalues = { target_setpoint = 450.5, PV = 21.5, watts = 9, '1XP' = 7, 'SW:hex' = 255 }",
+        ),
+        "ei-bisynch",
+        {"target_setpoint": 450.5, "process_value": pytest.approx(21.5, abs=0.2), "watts": 9.0, "XP": 7, "SW": 255},
     ),
     (
         node(

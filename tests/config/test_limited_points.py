@@ -128,7 +128,7 @@ async def test_no_limit_holds_the_safe_state(kind: str, address: str, item: str)
         await line.point("winder/speed").write(40, priority=Priority.URGENT)
         with pytest.raises(InvalidCommand, match="minimum of 5"):
             await line.point("winder/speed").write(0, priority=Priority.URGENT)
-        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
         assert await line.point("winder/speed").read() == 0
 
 
@@ -139,7 +139,7 @@ async def test_a_node_that_somebody_has_suspended_is_left_safely_too() -> None:
         winder.suspend(60.0)
         with pytest.raises(NodeDown, match="suspended"):
             await line.point("winder/speed").write(30)
-        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
 
 
 @in_virtual_time
@@ -161,7 +161,7 @@ async def test_a_file_that_is_read_again_keeps_its_groups_but_those_whose_points
         ("[nodes.winder.points]\na = { item = '1', minimum = 2, maximum = 1 }", "minimum of 2 is above its maximum"),
         ("[nodes.winder.points]\na = { item = '1', max_step = 0 }", "max_step is more than 0"),
         ("[nodes.winder.points]\na = { item = '1', decimals = 2 }", "write factor = 0.01"),
-        ("timing = { nominal = 50 }", "times are in seconds, 10 at most: for 50 ms write 0.05"),
+        ("timing = { late_after = 50 }", "times are in seconds, 10 at most: for 50 ms write 0.05"),
         ("[groups.axes]\nperiod = 1\npoints = []", "a group without points"),
     ],
 )

@@ -13,6 +13,8 @@ import pytest
 
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
+from busmaster.authorisation.permission import EVERYTHING
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.bus.node import Node
 from busmaster.bus.requester import ORDINARY, Priority
 from busmaster.cli.write import pass_on, prepare
@@ -22,8 +24,6 @@ from busmaster.config.source import Source
 from busmaster.contract.exchange import Command
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError, InvalidCommand, Superseded
-from busmaster.gate.permission import EVERYTHING
-from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs.mqtt_commands import Answer, Commands
 from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
@@ -109,7 +109,7 @@ class Plant:
         self.handle = line.nodes["drive"]
         self.node = Node.of(self.handle)
         self.records: list[WriteRecord] = []
-        line.gate.record = self.records.append
+        line.authorisation.record = self.records.append
 
     async def held(self) -> Any:
         return await self.line.point(f"drive/{self.kind.item}").read()
@@ -135,7 +135,7 @@ async def by_command_in_midst(plant: Plant, value: int) -> None:
 
 
 async def by_list(plant: Plant, value: int) -> None:
-    for send in plant.handle.prepare_write(plant.kind.first, (1, value)):
+    for send in plant.handle._prepare_write(plant.kind.first, (1, value)):
         await send()
 
 
@@ -155,14 +155,16 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         key = f"drive/{name}"
         answers: asyncio.Queue[Answer] = asyncio.Queue()
-        commands = Commands("line", plant.line.gate, {key: plant.line.point(key)}, plant.line.bus.now)
+        commands = Commands("line", plant.line.authorisation, {key: plant.line.point(key)}, plant.line.bus.now)
         commands.arrive(
             SimpleNamespace(  # type: ignore[arg-type]  # all that is looked at of a message
                 topic=f"line/set/{key}", payload=str(value).encode(), retain=False, properties=None
             )
         )
-        gate = plant.line.gate
-        serving = asyncio.ensure_future(commands.serve(gate.write, gate.refuse, answers.put, lambda: 0))
+        authorisation = plant.line.authorisation
+        serving = asyncio.ensure_future(
+            commands.serve(authorisation.write, authorisation.refuse, answers.put, lambda: 0)
+        )
         try:
             answer = await answers.get()
         finally:
@@ -189,7 +191,7 @@ class Person:
         raise AssertionError("a person reads nothing")
 
     def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
-        return node.shared.add_client(1.0)
+        return node._shared.add_client(1.0)
 
     def stops_before(self, node: Node, /) -> int:
         return 0
@@ -204,7 +206,7 @@ class Person:
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         params = {"group": "all", "key": f"drive/{name}", "value": value}
-        errand = errand_of(params, Person(), ServedLine(plant.line.bus, plant.line.gate, 1.0, ""))
+        errand = errand_of(params, Person(), ServedLine(plant.line.bus, plant.line.authorisation, 1.0, ""))
         ended: asyncio.Future[BaseException | None] = asyncio.get_running_loop().create_future()
         errand.begin(lambda _, __, error: ended.set_result(error))
         if (error := await ended) is not None:
@@ -330,12 +332,17 @@ def test_the_safe_state_passes_every_limit_and_is_on_record(kind: Kind, limit: s
     async def story(plant: Plant) -> None:
         refused = asyncio.ensure_future(by_point("pace")(plant, value))
         await asyncio.sleep(0)
-        assert await plant.line.safe_state.enter(plant.line.gate, "a test") == {"drive/pace": None}
+        assert await plant.line.safe_state.enter(plant.line.authorisation, "a test") == {"drive/pace": None}
         with pytest.raises((InvalidCommand, BusError)):
             await refused
         assert await plant.held() == 0
         [record] = plant.records
-        assert (record.door, record.point, record.value, record.outcome) == ("safe", "drive/pace", 0, Outcome.WRITTEN)
+        assert (record.interface, record.point, record.value, record.outcome) == (
+            "safe",
+            "drive/pace",
+            0,
+            Outcome.WRITTEN,
+        )
 
     in_plant(kind, text, story)
 
@@ -343,7 +350,7 @@ def test_the_safe_state_passes_every_limit_and_is_on_record(kind: Kind, limit: s
 @kinds
 def test_a_safe_write_may_go_by_its_item_alone(kind: Kind) -> None:
     async def story(plant: Plant) -> None:
-        assert await plant.line.safe_state.enter(plant.line.gate, "a test") == {f"drive/{kind.item}": None}
+        assert await plant.line.safe_state.enter(plant.line.authorisation, "a test") == {f"drive/{kind.item}": None}
         assert await plant.held() == 0
 
     in_plant(kind, "minimum = 5", story, safe=kind.item)
@@ -356,7 +363,7 @@ def test_a_line_that_is_read_only_takes_nothing_from_outside_but_its_own_safe_st
         with pytest.raises(InvalidCommand, match="this line is read-only"):
             await PATHS[path](plant, 41)
         assert await plant.held() == BEFORE
-        assert await plant.line.safe_state.enter(plant.line.gate, "a test") == {"drive/pace": None}
+        assert await plant.line.safe_state.enter(plant.line.authorisation, "a test") == {"drive/pace": None}
         assert await plant.held() == 0
         assert [record.outcome for record in plant.records] == [Outcome.REFUSED, Outcome.WRITTEN]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from busmaster.outputs.settings import FileSettings, MqttSettings, SqliteSetting
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import kinds
+from tests.docs.pages import ROOT, blocks
 
 EXAMPLES = sorted((Path(__file__).parent.parent.parent / "examples").glob("*.toml"))
 SLOW = 'port = "/dev/ttyUSB0?baudrate=9600"\n'
@@ -42,8 +44,11 @@ def test_an_example_is_a_line_that_fits_and_can_be_emulated(path: Path) -> None:
     assert {device.address for device in emulated_line(file).devices} == {n.address for n in file.nodes.values()}
 
 
-def test_the_examples_show_all_protocols() -> None:
+def test_the_examples_and_the_protocols_own_pages_show_all_protocols() -> None:
     shown = {node.protocol for path in EXAMPLES for node in load(path).nodes.values()}
+    for kind in kinds().values():
+        page = ROOT / "docs" / "protocols" / f"{kind.protocol.name}.md"
+        shown |= {name for block in blocks(page, "toml") for name in re.findall(r'protocol = "(.+)"', block.text)}
     assert shown == set(kinds())
 
 
@@ -99,16 +104,16 @@ def test_a_node_overrides_its_protocol_and_the_protocol_its_document() -> None:
     text = (
         f"{HEAD}[protocols.hcp2]\nretries = 1\ntiming = {{ window = 0.2 }}\n{NODE}"
         '[nodes.other]\nprotocol = "hcp2"\naddress = 6\nretries = 0\n'
-        "timing = { nominal = 0.08, write = { window = 0.3, lateness = 0.4 } }\n"
+        "timing = { late_after = 0.08, write = { window = 0.3, max_reply_delay = 0.4 } }\n"
     )
     nodes = parse(text).nodes
     first, second = documented(nodes["winder"].timings), documented(nodes["other"].timings)
     assert first is not None
     assert second is not None
     assert (nodes["winder"].retries, nodes["other"].retries) == (1, 0)
-    assert (first.read.nominal, first.read.window, first.read.lateness) == (0.05, 0.2, 0.2)
-    assert (second.read.nominal, second.read.window, second.read.lateness) == (0.08, 0.2, 0.2)
-    assert (second.write.nominal, second.write.window, second.write.lateness) == (0.08, 0.3, 0.4)
+    assert (first.read.late_after, first.read.window, first.read.max_reply_delay) == (0.05, 0.2, 0.2)
+    assert (second.read.late_after, second.read.window, second.read.max_reply_delay) == (0.08, 0.2, 0.2)
+    assert (second.write.late_after, second.write.window, second.write.max_reply_delay) == (0.08, 0.3, 0.4)
 
 
 def test_a_node_without_a_word_on_timing_has_its_protocols() -> None:
@@ -171,7 +176,7 @@ def test_an_msc_has_its_symbols_step_and_model() -> None:
     text = f"{SLOW}{protocol}{PRESS}symbols = {{ count = 2008, a1-3 = 3000 }}\n"
     handle = line(text).nodes["press"]
     assert isinstance(handle, MscController)
-    assert (handle.address_step, handle.model, handle.address_of("a1-3")) == (4, "MSC-250", 3000)
+    assert (handle.address_step, handle.model, handle._address_of("a1-3")) == (4, "MSC-250", 3000)
 
 
 def test_a_point_of_a_group_may_be_many() -> None:
@@ -258,7 +263,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             "nodes.winder.timing.window: must be a number of seconds, not '1'",
         ),
         (
-            f"{HEAD}{NODE}[nodes.winder.timing]\nwindow = 0.2\nlateness = 0.1",
+            f"{HEAD}{NODE}[nodes.winder.timing]\nwindow = 0.2\nmax_reply_delay = 0.1",
             "line.toml:5: nodes.winder.timing: reply times must satisfy",
         ),
         (f"{HEAD}[protocols.hcp3]\nretries = 1", "line.toml:2: protocols.hcp3: no such key; did you mean 'hcp"),

@@ -80,7 +80,7 @@ async def test_a_number_of_every_protocol_has_labels_precision_and_limits(kind: 
         assert (await anext(alarms)).text == "w/b = 2 is above its high of 1"
 
 
-def test_a_plan_reckons_bits_as_one_exchange() -> None:
+def test_a_plan_calculates_bits_as_one_exchange() -> None:
     word = 'a = { item = "10"BITS }' + GROUP
     bits = parse("hcp2", word.replace("BITS", ", bits = { READY = 0, FAULT = 3 }"))
     assert len(bits.members("axes")) == 3
@@ -293,7 +293,7 @@ def test_an_empty_group_and_milliseconds_for_seconds_are_errors() -> None:
     with pytest.raises(FileError, match="a group without points polls nothing"):
         parse("hcp2", "[groups.axes]\nperiod = 1\npoints = []")
     with pytest.raises(FileError, match=r"times are in seconds, 10 at most: for 50 ms write 0\.05"):
-        parse("hcp2", "[nodes.w.timing]\nnominal = 50")
+        parse("hcp2", "[nodes.w.timing]\nlate_after = 50")
 
 
 @in_virtual_time

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from busmaster import Hcp2Controller, MemoryPort
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine
 from busmaster.config.sections import read
@@ -16,7 +17,6 @@ from busmaster.config.source import Source
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.errors import Refused, Superseded, WriteUnconfirmed
-from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.testing.virtual_time import run_in_virtual_time
 
@@ -66,7 +66,7 @@ def on_a_line(story: Story, *safe: str, gone: bool = False, forgetful: int = 0) 
         port = MemoryPort(Line(Hcp2Controller.profile.line, devices, chance=random.Random(1)))
         line = ConfiguredLine(read(Source("line.toml", text)), port=port, outputs=False)
         records: list[WriteRecord] = []
-        line.gate.record = records.append
+        line.authorisation.record = records.append
         async with line:
             for element in (10, 11):
                 await Hcp2Controller(line.bus, 2).write(element, 7)
@@ -77,7 +77,7 @@ def on_a_line(story: Story, *safe: str, gone: bool = False, forgetful: int = 0) 
 
 def test_a_node_that_is_gone_does_not_hold_up_the_others() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
-        outcomes = await line.safe_state.enter(line.gate, "a test", leaving=False)
+        outcomes = await line.safe_state.enter(line.authorisation, "a test", leaving=False)
         assert list(outcomes) == ["gone/speed", "winder/speed"]
         assert outcomes["winder/speed"] is None
         assert [record.point for record in records] == ["winder/speed", "gone/speed"]
@@ -90,7 +90,7 @@ def test_a_node_that_is_gone_does_not_hold_up_the_others() -> None:
 
 def test_what_was_sent_and_could_not_be_sent_again_is_not_called_not_started() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
-        outcomes = await line.safe_state.enter(line.gate, "a test")
+        outcomes = await line.safe_state.enter(line.authorisation, "a test")
         assert isinstance(outcomes["gone/speed"], WriteUnconfirmed)
         assert [record.outcome for record in records] == [Outcome.UNCONFIRMED]
         assert Node.of(line.nodes["gone"]).health.value == "down"  # what was tried last was not sent
@@ -100,7 +100,7 @@ def test_what_was_sent_and_could_not_be_sent_again_is_not_called_not_started() -
 
 def test_a_write_that_is_refused_does_not_keep_the_others_of_its_node_from_being_sent() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
-        outcomes = await line.safe_state.enter(line.gate, "a test", leaving=False)
+        outcomes = await line.safe_state.enter(line.authorisation, "a test", leaving=False)
         assert isinstance(outcomes["winder/refused"], Refused)
         assert outcomes["winder/speed"] is outcomes["winder/force"] is None
         assert [await line.nodes["winder"].read(element) for element in (10, 11)] == [0, 0]
@@ -111,14 +111,14 @@ def test_a_write_that_is_refused_does_not_keep_the_others_of_its_node_from_being
 def test_a_node_that_is_suspended_is_left_in_its_safe_state_too() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
         Node.of(line.nodes["winder"]).suspend(100 * WITHIN)
-        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
 
     on_a_line(story, "winder/speed")
 
 
 def test_each_write_is_read_back_and_sent_again_until_it_reads_as_it_was_written() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
-        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
         assert [record.outcome for record in records] == [Outcome.WRITTEN]
         assert await line.nodes["winder"].read(10) == 0
 
@@ -131,7 +131,7 @@ def test_what_waits_for_the_line_waits_until_the_safe_state_is_sent() -> None:
         before = Node.of(drive).statistics().attempts
         reads = [asyncio.ensure_future(drive.read(20)) for _ in range(50)]
         await asyncio.sleep(0)
-        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
         assert Node.of(drive).statistics().attempts - before < len(reads)
         assert await asyncio.gather(*reads) == [0] * len(reads)
 
@@ -142,7 +142,7 @@ def test_what_waits_for_the_line_waits_until_the_safe_state_is_sent() -> None:
 def test_a_line_that_is_left_takes_no_other_write_and_one_that_is_not_left_does(leaving: bool) -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
         drive = line.nodes["winder"]
-        await line.safe_state.enter(line.gate, "a test", leaving=leaving)
+        await line.safe_state.enter(line.authorisation, "a test", leaving=leaving)
         if leaving:
             with pytest.raises(Superseded):
                 await drive.write(10, 5)

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
+from busmaster.authorisation.permission import Permission, digest_of
+from busmaster.authorisation.rights import Role
 from busmaster.config import ConfiguredLine, FileError, LineFile
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.errors import InvalidCommand
-from busmaster.gate.permission import Permission, digest_of
-from busmaster.gate.rights import Role
 
 USER, GROUP = pwd.getpwuid(0).pw_name, grp.getgrgid(0).gr_name
 TEXT = """
@@ -44,7 +44,7 @@ def parse(text: str) -> LineFile:
 def role(said: str, text: str = TEXT) -> Permission:
     """What this user may do, of whom the file says so much."""
     file = parse(f'{text}[service.users.{USER}]\nrole = "write"\n{said}\n')
-    return ConfiguredLine(file, outputs=False).gate.access.users[0]
+    return ConfiguredLine(file, outputs=False).authorisation.access.users[0]
 
 
 def only(*names: str) -> Any:
@@ -62,7 +62,7 @@ users.{USER}.role = "read"
 groups.{GROUP}.role = "write"
 tokens.hmi = {{ role = "write", allow_writes = "winder/force" }}
 """)
-    access = ConfiguredLine(file, outputs=False).gate.access
+    access = ConfiguredLine(file, outputs=False).authorisation.access
     assert access.users == {0: Permission(f"user {USER}", Role.READ)}
     assert access.groups == {0: Permission(f"group {GROUP}", Role.WRITE)}
     assert access.tokens == {"hmi": Permission("token hmi", Role.WRITE, {("hcp2", 5): frozenset({10})})}
@@ -181,14 +181,14 @@ def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> 
     async def run() -> None:
         with pytest.raises(InvalidCommand, match=r"another \[service\] needs a restart"):
             await line.take(parse(f'{TEXT}[service]\nlisten = "127.0.0.1:7420"\n'))
-        line.gate.take_secrets({"hmi": b"kept"})
-        line.gate.on_access.append(lambda: told.append(line.gate.access.users[0].writes))
+        line.authorisation.take_secrets({"hmi": b"kept"})
+        line.authorisation.on_access.append(lambda: told.append(line.authorisation.access.users[0].writes))
         await line.take(parse(f'{TEXT}[service.users.{USER}]\nrole = "write"\n'))
 
     told: list[bool] = []
     asyncio.run(run())
     assert told == [True]
-    assert line.gate.access.secrets == {"hmi": b"kept"}
+    assert line.authorisation.access.secrets == {"hmi": b"kept"}
 
 
 def test_the_share_of_line_time_that_each_program_has() -> None:

@@ -29,14 +29,14 @@ def profile_of(text: str, node: str) -> Profile:
 
 def test_a_node_has_the_probe_and_the_sync_reads_of_its_kind_by_default() -> None:
     profile = profile_of(DRIVES, "drive1")
-    assert (profile.probe, profile.checks) == (microflex.PROFILE.probe, microflex.PROFILE.checks)
+    assert (profile.probe, profile.sync_reads) == (microflex.PROFILE.probe, microflex.PROFILE.sync_reads)
 
 
 def test_a_node_has_its_own_probe_and_sync_reads() -> None:
     text = f'{NODE}probe = "input:7"\nsync_reads = ["holding:100", "holding:100:2"]\n'
     profile = profile_of(text, "press")
     assert profile.probe == ReadRegisters(7, table="input")
-    assert tuple(profile.checks) == (ReadRegisters(100), ReadRegisters(100, 2))
+    assert tuple(profile.sync_reads) == (ReadRegisters(100), ReadRegisters(100, 2))
 
 
 def test_items_may_be_named_as_the_points_of_the_node() -> None:
@@ -53,7 +53,7 @@ def test_what_the_protocol_says_holds_for_the_nodes_that_do_not_say_otherwise() 
         hcp2.Read(239),
         hcp2.Read(242),
     ]
-    assert all(handle.node.profile.checks == (hcp2.Read(100), hcp2.Read(103)) for handle in line.nodes.values())
+    assert all(handle.node.profile.sync_reads == (hcp2.Read(100), hcp2.Read(103)) for handle in line.nodes.values())
 
 
 @pytest.mark.parametrize(

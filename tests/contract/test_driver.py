@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from busmaster.contract.driver import MOST_LEGS, Driver, Ending, EndlessExchange
-from busmaster.contract.exchange import Done, Expect, FrameError, Refused, Sizes, Step
+from busmaster.contract.driver import MOST_STEPS, Driver, Ending, EndlessExchange
+from busmaster.contract.exchange import Done, Expect, FrameError, Progress, Refused, Sizes
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 
@@ -33,13 +33,13 @@ def test_a_reply_ends_it_with_its_value_and_what_comes_later_is_left_over() -> N
     assert driver.ending == Ending(5.0, rest=b"\x00\x7f")
 
 
-def test_it_goes_from_leg_to_leg_with_bytes_that_came_in_one_chunk() -> None:
+def test_it_goes_from_step_to_step_with_bytes_that_came_in_one_chunk() -> None:
     driver = reading_packet().feed(ACK + PACKET)
     assert driver.ending == Ending(1234, send=ACK)
     assert driver.said == []
 
 
-def test_the_leg_that_is_awaited_has_its_own_times_and_has_not_begun() -> None:
+def test_the_step_that_is_awaited_has_its_own_times_and_has_not_begun() -> None:
     driver = reading_packet()
     assert (driver.timing, driver.begun) == (msc.PROFILE.timings.read, False)
     driver.feed(ACK)
@@ -48,7 +48,7 @@ def test_the_leg_that_is_awaited_has_its_own_times_and_has_not_begun() -> None:
     assert driver.begun
 
 
-def test_what_the_host_says_between_legs_is_told_in_order() -> None:
+def test_what_the_host_says_between_steps_is_told_in_order() -> None:
     driver = reading_packet().feed(ACK, BAD)
     assert driver.said == [NAK]
     assert driver.ending is None
@@ -109,7 +109,7 @@ def test_of_noise_alone_an_exchange_is_told_nothing() -> None:
 class Odd:
     """An exchange whose every step is the same; none is a bug of its own."""
 
-    step: Step[Any] | None
+    progress: Progress[Any] | None
     request: bytes = b"?"
     timing: Any = hcp2.PROFILE.timings.read
     sizes: Sizes = field(default_factory=lambda: Sizes(1, 1))
@@ -117,23 +117,23 @@ class Odd:
     closing: int = 0
     starts: bytes = b"1"
     answers: tuple[bytes, ...] = (b"1",)
-    owed: tuple[bytes, ...] = (b"1",)
+    overdue: tuple[bytes, ...] = (b"1",)
     answered: bool = True
 
-    def feed(self, _data: bytes, /) -> Step[Any]:
-        if self.step is None:
+    def feed(self, _data: bytes, /) -> Progress[Any]:
+        if self.progress is None:
             raise ZeroDivisionError("a bug")
-        return self.step
+        return self.progress
 
     def expired(self, _started: bool, /) -> Any:
-        return self.step
+        return self.progress
 
 
 @pytest.mark.parametrize("end", [lambda driver: driver.feed(b"1").ending, lambda driver: driver.run_out()])
-def test_an_exchange_that_wants_one_leg_after_the_other_is_found_out(end: Any) -> None:
+def test_an_exchange_that_wants_one_step_after_the_other_is_found_out(end: Any) -> None:
     driver = Driver(Odd(Expect(hcp2.PROFILE.timings.read, Sizes(1, 1), NAK)))
     assert isinstance(end(driver).error, EndlessExchange)
-    assert len(driver.said) == MOST_LEGS
+    assert len(driver.said) == MOST_STEPS
 
 
 def test_an_ending_says_what_it_was() -> None:
@@ -197,22 +197,22 @@ def test_bytes_after_silence_make_the_failure_no_silence() -> None:
     assert not driver.ending.silent
 
 
-@pytest.mark.parametrize("legs", [MOST_LEGS, MOST_LEGS + 1])
-def test_as_many_legs_in_a_row_as_the_limit_says_are_followed(legs: int) -> None:
-    driver = Driver(Counted(None, legs=legs))
+@pytest.mark.parametrize("steps", [MOST_STEPS, MOST_STEPS + 1])
+def test_as_many_steps_in_a_row_as_the_limit_says_are_followed(steps: int) -> None:
+    driver = Driver(Counted(None, steps=steps))
     ending = driver.feed(b"1").ending
     assert ending is not None
-    assert (ending.delivered, len(driver.said)) == (legs <= MOST_LEGS, MOST_LEGS)
+    assert (ending.delivered, len(driver.said)) == (steps <= MOST_STEPS, MOST_STEPS)
 
 
 @dataclass
 class Counted(Odd):
-    """An exchange that wants some more legs, and then is done."""
+    """An exchange that wants some more steps, and then is done."""
 
-    legs: int = 0
+    steps: int = 0
 
-    def feed(self, _data: bytes, /) -> Step[Any]:
-        if not self.legs:
+    def feed(self, _data: bytes, /) -> Progress[Any]:
+        if not self.steps:
             return Done(5)
-        self.legs -= 1
+        self.steps -= 1
         return Expect(self.timing, self.sizes, NAK)

@@ -15,7 +15,7 @@ import busmaster.protocols
 import busmaster.wire
 from busmaster.contract.arguments import Between
 from busmaster.contract.driver import Ending
-from busmaster.contract.exchange import Done, Expect, LaterLeg, Sizes
+from busmaster.contract.exchange import Done, Expect, LaterStep, Sizes
 from busmaster.contract.items import Bit, Item
 from busmaster.contract.learning import Learned
 from busmaster.contract.places import Changing, Placed, Telling
@@ -31,6 +31,7 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.exchange import Reply
+from tests.docs.test_telegrams import EXAMPLES
 
 TIMING = ReplyTiming(0.05, 0.1, 0.15, 0.02)
 COMMANDS: tuple[Any, ...] = (
@@ -62,10 +63,18 @@ COMMANDS: tuple[Any, ...] = (
     msc.PickedData(1, (0, 31)),
     msc.PickedFlags((0, 255)),
 )
+COMMANDS += tuple(
+    {
+        type(command): command
+        for command in (example.built() for _, example in EXAMPLES if example.known)
+        if type(command) not in set(map(type, COMMANDS))
+    }.values()
+)
+"""Those of the pages' examples, of protocols that are not listed here."""
 RECORDS: tuple[Any, ...] = (
     *COMMANDS,
     Sizes(1, 2),
-    LaterLeg(TIMING, Sizes(1, 2)),
+    LaterStep(TIMING, Sizes(1, 2)),
     TIMING,
     Timings.uniform(TIMING),
     Learned(),
@@ -166,11 +175,11 @@ def test_a_write_may_be_repeated_only_if_somebody_said_so() -> None:
 
 
 def test_records_say_nothing_that_nobody_told_them() -> None:
-    assert LaterLeg(TIMING, Sizes(1, 2)).sent == 0
+    assert LaterStep(TIMING, Sizes(1, 2)).sent == 0
     assert (Expect(TIMING, Sizes(1, 2)).send, Done(5).rest, Done(5).send) == (b"", b"", b"")
     ending = Ending()
     assert (ending.value, ending.send, ending.rest, ending.error, ending.silent) == (None, b"", b"", None, False)
-    assert TIMING.turnaround == 0
+    assert TIMING.driver_release_time == 0
     assert Between(1).most == float("inf")
     item = Item("1", "1", "a thing")
     assert Reply(1, b"DREAD,", 4).shortest is None
@@ -222,31 +231,31 @@ def test_a_framing_that_does_not_exist_is_refused(bits: int, parity: str, stop: 
 
 def test_reply_times_may_be_equal_and_never_out_of_order() -> None:
     assert ReplyTiming(0.0, 0.0, 0.0, 0.01).window == 0
-    assert ReplyTiming(0.1, 0.1, 0.1, 0.01).lateness == 0.1
+    assert ReplyTiming(0.1, 0.1, 0.1, 0.01).max_reply_delay == 0.1
     for times in ((0.2, 0.1, 0.3), (0.1, 0.3, 0.2), (0.3, 0.2, 0.1)):
-        with pytest.raises(InvalidCommand, match="nominal <= window <= lateness"):
-            ReplyTiming(*times, byte_gap=0.01)
-    for name in ("nominal", "window", "lateness", "byte_gap", "turnaround"):
+        with pytest.raises(InvalidCommand, match="late_after <= window <= max_reply_delay"):
+            ReplyTiming(*times, inter_byte_timeout=0.01)
+    for name in ("late_after", "window", "max_reply_delay", "inter_byte_timeout", "driver_release_time"):
         with pytest.raises(InvalidCommand, match=f"a reply's {name} is a time of 0 s or more"):
             replace(TIMING, **{name: -0.001})
     with pytest.raises(InvalidCommand, match="above 0 s"):
-        replace(TIMING, byte_gap=0.0)
+        replace(TIMING, inter_byte_timeout=0.0)
 
 
 def test_another_window_moves_its_neighbours_only_as_far_as_they_must() -> None:
     assert TIMING.with_window(0.07) == ReplyTiming(0.05, 0.07, 0.15, 0.02)
     assert TIMING.with_window(0.03) == ReplyTiming(0.03, 0.03, 0.15, 0.02)
     assert TIMING.with_window(0.4) == ReplyTiming(0.05, 0.4, 0.4, 0.02)
-    assert TIMING.with_lateness(0.1) is TIMING
-    assert TIMING.with_lateness(0.15) is TIMING
-    assert TIMING.with_lateness(0.2) == ReplyTiming(0.05, 0.1, 0.2, 0.02)
+    assert TIMING.with_max_reply_delay(0.1) is TIMING
+    assert TIMING.with_max_reply_delay(0.15) is TIMING
+    assert TIMING.with_max_reply_delay(0.2) == ReplyTiming(0.05, 0.1, 0.2, 0.02)
 
 
-def test_a_nodes_times_move_leg_by_leg_and_a_packets_window_only_grows() -> None:
+def test_a_nodes_times_move_step_by_step_and_a_packets_window_only_grows() -> None:
     first, packet = TIMING, ReplyTiming(0.5, 1.0, 1.0, 0.1)
     timings = Timings(first, first, packet)
     short, long = timings.with_window(0.07), timings.with_window(2.0)
     assert short == Timings(first.with_window(0.07), first.with_window(0.07), packet)
     assert long == Timings(first.with_window(2.0), first.with_window(2.0), packet.with_window(2.0))
-    late = timings.with_lateness(0.5)
-    assert late == Timings(first.with_lateness(0.5), first.with_lateness(0.5), packet)
+    late = timings.with_max_reply_delay(0.5)
+    assert late == Timings(first.with_max_reply_delay(0.5), first.with_max_reply_delay(0.5), packet)

@@ -275,6 +275,7 @@ def test_the_nodes_that_are_named_are_asked_where_they_exist() -> None:
         "msc": (12,),
         "mentor": (12,),
         "ct-ansi": (12,),
+        "ei-bisynch": (0, 12),
         "modbus": (12,),
         "dc104": (0,),
     }

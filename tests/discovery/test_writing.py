@@ -9,6 +9,7 @@ import pytest
 
 from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine, load
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings
 from busmaster.discovery.search import Discovery, Found
 from busmaster.discovery.writing import line_text, summary
@@ -39,6 +40,8 @@ def test_every_protocols_nodes_make_a_line(protocol: Protocol, tmp_path: Path) -
     assert type(handle) is protocol.kinds[0].handle
     [group] = line.file.groups.values()
     assert group.points == (f"{next(iter(line.nodes))}/{protocol.kinds[0].probe_item}",)
+    [node] = line.file.nodes.values()
+    assert isinstance(node.timings, Learned) == protocol.profile.checked_requests
 
 
 def test_what_was_said_of_the_port_is_kept_and_what_was_found_of_it_added(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from busmaster.cli.app import STATUSES, cli
 from busmaster.registry import kinds
 
 ENVIRONMENT = {
-    "BUSMASTER_TOKEN": "The token that is shown to a line or a door that is reached by tcp://HOST:PORT.",
+    "BUSMASTER_TOKEN": "The token that is shown to a line or an interface that is reached by tcp://HOST:PORT.",
     "BUSMASTER_DEBUG": "1 shows the log on standard error, and where an internal error came from.",
     "NO_COLOR": "Whatever it holds, nothing is coloured.",
     "XDG_RUNTIME_DIR": "Lines of a user are served in the folder busmaster there.",
@@ -48,6 +48,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "web": (("web --bind 127.0.0.1:8420", CTRL_C),),
     "opcua": (("opcua --allow 'drive*/speed_reference'", CTRL_C),),
     "safe": (("safe line.toml", DRIVES),),
+    "check": (("check line.toml", RUN),),
+    "migrate": (("migrate line.toml", RUN),),
     "plan": (("plan line.toml", RUN),),
     "points": (("points line.toml --csv >points.csv", RUN), ("points line.toml --from points.csv", RUN)),
     "monitor": ((f"monitor {LINE} --protocol hcp2", DRIVES),),

@@ -125,13 +125,15 @@ def _api() -> Iterator[str]:
 Every public name, from the docstrings of this very version; [what is public](../public-api.md) says how names change.
 Times are in seconds and baud rates in bits a second, unless a name or a docstring says otherwise. A wrong argument
 raises `InvalidCommand` before anything is sent. On a code host this page is a list of modules: the site has the texts,
-and so has `help(busmaster.Bus)`. What a module shares with `busmaster` itself is shown there.
+and so has `help(busmaster.Bus)`. What a module shares with one before it is shown there.
 """
     table = (ROOT / "docs" / "public-api.md").read_text()
     yield _module("busmaster", "applications", [])
+    shown = {getattr(busmaster, each) for each in busmaster.__all__ if callable(getattr(busmaster, each))}
     for name, who in re.findall(r"^\| `(busmaster\.[\w.]+)` \| (.*) \|$", table, re.MULTILINE):
         module = import_module(name)
-        shared = [each for each in module.__all__ if each in busmaster.__all__ and callable(getattr(module, each))]
+        shared = [each for each in module.__all__ if callable(getattr(module, each)) and getattr(module, each) in shown]
+        shown.update(getattr(module, each) for each in module.__all__ if callable(getattr(module, each)))
         yield _module(name, who, shared)
 
 

@@ -24,7 +24,7 @@ ADDRESS = re.compile(r"\b(127\.0\.0\.1|localhost):(\d{4,5})\b")
 PORT_KEY = re.compile(r"^(port = )(\d{4,5})$", re.MULTILINE)
 NUMBER = r"(?<![\d.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
 OWN_BINDS = {"web": "127.0.0.1:8420", "opcua": "127.0.0.1:4840"}
-"""Where doors listen that are not told: another program of this machine may be there."""
+"""Where interfaces listen that are not told: another program of this machine may be there."""
 CTRL_C = "^C"
 
 
@@ -245,9 +245,9 @@ class Shell:
         assert self._status == 0, f"{place}: exit status {self._status}"
 
     def _bash(self, text: str) -> list[str]:
-        for door, address in OWN_BINDS.items():
+        for interface, address in OWN_BINDS.items():
             if "--bind" not in text:
-                text = re.sub(rf"\bbusmaster {door}\b", f"busmaster {door} --bind {address}", text)
+                text = re.sub(rf"\bbusmaster {interface}\b", f"busmaster {interface} --bind {address}", text)
         return ["bash", "-c", f"(exit {self._status}); {self.replace.real(text)}"]
 
     def _start(self, text: str, place: str, command: Command | None = None) -> None:

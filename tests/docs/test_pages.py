@@ -59,7 +59,7 @@ def test_the_picture_and_the_table_of_rooms_have_every_room() -> None:
     assert {
         Path(name).stem for name in re.findall(r"^\| `busmaster/(\w+)(?:/|\.py)`", prose(page), re.MULTILINE)
     } == rooms
-    assert rooms - {"dissectors", "templates"} <= set(re.findall(r"\w+", picture.text))
+    assert rooms - {"dissectors"} <= set(re.findall(r"\w+", picture.text))
 
 
 def test_pre_commit_runs_what_the_extras_install_and_fetches_nothing() -> None:

@@ -103,9 +103,9 @@ def test_the_codec_sends_and_reads_the_very_bytes_of_an_example(example: Telegra
 
 @pytest.mark.parametrize("example", [example for _, example in EXAMPLES if example.known], ids=str)
 def test_a_listener_reads_an_example_off_the_line(example: Telegrams) -> None:
-    legs = [data for side, data in example.said if side == "<"]
+    steps = [data for side, data in example.said if side == "<"]
     raises = REFUSALS.get(example.outcome)
-    check_dialect(example.kind.protocol, [Case(example.built(), example.address, legs, raises=raises)])
+    check_dialect(example.kind.protocol, [Case(example.built(), example.address, steps, raises=raises)])
 
 
 @pytest.mark.parametrize("example", [example for _, example in EXAMPLES], ids=str)

@@ -7,8 +7,7 @@ import termios
 
 import pytest
 
-from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.mark import Mark
+from busmaster.arbiter.counters import DriverErrors, Mark
 from busmaster.doctor import uart
 from busmaster.doctor.adapters import Finding
 from busmaster.doctor.examination import Patient, examine

@@ -258,6 +258,21 @@ def test_a_restarted_device_comes_back_without_its_ram() -> None:
     assert ask(line, READ, 5.0) == "02 30 31 30 03 32"  # Comms(1) = 0
 
 
+def test_a_device_that_restarts_does_not_say_what_it_was_about_to_say() -> None:
+    """Neither after what it says next, which would be out of order, nor in place of it."""
+    line = line_with()
+    mint = line.device(2)
+    mint.delay = Delay(0.1)
+    line.send(bytes.fromhex(READ), 0.0)
+    line.receive(0.05)
+    mint.faults.restart, mint.faults.away_for = 1.0, 0.001
+    line.send(bytes.fromhex(READ), 0.06)
+    line.receive(0.09)
+    mint.faults.restart, mint.delay = 0.0, Delay(0.001)
+    line.send(bytes.fromhex(READ), 0.09)
+    assert [data for _, data in arrivals(line, 1.0)] == ["02 30 31 30 03 32"]  # Comms(1) = 0
+
+
 def test_what_comes_while_it_is_busy_is_queued_or_dropped() -> None:
     """A device that takes 10 ms is asked again after 5."""
     for settings, replies in (((), 2), (("drop=1",), 1)):

@@ -70,7 +70,7 @@ def test_the_first_byte_is_an_event_unless_the_host_asks_in_time_by_itself() -> 
 
 
 def test_a_long_frame_comes_in_pieces_without_a_pause_that_would_look_like_its_end() -> None:
-    """MSC's BREAD packet lasts 148 ms at 9600 baud, and its byte gap is 100 ms."""
+    """MSC's BREAD packet lasts 148 ms at 9600 baud, and its inter-byte timeout is 100 ms."""
     line = Line(LineSettings(9600), [make_device("msc", 1)])
     line.send(bytes.fromhex("02 01 00 08 00 00 42 52 45 41 44 2C 07 D8 02 72"), 0.0)
     times = [when for when, data in arrivals(line, 0.5)][1:]
@@ -157,7 +157,7 @@ class Insister(Device):
         self.wakeup = now + 0.01
 
 
-def test_a_device_may_speak_unasked_when_its_own_timer_runs_out() -> None:
+def test_a_device_may_speak_unexpected_when_its_own_timer_runs_out() -> None:
     device = Insister(1)
     device.wakeup = 0.005
     device.attentive = True
@@ -212,7 +212,7 @@ def test_what_is_heard_of_a_collision_reaches_the_host_as_it_comes(prompt: bool)
     assert [when for when, _ in arrivals(line, 1.0)] == pytest.approx([start + 5 * TAU, start + 6 * TAU])
 
 
-def test_a_request_that_collides_with_a_straggler_is_lost_and_not_misheard() -> None:
+def test_a_request_that_collides_with_an_overdue_reply_is_lost_and_not_misheard() -> None:
     line = line_of(mint(2, delay=0.05), mint(3))
     line.send(READ_2, 0.0)
     line.send(READ_3, 0.0505)
@@ -271,7 +271,7 @@ def test_a_corrupt_echo_differs_by_one_bit() -> None:
 
 def test_a_device_that_holds_the_line_after_its_reply_garbles_the_next_request() -> None:
     first = mint(2)
-    first.turnaround = 2 * TAU
+    first.driver_release_time = 2 * TAU
     line = line_of(first, mint(3))
     line.send(READ_2, 0.0)
     end = 14 * TAU + 0.002
@@ -284,11 +284,11 @@ def test_a_device_that_holds_the_line_after_its_reply_garbles_the_next_request()
 
 
 def test_a_host_that_holds_the_line_garbles_a_quick_reply() -> None:
-    line = line_of(mint(delay=0.0), turnaround=3 * TAU)
+    line = line_of(mint(delay=0.0), driver_release_time=3 * TAU)
     garbled = ask(line, hexed(READ_2))
     assert garbled != REPLY
     assert garbled.endswith("03 32")
-    assert ask(line_of(mint(delay=0.002), turnaround=3 * TAU), hexed(READ_2)) == REPLY
+    assert ask(line_of(mint(delay=0.002), driver_release_time=3 * TAU), hexed(READ_2)) == REPLY
 
 
 def test_nothing_passes_a_cut_until_it_is_mended() -> None:
@@ -347,7 +347,7 @@ def test_whatever_happens_the_line_comes_to_rest_and_then_works(
     chance = Random(seed)
     devices = [mint(2), mint(2, delay=0.0), mint(3)]
     for device in devices:
-        device.turnaround = TAU
+        device.driver_release_time = TAU
         device.faults = Faults.parse([f"{name}=0.1" for name in (*HEARING, *SPEAKING) if name != "dead"])
     line = Line(
         SETTINGS,
@@ -357,7 +357,7 @@ def test_whatever_happens_the_line_comes_to_rest_and_then_works(
         echo=echo,
         chunk=seed % 3,
         latency=seed % 2 * 0.001,
-        turnaround=TAU,
+        driver_release_time=TAU,
     )
     now = 0.0
     for what, seconds in happenings:
@@ -402,8 +402,8 @@ def test_a_spread_delay_is_drawn_from_the_chance_that_was_handed_in() -> None:
     assert 0.05 <= times[0] <= 0.1
 
 
-def test_stragglers_are_a_share_of_the_replies() -> None:
-    delay, chance = Delay(0.002, stragglers=0.1, straggle=(0.1, 0.145)), Random(1)
+def test_late_replies_are_a_share_of_the_replies() -> None:
+    delay, chance = Delay(0.002, late_replies=0.1, late_reply_delay=(0.1, 0.145)), Random(1)
     drawn = [delay.draw(chance) for _ in range(1000)]
     assert 50 < sum(d > 0.01 for d in drawn) < 150
     assert all(d == 0.002 or 0.1 <= d <= 0.145 for d in drawn)

@@ -236,7 +236,7 @@ def test_hcp_and_hcp2_controllers_share_a_line() -> None:
             assert master.ask(read(1 + number), address) == value
     assert master.line.collisions == 0
     statistics = master.world.arbiter.statistics(master.world.now)
-    assert statistics.unasked_bytes == 0
+    assert statistics.unexpected_bytes == 0
     assert statistics.exchanges == statistics.completed == 2 * 8 * 40
 
 
@@ -274,7 +274,7 @@ def test_msc_never_takes_a_packet_whose_ack_was_lost_for_the_answer() -> None:
     master.leaves_off()
     assert not controller.unacknowledged
     counted = master.world.arbiter.statistics(master.world.now)
-    assert counted.exchanges - counted.checks == 2, "a packet before its ACK may answer an older request"
+    assert counted.exchanges - counted.sync_reads == 2, "a packet before its ACK may answer an older request"
 
 
 def test_a_packet_that_was_never_acknowledged_does_not_come_again_into_other_exchanges() -> None:

@@ -19,13 +19,13 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from tests.emulator.lines import SETTINGS, TAU
 from tests.stories import in_use
 
-SETTLED = 0.2
+IN_SYNC = 0.2
 
 
 def world_of(*devices: EmulatedMint, seed: int = 1, **options: object) -> World:
     line = Line(SETTINGS, devices, chance=Random(seed), **options)  # type: ignore[arg-type]  # options of Line
     world = World(line)
-    world.run(SETTLED)
+    world.run(IN_SYNC)
     in_use(world)
     return world
 
@@ -37,7 +37,7 @@ def test_a_read_takes_as_long_as_its_bytes_and_the_devices_delay() -> None:
     read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
     world.run(1.0)
     assert read.value == 123.456
-    assert read.ended_at - SETTLED == pytest.approx(8 * TAU + 0.002 + 12 * TAU)
+    assert read.ended_at - IN_SYNC == pytest.approx(8 * TAU + 0.002 + 12 * TAU)
 
 
 def test_a_node_that_is_not_there_fails_after_its_attempts() -> None:
@@ -46,11 +46,12 @@ def test_a_node_that_is_not_there_fails_after_its_attempts() -> None:
     assert world.run_until(lambda: read.ended_at > 0, 5.0)
     assert isinstance(read.error, NoReply)
     assert read.attempts == 3
-    assert world.now < SETTLED + (3 + 1) * 0.16  # a check behind the first (R15)
+    assert world.now < IN_SYNC + (3 + 1) * 0.16  # a check behind the first (R15)
 
 
 def test_a_reply_that_lies_in_an_adapter_is_waited_for_as_long_as_the_line_holds_bytes_back() -> None:
-    """It begins within its window of 100 ms on the wire, and reaches the host behind its lateness of 150 ms."""
+    """It begins within its window of 100 ms on the wire, and reaches the host behind its maximum reply delay of 150
+    ms."""
     mint = EmulatedMint(2, delay=Delay(0.08))
     mint.comms[1] = 123.456
     world = world_of(mint, latency=0.2)
@@ -62,7 +63,7 @@ def test_a_reply_that_lies_in_an_adapter_is_waited_for_as_long_as_the_line_holds
 def test_run_until_gives_up_at_its_limit() -> None:
     world = world_of()
     assert not world.run_until(lambda: False, 2.0)
-    assert world.now == pytest.approx(SETTLED + 2.0)
+    assert world.now == pytest.approx(IN_SYNC + 2.0)
 
 
 def test_an_action_happens_at_its_time_and_events_reach_their_listener() -> None:
@@ -89,7 +90,7 @@ def test_a_listener_may_submit_the_next_request() -> None:
                 world.request(node, hcp2.Read(len(done)))
 
     world = World(Line(SETTINGS, [EmulatedMint(2)]), on_event=on_event)
-    world.run(SETTLED)
+    world.run(IN_SYNC)
     node = world.node(hcp2.PROFILE, 2)
     world.request(node, hcp2.Read(100))
     world.run(2.0)
@@ -106,10 +107,10 @@ def test_unplugging_fails_what_waits_and_plugging_in_lets_it_go_on() -> None:
 
     world = World(Line(SETTINGS, [EmulatedMint(2, delay=Delay(0.02))]), on_event=on_event)
     node = world.node(hcp2.PROFILE, 2)
-    world.run(SETTLED)
+    world.run(IN_SYNC)
     first = world.request(node, hcp2.Read(1))
-    world.at(SETTLED + 0.01, world.unplug)
-    world.run(SETTLED + 0.02)
+    world.at(IN_SYNC + 0.01, world.unplug)
+    world.run(IN_SYNC + 0.02)
     assert isinstance(first.error, LineDown)
     world.plug()
     world.run(1.0)
@@ -196,7 +197,7 @@ def test_faults_inside_the_assumption_give_no_wrong_value_and_progress_goes_on()
 
 def test_an_echo_is_stripped() -> None:
     world = World(Line(SETTINGS, [EmulatedMint(2)], echo=Echo()))
-    world.run(SETTLED)
+    world.run(IN_SYNC)
     read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
     world.run(1.0)
     assert read.value == 0

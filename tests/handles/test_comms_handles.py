@@ -77,7 +77,7 @@ async def test_nothing_is_sent_of_a_list_that_cannot_be_sent_whole(controller: C
         with pytest.raises(InvalidCommand):
             await controller.write(1, *values)
     with pytest.raises(InvalidCommand):
-        await controller.write(controller.read_command.last - 10, *range(10001, 10013))
+        await controller.write(controller._read_command.last - 10, *range(10001, 10013))
     assert line.asked == []
 
 
@@ -192,7 +192,7 @@ async def test_an_item_that_is_a_number_is_named_as_such(line: CommsArray) -> No
     with pytest.raises(InvalidCommand, match=r"an item is text, such as '1', not 1"):
         controller.point(1)  # type: ignore[arg-type]  # a caller without a type checker
     with pytest.raises(InvalidCommand, match="no such item"):
-        await controller.read(1.0)  # type: ignore[arg-type]  # likewise
+        await controller.read(1.0)  # type: ignore[call-overload]  # likewise
     assert line.asked == []
 
 

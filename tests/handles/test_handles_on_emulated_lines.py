@@ -50,7 +50,7 @@ async def cycles(group: PollGroup, count: int) -> list[Snapshot]:
 
 @asynccontextmanager
 async def line_of(handle: type[Handle], *devices: Device) -> AsyncIterator[Bus]:
-    """A bus on a line as that handle's protocol has it, once it has settled."""
+    """A bus on a line as that handle's protocol has it, once it has resynchronised."""
     async with Bus(MemoryPort(Line(handle.profile.line, devices, chance=random.Random(1)))) as bus:
         in_use(bus)
         yield bus
@@ -80,8 +80,8 @@ async def test_msc_gives_up_after_six_bad_packets_and_leaves_the_line_free() -> 
             await MscController(bus, 3, retries=0).read(2008)
         failed = bus.now()
         assert await MscController(bus, 4).read(2008) == 44
-        silence = msc_commands.PROFILE.timings.packet.byte_gap + msc_commands.PROFILE.line.byte_time
-        assert bus.now() - failed < silence + 0.05, "no lateness: the packet had begun"
+        silence = msc_commands.PROFILE.timings.packet.inter_byte_timeout + msc_commands.PROFILE.line.byte_time
+        assert bus.now() - failed < silence + 0.05, "no maximum reply delay: the packet had begun"
         assert device.retransmitted == 5
         assert not device.unacknowledged
         assert await MscController(bus, 3).read(2008) == 0
@@ -115,7 +115,7 @@ def test_the_address_step_is_found_and_a_wrong_one_fails_verification(step: int)
         async with line_of(MscController, device) as bus:
             press = MscController(bus, 3)
             assert await press.find_address_step(2000) == step
-            assert await press.read_block(2000, 39) == tuple(range(1, 40))
+            assert await press.read(2000, 39) == tuple(range(1, 40))
             press.address_step = 5 - step
             with pytest.raises(VerifyFailed):
                 await press.load_cam(3000, range(100))
@@ -132,11 +132,11 @@ async def test_msc_blocks_of_any_length_touch_nothing_else() -> None:
         for length in (1, 2, 31, 32, 33, 64, 70):
             values = tuple(range(length, 2 * length))
             await press.write_block(4000, values, verify=True)
-            assert await press.read_block(4000, length) == values
+            assert await press.read(4000, length) == values
             assert device.value(4000 + 4 * length) == -1
         last = 0x8000 - 4 * 40
         await press.write_block(last, range(40), verify=True)
-        assert await press.read_block(last, 40) == tuple(range(40))  # the last 32 would reach beyond the data area
+        assert await press.read(last, 40) == tuple(range(40))  # the last 32 would reach beyond the data area
         with pytest.raises(Refused):
             await press.write(0x8000, 1)
 
@@ -182,10 +182,10 @@ async def test_mentor_parameters_with_and_without_decimals_wide_and_fine() -> No
             await drive.read("17.23")
         with pytest.raises(Refused):
             await drive.write("1.17", 100.1)
-        assert await drive.read_run("1.17", 3) == await drive.read_run("1.17", 3, chain=True) == (-47.6, 0, 0)
-        assert await drive.read_run("1.19", 3, step=-1) == (0, 0, -47.6)
-        assert await drive.read_run("1.19", 3, step=-1, chain=True) == (0, 0, -47.6)
-        assert await drive.read_run("1.17", 3, step=0, chain=True) == (-47.6, -47.6, -47.6)
+        assert await drive.read("1.17", 3) == await drive.read("1.17", 3, chain=True) == (-47.6, 0, 0)
+        assert await drive.read("1.19", 3, step=-1) == (0, 0, -47.6)
+        assert await drive.read("1.19", 3, step=-1, chain=True) == (0, 0, -47.6)
+        assert await drive.read("1.17", 3, step=0, chain=True) == (-47.6, -47.6, -47.6)
         await drive.write("15.61", 65535, verify=True)
 
 
@@ -249,4 +249,4 @@ async def test_controllers_of_both_host_comms_protocols_share_a_line() -> None:
             assert [snapshot[point].value for point in points] == [
                 100 * number + value for number in range(4) for value in (0, 3, 16)
             ]
-        assert bus.statistics().unasked_bytes == bus.statistics().collisions == 0
+        assert bus.statistics().unexpected_bytes == bus.statistics().collisions == 0

@@ -95,24 +95,24 @@ async def test_a_verified_write_is_read_back(drive: MentorDrive, line: Parameter
 @pytest.mark.asyncio
 async def test_a_run_is_read_singly_or_in_one_exchange(drive: MentorDrive, line: Parameters) -> None:
     line.table = {(1, 17): 476, (1, 18): 5, (1, 19): 7}
-    assert await drive.read_run("1.17", 3) == (47.6, 5, 7)
+    assert await drive.read("1.17", 3) == (47.6, 5, 7)
     assert line.asked == ["read 01.17", "read 01.18", "read 01.19"]
     line.log.clear()
-    assert await drive.read_run("1.17", 3, chain=True) == (47.6, 5, 7)
+    assert await drive.read("1.17", 3, chain=True) == (47.6, 5, 7)
     assert line.asked == ["read 01.17 to 01.19"]
 
 
 @pytest.mark.asyncio
 async def test_a_run_goes_back_or_stays_where_that_is_asked(drive: MentorDrive, line: Parameters) -> None:
     line.table = {(1, 17): 476, (1, 16): 5, (1, 15): 7}
-    assert await drive.read_run("1.17", 3, step=-1) == (47.6, 5, 7)
+    assert await drive.read("1.17", 3, step=-1) == (47.6, 5, 7)
     assert line.asked == ["read 01.17", "read 01.16", "read 01.15"]
     line.log.clear()
-    assert await drive.read_run("1.17", 2, step=0) == (47.6, 47.6)
-    await drive.read_run("1.17", 3, step=-1, chain=True)
+    assert await drive.read("1.17", 2, step=0) == (47.6, 47.6)
+    await drive.read("1.17", 3, step=-1, chain=True)
     assert line.asked == ["read 01.17", "read 01.17", "read 01.17 to 01.15"]
     with pytest.raises(InvalidCommand, match="last parameter number"):
-        await drive.read_run("1.01", 3, step=-1)
+        await drive.read("1.01", 3, step=-1)
 
 
 @pytest.mark.asyncio
@@ -169,7 +169,7 @@ async def test_all_drives_are_never_read(line: Parameters) -> None:
     with pytest.raises(InvalidCommand, match="all drives"):
         await everyone.read("1.17")
     with pytest.raises(InvalidCommand, match="all drives"):
-        await everyone.read_run("1.17", 2)
+        await everyone.read("1.17", 2)
     with pytest.raises(InvalidCommand, match="a write to all cannot be verified"):
         await everyone.write("1.17", 0, verify=True)
     assert line.asked == []

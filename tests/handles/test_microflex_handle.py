@@ -311,7 +311,7 @@ async def test_by_number_too_since_every_drive_has_the_same_map(drive: MicroFlex
     assert line.asked == []
     for element in (118, 50):  # 50 is not in the map: the drive's to refuse
         assert drive.element(element).writable
-        assert [str(command) for command in drive.writes(element, (5,))] == [f"write element {element} = 5"]
+        assert [str(command) for command in drive._writes(element, (5,))] == [f"write element {element} = 5"]
 
 
 @pytest.mark.asyncio

@@ -127,7 +127,7 @@ async def test_any_number_of_values_is_written_and_read(press: MscController, li
     await press.write_block("cam", values, verify=True)
     assert line.data[:count] == list(values)
     assert line.data[count:] == [-7] * (1200 - count)
-    assert await press.read_block("cam", count) == values
+    assert await press.read("cam", count) == values
 
 
 @pytest.mark.asyncio
@@ -143,14 +143,14 @@ async def test_while_the_step_is_unknown_only_what_needs_no_step_is_sent(line: C
     press = MscController(line, 3)
     await press.write_block(2000, range(32), verify=True)
     await press.write(2000, 5, verify=True)
-    assert await press.read_block(2000, 5) == (5, 1, 2, 3, 4)
+    assert await press.read(2000, 5) == (5, 1, 2, 3, 4)
     asked = len(line.asked)
     with pytest.raises(InvalidCommand, match="address_step"):
         await press.write_block(2000, range(33))
     with pytest.raises(InvalidCommand, match="address_step"):
         await press.write_block(2000, range(5))
     with pytest.raises(InvalidCommand, match="address_step"):
-        await press.read_block(2000, 33)
+        await press.read(2000, 33)
     assert len(line.asked) == asked
 
 
@@ -158,19 +158,19 @@ async def test_while_the_step_is_unknown_only_what_needs_no_step_is_sent(line: C
 async def test_the_last_values_of_the_data_area_are_read_one_by_one(line: Controller) -> None:
     line.data = list(range(40))
     press = MscController(line, 3, address_step=4)
-    assert await press.read_block(2000, 40) == tuple(range(40))
+    assert await press.read(2000, 40) == tuple(range(40))
     assert line.asked[1:3] == ["read 32 values from data 2128", "read data 2128"]
 
 
 @pytest.mark.asyncio
-async def test_a_refusal_that_no_single_read_would_mend_is_the_callers(line: Controller) -> None:
+async def test_a_refusal_that_no_single_read_would_fix_is_the_callers(line: Controller) -> None:
     known, unknown = MscController(line, 3, address_step=4), MscController(line, 4)
     with pytest.raises(Refused):
-        await known.read_block(1000, 32)
+        await known.read(1000, 32)
     with pytest.raises(Refused):
-        await known.read_block(1000, 1)
+        await known.read(1000, 1)
     with pytest.raises(Refused):
-        await unknown.read_block(1000, 5)
+        await unknown.read(1000, 5)
 
 
 @pytest.mark.asyncio
@@ -180,7 +180,7 @@ async def test_a_transfer_that_cannot_end_is_not_begun(press: MscController, lin
             await press.write_block(2000, values)
     for count in (0, 20000):
         with pytest.raises(InvalidCommand):
-            await press.read_block(2000, count)
+            await press.read(2000, count)
     assert line.asked == []
 
 
@@ -220,7 +220,7 @@ async def test_the_address_step_is_found_on_values_that_differ(step: int) -> Non
     line.data = [3 * i * i for i in range(1200)]
     press = MscController(line, 3, symbols={"table": 2000})
     assert await press.find_address_step("table") == step
-    assert await press.read_block("table", 100) == tuple(line.data[:100])
+    assert await press.read("table", 100) == tuple(line.data[:100])
     assert all(asked.startswith("read") for asked in line.asked)
 
 
@@ -320,8 +320,8 @@ def test_points_are_equal_if_they_ask_the_same(press: MscController) -> None:
 
 
 def test_each_value_of_a_run_has_a_name(press: MscController, line: Controller) -> None:
-    assert press.run_items("cam:3", 3) == ("2000", "2004", "2008")
-    assert MscController(line, 4).run_items("2000:2", 2) == ("2000[0]", "2000[1]")
+    assert press._run_items("cam:3", 3) == ("2000", "2004", "2008")
+    assert MscController(line, 4)._run_items("2000:2", 2) == ("2000[0]", "2000[1]")
 
 
 def test_poll_groups_merge_by_what_is_known(line: Controller) -> None:

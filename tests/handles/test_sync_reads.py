@@ -76,7 +76,7 @@ def test_the_emulated_device_of_a_kind_has_the_probe_and_the_sync_reads(kind: No
         line = Line(kind.profile.line, [make_device(kind.name, address)], chance=random.Random(1))
         async with Bus(MemoryPort(line)) as bus:
             node = bus.node(kind.profile, address)
-            for command in (kind.profile.probe, *kind.profile.checks):
+            for command in (kind.profile.probe, *kind.profile.sync_reads):
                 await node.request(command)
 
     run_in_virtual_time(read())
@@ -89,12 +89,12 @@ async def test_what_a_handle_sets_holds_for_all_handles_of_the_node() -> None:
         assert first.node.profile.probe == hcp2.Read(1), "as the first handle said"
         second.use_sync_reads(probe="status_word")
         assert first.node.profile.probe == hcp2.Read(109)
-        assert first.node.profile.checks == hcp2.PROFILE.checks, "what is left out stays"
+        assert first.node.profile.sync_reads == hcp2.PROFILE.sync_reads, "what is left out stays"
         first.use_sync_reads(sync_reads=("239", "242"))
-        assert second.node.profile.checks == (hcp2.Read(239), hcp2.Read(242))
+        assert second.node.profile.sync_reads == (hcp2.Read(239), hcp2.Read(242))
         assert first.node.profile.probe == hcp2.Read(109)
         second.use_sync_reads(probe="109", sync_reads=("firmware", "temperature"))
-        assert other.node.profile.checks == MicroFlexDrive.profile.checks
+        assert other.node.profile.sync_reads == MicroFlexDrive.profile.sync_reads
         for wrong in ({"probe": "1"}, {"sync_reads": ("239", "1")}):
             with pytest.raises(InvalidCommand, match="another probe or other sync reads"):
                 first.use_sync_reads(**wrong)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.gate import gate
+from busmaster.authorisation import authorisation
 from tests.outputs.brokers import Broker, running
 from tests.patience import PATIENCE
 
 
 @pytest.fixture(autouse=True)
 def commands_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate, "FRESH", PATIENCE)
+    monkeypatch.setattr(authorisation, "FRESH", PATIENCE)
 
 
 @pytest.fixture

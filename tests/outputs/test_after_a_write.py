@@ -73,7 +73,7 @@ async def write_both(line: ConfiguredLine) -> None:
     group = line.groups["slow"]
     await until(lambda: group.latest is not None)
     await line.point("winder/force").write(7)
-    await until(lambda: line.bus.reads_after_writes.read == 1)
+    await until(lambda: line.bus._reads_after_writes.read == 1)
     await line.point("winder/plain").write(1)
     await line.point("winder/plain").write(1)
     cycles = group.statistics().cycles

@@ -6,7 +6,7 @@ import json
 import sqlite3
 from pathlib import Path
 
-from busmaster.gate.record import Outcome, WriteRecord
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
@@ -18,7 +18,7 @@ WRITE = WriteRecord(
 )
 KEPT = {
     "time": 1767225600.25,
-    "door": "screen",
+    "interface": "screen",
     "by": "key w",
     "user": "op",
     "process": 17,

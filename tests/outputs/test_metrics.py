@@ -139,7 +139,7 @@ async def poll_and_pause() -> None:
 async def test_a_scrape_has_the_drivers_counts_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
     found: DriverErrors | None = None
     bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [])))
-    monkeypatch.setattr(bus.pump, "driver_errors", lambda: found)
+    monkeypatch.setattr(bus._pump, "driver_errors", lambda: found)
     output = MetricsOutput("metrics", MetricsSettings(port=0), bus)
     async with bus:
         output.start()
@@ -225,7 +225,7 @@ async def test_a_stale_value_is_told_as_such_and_a_lost_one_keeps_its_time(monke
         metrics = await asyncio.to_thread(scraped, output.port)
         assert (of(metrics, "value", **labels), of(metrics, "value_good", **labels)) == (0, 0)
         monkeypatch.setattr(MemoryPort, "open", never_opens)
-        transport = bus.pump._transport
+        transport = bus._pump._transport
         assert isinstance(transport, MemoryTransport)
         transport.lose(OSError("unplugged"))
         while not bus.condition.is_lost:  # noqa: ASYNC110  nobody tells it
@@ -269,7 +269,7 @@ async def test_the_alerts_of_the_page_fire_when_the_line_is_lost_and_not_before(
         await asyncio.to_thread(until, lambda: output.port != 0)
         calm = await asyncio.to_thread(scraped, output.port)
         monkeypatch.setattr(MemoryPort, "open", never_opens)
-        transport = bus.pump._transport
+        transport = bus._pump._transport
         assert isinstance(transport, MemoryTransport)
         transport.lose(OSError("unplugged"))
         while not bus.condition.is_lost:  # noqa: ASYNC110  nobody tells it

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from busmaster.authorisation.payload import NoCommand, Payload, read_payload
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
-from busmaster.gate.payload import NoCommand, Payload, read_payload
 from busmaster.outputs.base import Happening
 from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.settings import MqttSettings

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from busmaster.authorisation.authorisation import Authorisation, Wish
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.bounds import MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError
-from busmaster.gate.gate import Gate, Wish
-from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import mqtt, mqtt_commands, mqtt_forbidden
 from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.mqtt_commands import LEAST, Commands
@@ -48,11 +48,11 @@ async def until(fact: Callable[[], object]) -> None:
 class Plant:
     """A line with one controller, whose element 1 may be written by MQTT, and somebody who writes it."""
 
-    def __init__(self, bus: Bus, gate: Gate, output: MqttOutput, client: Client) -> None:
-        self.bus, self.gate, self.output, self.client = bus, gate, output, client
+    def __init__(self, bus: Bus, authorisation: Authorisation, output: MqttOutput, client: Client) -> None:
+        self.bus, self.authorisation, self.output, self.client = bus, authorisation, output, client
         self.controller = Hcp2Controller(bus, 5)
         self.records: list[WriteRecord] = []
-        gate.record = self.keep
+        authorisation.record = self.keep
 
     def keep(self, record: WriteRecord) -> None:
         self.records.append(record)
@@ -81,11 +81,11 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
     import aiomqtt
 
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)))
-    door = Gate(bus, read_only=read_only)
+    interface = Authorisation(bus, read_only=read_only)
     controller = Hcp2Controller(bus, 5)
     controller.element(1).limit(maximum=500)
     settings = MqttSettings(port=broker.port, prefix="line")
-    output = MqttOutput("mqtt", settings, bus, commands={"5/1": controller.point("1")}, gate=door)
+    output = MqttOutput("mqtt", settings, bus, commands={"5/1": controller.point("1")}, authorisation=interface)
     async with bus, aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
         await client.subscribe("line/status", qos=1)
         output.start()
@@ -97,7 +97,7 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
         for topic in topics or ("line/result/#",):
             await client.subscribe(topic, qos=1)
         try:
-            yield Plant(bus, door, output, client)
+            yield Plant(bus, interface, output, client)
         finally:
             await asyncio.to_thread(output.close, PATIENCE)
 
@@ -111,7 +111,7 @@ async def test_a_write_is_answered_with_its_id_and_kept_whole(broker: Broker) ->
         assert await there.controller.read(1) == 12.5
     assert found["line/result/5/1"] == {"ok": True, "id": "a1"}
     audit = found["line/audit"]
-    assert (audit["door"], audit["by"], audit["point"], audit["value"]) == ("mqtt", "line/set/5/1", "5/1", 12.5)
+    assert (audit["interface"], audit["by"], audit["point"], audit["value"]) == ("mqtt", "line/set/5/1", "5/1", 12.5)
     assert (audit["outcome"], audit["error"], audit["id"]) == ("written", None, "a1")
     assert audit["took"] > 0
     assert began <= audit["time"] <= time.time()
@@ -137,7 +137,7 @@ def test_a_command_that_is_refused_is_answered_though_the_lines_loop_has_ended(b
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)))
     settings = MqttSettings(port=broker.port, prefix="line")
     commands = {"5/1": Hcp2Controller(bus, 5).point("1")}
-    output = MqttOutput("mqtt", settings, bus, commands=commands, gate=Gate(bus))
+    output = MqttOutput("mqtt", settings, bus, commands=commands, authorisation=Authorisation(bus))
 
     async def start() -> None:
         output.start()
@@ -336,7 +336,7 @@ async def test_commands_that_come_are_a_life_sign_of_a_broker_that_does_not_ackn
     output._arriving = cast("Commands", Commanded())
     await output._acknowledged(asyncio.ensure_future(publishing()))
     acknowledged = asyncio.get_running_loop().create_future()
-    output._arriving = Commands("line", output._gate, {}, lambda: 0.0)
+    output._arriving = Commands("line", output._authorisation, {}, lambda: 0.0)
     with pytest.raises(ConnectionError, match=r"did not answer in 0.001 s"):
         await output._acknowledged(asyncio.ensure_future(publishing()))
 
@@ -383,17 +383,17 @@ async def test_read_only_means_mqtt_too(broker: Broker) -> None:
 @pytest.mark.asyncio
 async def test_while_the_line_is_left_commands_are_refused_and_recorded(broker: Broker) -> None:
     async with plant(broker) as there:
-        there.gate.leaving = True
+        there.authorisation.leaving = True
         assert "the line is being left" in (await there.ask('{"value": 7, "id": "late"}'))["error"]
         assert [(record.id, record.outcome) for record in there.records] == [("late", Outcome.REFUSED)]
         assert await there.controller.read(1) == 0
 
 
 @pytest.mark.asyncio
-async def test_behind_a_closed_door_nothing_is_carried_out_answered_or_recorded(broker: Broker) -> None:
+async def test_behind_a_closed_interface_nothing_is_carried_out_answered_or_recorded(broker: Broker) -> None:
     async with plant(broker) as there:
         assert (await there.ask("7"))["ok"]
-        await asyncio.to_thread(there.output.close_door)
+        await asyncio.to_thread(there.output.close_interface)
         await there.send("8")
         assert there.output._arriving.unanswered == 0  # the broker keeps it: nobody listens
         there.output._arriving.arrive(cast("Message", Arrived(b"9")))  # what it had sent before that
@@ -412,7 +412,7 @@ async def test_a_stop_passes_while_commands_are_refused(broker: Broker) -> None:
         with pytest.raises(ValueError, match="may not be written"):
             await there.controller.write(2, 0.0)
         try:
-            await there.controller.node.request(there.controller.write_command(2, (0.0,)), stop=True)
+            await there.controller.node.request(there.controller._write_command(2, (0.0,)), stop=True)
         except BusError as error:
             pytest.fail(str(error))
 
@@ -431,7 +431,7 @@ def test_what_came_while_we_stood_still_is_as_old_as_the_standstill() -> None:
     """Whatever lies before it in the socket is read first, and a look at the clock may come in between."""
     clock = [10.0]
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
-    commands = Commands("line", Gate(bus), {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: clock[0])
+    commands = Commands("line", Authorisation(bus), {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: clock[0])
     commands.look(0)
     clock[0] = 15.0
     commands.look(2 * len("line/set/5/1" + "1") + 20)  # with acknowledgements of ours among it
@@ -448,7 +448,7 @@ def test_what_came_while_we_stood_still_is_as_old_as_the_standstill() -> None:
 def test_a_flood_does_not_make_what_comes_behind_it_look_old() -> None:
     clock = [0.0]
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
-    commands = Commands("line", Gate(bus), {}, lambda: clock[0])
+    commands = Commands("line", Authorisation(bus), {}, lambda: clock[0])
     size = len("line/set/5/1" + "0") + LEAST
     for step in range(500):
         clock[0] = step * 0.02
@@ -462,13 +462,13 @@ def test_a_flood_does_not_make_what_comes_behind_it_look_old() -> None:
 async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt_commands, "TOLD_EVERY", 0.01)
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
-    gate = Gate(bus)
+    authorisation = Authorisation(bus)
     said: asyncio.Queue[str] = asyncio.Queue()
-    commands = Commands("line", gate, {}, lambda: 0.0, said.put_nowait)
+    commands = Commands("line", authorisation, {}, lambda: 0.0, said.put_nowait)
     for _ in range(MOST_COMMANDS + 7):
         commands.arrive(cast("Message", Arrived(b"1")))
     answers: asyncio.Queue[object] = asyncio.Queue()
-    serving = asyncio.ensure_future(commands.serve(gate.write, gate.refuse, answers.put, lambda: 0))
+    serving = asyncio.ensure_future(commands.serve(authorisation.write, authorisation.refuse, answers.put, lambda: 0))
     try:
         assert await said.get() == "7 refused commands were neither answered nor put on record"
     finally:
@@ -479,7 +479,7 @@ async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.Mon
 @pytest.mark.asyncio
 async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> None:
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
-    commands = Commands("line", Gate(bus), {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: 0.0)
+    commands = Commands("line", Authorisation(bus), {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: 0.0)
     kept: list[tuple[Any, str]] = []
     under_way: list[Wish] = []
     for number in range(MOST_AT_ONCE + 2):
@@ -508,7 +508,7 @@ async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> N
 
 def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
-    commands = Commands("line", Gate(bus), {}, lambda: 0.0)
+    commands = Commands("line", Authorisation(bus), {}, lambda: 0.0)
     for _ in range(MOST_COMMANDS):
         commands.arrive(cast("Message", Arrived(b"1")))
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.snapshots import Snapshot
 from busmaster.errors import NoReply
-from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import retention, sqlite
 from busmaster.outputs.base import Happening
 from busmaster.outputs.retention import DAY, Retention
@@ -68,6 +68,55 @@ def test_values_events_and_errors_are_there_under_their_names(tmp_path: Path) ->
     assert query(path, "select node, text from events") == [("winder", "winder is down, was suspect")]
     [(moment,)] = query(path, "select max(time) from samples")
     assert abs(moment - time.time()) < PATIENCE
+
+
+OF_0_2 = """
+create table points (
+    id integer primary key, node text not null, item text not null, unit text not null, unique (node, item, unit)
+);
+create table samples (
+    time real not null, point integer not null references points (id), value, quality text not null, error text
+);
+create table events (time real not null, node text, text text not null);
+create table audit (
+    time real not null, door text not null, by text not null, user text not null, process integer not null,
+    point text not null, before, value, outcome text not null, error text, took real not null, id text
+);
+insert into points values (1, 'n', 'p', '');
+insert into samples values (5.0, 1, 7, 'good', null);
+insert into audit values (5.0, 'mqtt', 'topic', 'op', 17, 'n/p', null, 3, 'written', '', 0.01, '');
+pragma user_version = 1;
+"""
+
+
+def test_a_database_of_0_2_is_continued_with_all_that_it_holds(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(OF_0_2)
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+        output.offer(REFUSED)
+    assert query(path, "pragma user_version") == [(sqlite.VERSION,)]
+    assert query(path, "select interface, point, value, outcome from audit order by time desc") == [
+        ("mqtt", "n/p", 3, "written"),
+        ("mqtt", "x", 2, "refused"),
+    ]
+    assert query(path, "select count(*) from history") == [(2,)]
+
+
+def test_a_database_of_a_newer_version_is_left_alone_and_the_error_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(OF_0_2)
+        database.execute("pragma user_version = 99")
+        before = list(database.iterdump())
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+        until(lambda: "has the layout 99" in output.statistics().error)
+        assert "upgrade, or give another path" in output.statistics().error
+    with closing(sqlite3.connect(path)) as database:
+        assert list(database.iterdump()) == before
+    assert output.dropped == 1
 
 
 def test_it_goes_on_with_a_file_of_its_own_and_leaves_another_alone(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.gate.record import Outcome, WriteRecord
+from busmaster.authorisation.record import Outcome, WriteRecord
 from busmaster.outputs.base import Output
 from busmaster.outputs.files import JsonlOutput
 from busmaster.outputs.settings import FileSettings, SqliteSettings

@@ -1,4 +1,4 @@
-"""Does this schedule fit this line? What the planner says, reckoned by hand where that can be done."""
+"""Does this schedule fit this line? What the planner says, calculated by hand where that can be done."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_utilisation_is_line_time_over_period_summed_over_the_groups() -> None:
     assert prediction.advice == ()
 
 
-def test_an_unknown_reply_time_is_taken_as_half_the_nominal_one() -> None:
+def test_an_unknown_reply_time_is_taken_as_half_the_late_after_one() -> None:
     """HCP2: "normally within 50ms"."""
     unknown = planned(group("g", 1.0, 1, node=PlannedNode(hcp2.PROFILE, 1)))
     assert unknown.groups[0].line_time == pytest.approx(EXCHANGE - 0.002 + 0.025)
@@ -192,8 +192,8 @@ def test_merges_of_the_profile_need_no_asking() -> None:
 
 
 def test_r9_the_longest_hold_of_a_read() -> None:
-    """8 bytes; 150 ms lateness; a reply of at most 25 bytes that trickles in, 20 ms a byte; 20 ms of silence. Each of
-    these times is to a start bit, and the byte is received a byte time later."""
+    """8 bytes; 150 ms maximum reply delay; a reply of at most 25 bytes that trickles in, 20 ms a byte; 20 ms of
+    silence. Each of these times is to a start bit, and the byte is received a byte time later."""
     hold = longest_hold(hcp2.Read(1).open(1, hcp2.PROFILE.timings), TAU)
     assert hold == pytest.approx(8 * TAU + 0.150 + TAU + 25 * (0.020 + TAU) + 0.020 + TAU)
 
@@ -201,20 +201,20 @@ def test_r9_the_longest_hold_of_a_read() -> None:
 def test_r9_a_trickle_ends_where_the_line_counts_as_noisy() -> None:
     tau = msc.PROFILE.line.byte_time
     hold = longest_hold(msc.DataWrite(2000, 1).open(1, msc.PROFILE.timings), tau)
-    leg = 1.0 + tau + 248 * tau + 0.1
-    assert hold == pytest.approx(21 * tau + leg + (1.0 + 0.1 + tau) + 0.1 + tau)
+    step = 1.0 + tau + 248 * tau + 0.1
+    assert hold == pytest.approx(21 * tau + step + (1.0 + 0.1 + tau) + 0.1 + tau)
 
 
-def test_r9_each_leg_can_last_its_lateness() -> None:
-    """Late replies are delivered, and the next leg follows."""
+def test_r9_each_step_can_last_its_max_reply_delay() -> None:
+    """Late replies are delivered, and the next step follows."""
     tau = mentor.PROFILE.line.byte_time
     one, three = (longest_hold(mentor.ReadRun(1, 1, n).open(1, mentor.PROFILE.timings), tau) for n in (1, 3))
     size = 1 + 4 + 5 + 1 + 1
-    leg = 0.300 + tau + 0.050 + size * tau
-    assert three == pytest.approx(one + 2 * (leg + tau))
+    step = 0.300 + tau + 0.050 + size * tau
+    assert three == pytest.approx(one + 2 * (step + tau))
 
 
-def test_r9_the_receive_latency_of_an_adapter_counts_once_a_leg_and_in_every_silence() -> None:
+def test_r9_the_receive_latency_of_an_adapter_counts_once_a_step_and_in_every_silence() -> None:
     read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
     assert longest_hold(read, TAU, 0.016) == pytest.approx(longest_hold(read, TAU) + (1 + 25 + 1) * 0.016)
 
@@ -260,7 +260,7 @@ def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
 # what lost frames cost
 
 
-def test_what_lost_frames_cost_and_learning_would_spare_is_reckoned() -> None:
+def test_what_lost_frames_cost_and_learning_would_spare_is_calculated() -> None:
     """A line that is full: what it keeps of its rate is what the benchmark `lossy_line` measures, 58 and 94 to 95 %."""
     full = planned(group("g", 32 * EXCHANGE, 32))
     assert full.utilisation == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Frames for unit 17 as the Modbus specification writes them. Their CRC is reckoned apart from what is tested."""
+"""Frames for unit 17 as the Modbus specification writes them. Their CRC is calculated apart from what is tested."""
 
 from __future__ import annotations
 

@@ -121,11 +121,11 @@ def test_values_are_read_and_written_in_their_own_unit() -> None:
         await drive.write("1.21", -47.64, verify=True)  # one decimal is declared
         assert await drive.read("1.21") == -47.6
         await drive.point("1.22").write(12.5)
-        assert await drive.read_run("1.21", 2) == await drive.read_run("1.21", 2, chain=True) == (-47.6, 12.5)
+        assert await drive.read("1.21", 2) == await drive.read("1.21", 2, chain=True) == (-47.6, 12.5)
         for chain in (False, True):
-            assert await drive.read_run("1.22", 2, step=-1, chain=chain) == (12.5, -47.6)
+            assert await drive.read("1.22", 2, step=-1, chain=chain) == (12.5, -47.6)
         assert await drive.point("1.21:2").read() == (-47.6, 12.5)
-        assert await drive.read_item("1.21:2") == (-47.6, 12.5)
+        assert await drive._read_item("1.21:2") == (-47.6, 12.5)
         with pytest.raises(NoSuchParameter):
             await drive.read("17.23")
         with pytest.raises(Refused):

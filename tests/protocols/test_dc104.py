@@ -69,7 +69,9 @@ def test_any_reply_gives_its_value_one_byte_at_a_time_too(parameter: int, value:
 
 
 @given(PARAMETERS, PARAMETERS, VALUES)
-def test_a_reply_for_another_parameter_is_an_error_and_no_exemption_from_settling(a: int, b: int, value: int) -> None:
+def test_a_reply_for_another_parameter_is_an_error_and_no_exemption_from_resynchronising(
+    a: int, b: int, value: int
+) -> None:
     if a != b:
         with pytest.raises(FrameError, match="wrong echo") as error:
             Read(a).open(0, PROFILE.timings).feed(reply(b, value))

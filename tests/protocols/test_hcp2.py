@@ -176,7 +176,7 @@ def test_the_profile_is_the_designs_table() -> None:
     assert PROFILE.line.baudrate == 57600
     assert (PROFILE.addresses, PROFILE.broadcast, PROFILE.merge) == (range(256), None, None)
     read = PROFILE.timings.read
-    assert (read.nominal, read.window, read.lateness, read.byte_gap) == (0.05, 0.1, 0.15, 0.02)
+    assert (read.late_after, read.window, read.max_reply_delay, read.inter_byte_timeout) == (0.05, 0.1, 0.15, 0.02)
 
 
 @given(st.integers(0, 255), st.integers(1, 255), st.floats(-1e9, 1e9))

@@ -117,7 +117,7 @@ def test_a_bit_may_come_as_one_digit_or_two() -> None:
         assert answer(Read(4, 26).open(23, TIMINGS), reply("0426", text)) == 1
 
 
-def test_a_bad_bcc_of_a_whole_reply_needs_no_wait_for_stragglers() -> None:
+def test_a_bad_bcc_of_a_whole_reply_needs_no_wait_for_late_replies() -> None:
     with pytest.raises(FrameError) as failure:
         Read(1, 17).open(12, TIMINGS).feed(FRAMES["reply 01.17 = -0476"][:-1] + b"-")
     assert failure.value.whole
@@ -178,7 +178,7 @@ def test_a_write_to_all_waits_for_no_answer() -> None:
     assert not exchange.answered
     assert exchange.expired(False) == Done(None)
     assert exchange.feed(b"\x06") == Done(None, rest=b"\x06")
-    assert exchange.timing.turnaround == TIMINGS.write.nominal
+    assert exchange.timing.driver_release_time == TIMINGS.write.late_after
 
 
 def test_a_read_never_goes_to_all() -> None:
@@ -208,7 +208,7 @@ def test_a_run_asks_for_each_further_parameter_with_one_byte(step: int, short: b
 
 def test_20_parameters_in_a_run_take_at_most_65_percent_of_the_bytes_of_20_reads() -> None:
     run, single = ReadRun(1, 17, 20).open(12, TIMINGS), Read(1, 17).open(12, TIMINGS)
-    together = len(run.request) + run.sizes.typical + sum(leg.sent + leg.sizes.typical for leg in run.later)
+    together = len(run.request) + run.sizes.typical + sum(step.sent + step.sizes.typical for step in run.later)
     assert together <= 0.65 * 20 * (len(single.request) + single.sizes.typical)
 
 
@@ -369,7 +369,7 @@ def test_the_profile_is_the_designs_table() -> None:
     assert (PROFILE.line.baudrate, PROFILE.line.framing) == (9600, "7E1")
     assert (PROFILE.addresses, PROFILE.broadcast) == (range(1, 100), 0)
     read = PROFILE.timings.read
-    assert (read.nominal, read.window, read.lateness, read.byte_gap) == (0.05, 0.15, 0.3, 0.05)
+    assert (read.late_after, read.window, read.max_reply_delay, read.inter_byte_timeout) == (0.05, 0.15, 0.3, 0.05)
 
 
 @given(debris(*answers(17, 2)), st.sampled_from([Read(1, 17), Write(1, 17, 5)]))

@@ -37,17 +37,17 @@ def feed_in_chunks(exchange: PacketExchange[Any], data: bytes, chunk: int) -> No
         exchange.feed(data[start : start + chunk])
 
 
-def says(step: object) -> bytes:
-    assert isinstance(step, Expect)
-    return step.send
+def says(progress: object) -> bytes:
+    assert isinstance(progress, Expect)
+    return progress.send
 
 
 # as IB-11A002 has it
 
 
-def test_a_read_is_owed_an_ack_and_its_packet_and_once_it_is_acked_its_packet_alone() -> None:
-    assert reading().owed == (ACK, *reading().answers)
-    assert acked().owed == acked().answers
+def test_a_read_is_overdue_an_ack_and_its_packet_and_once_it_is_acked_its_packet_alone() -> None:
+    assert reading().overdue == (ACK, *reading().answers)
+    assert acked().overdue == acked().answers
 
 
 def test_a_read_is_an_ack_and_a_packet_that_the_host_acks() -> None:
@@ -62,8 +62,8 @@ def test_a_write_is_done_with_its_ack() -> None:
 
 def test_a_read_announces_its_packet_and_its_closing_ack() -> None:
     exchange = BlockRead(0).open(1, TIMINGS)
-    (leg,) = exchange.later
-    assert (leg.timing, leg.sizes.typical, leg.sent) == (TIMINGS.packet, 142, 0)
+    (step,) = exchange.later
+    assert (step.timing, step.sizes.typical, step.sent) == (TIMINGS.packet, 142, 0)
     assert (exchange.sizes.typical, exchange.closing) == (1, 1)
 
 
@@ -144,8 +144,8 @@ def test_a_cut_packet_is_naked_when_the_line_pauses() -> None:
 def test_a_reader_that_has_lost_count_says_nak_only_when_the_line_pauses(heard: bytes) -> None:
     for chunks in ([heard], [bytes((byte,)) for byte in heard[:-1]]):
         exchange = acked()
-        steps = [exchange.feed(chunk) for chunk in chunks]
-        if steps[-1] is MORE:
+        progresses = [exchange.feed(chunk) for chunk in chunks]
+        if progresses[-1] is MORE:
             assert says(exchange.expired(True)) == NAK
         assert exchange.feed(REPLY) == Done(1234, send=ACK)
 
@@ -319,7 +319,7 @@ def test_a_read_that_must_not_go_on_acks_the_bad_packet_away() -> None:
     assert (failure.whole, failure.send) == (True, ACK)
 
 
-def test_a_cut_or_stale_packet_is_acked_away_and_the_line_settles() -> None:
+def test_a_cut_or_stale_packet_is_acked_away_and_the_line_resynchronises() -> None:
     cut, stale = acked(), reading()
     cut.feed(REPLY[:9])
     cut.expired(True)
@@ -384,7 +384,7 @@ def test_the_ack_of_a_stale_packet_is_not_said_into_the_next_one() -> None:
 
 
 def test_a_stale_packet_with_noise_behind_it_is_acked_all_the_same() -> None:
-    with pytest.raises(FrameError, match="unasked") as error:
+    with pytest.raises(FrameError, match="unexpected") as error:
         StalePacketListener().feed(STALE + b"\xff")
     assert error.value.send == ACK
 
@@ -396,11 +396,11 @@ def test_a_damaged_stale_packet_is_acked_when_the_line_pauses() -> None:
         assert listener.expired() == Done(None, send=ACK)
 
 
-@pytest.mark.parametrize("unasked", [ACK, NAK, b"\x00" + STALE, b"\x02\xff" + bytes(300)])
-def test_what_is_no_stale_packet_is_not_answered(unasked: bytes) -> None:
+@pytest.mark.parametrize("unexpected", [ACK, NAK, b"\x00" + STALE, b"\x02\xff" + bytes(300)])
+def test_what_is_no_stale_packet_is_not_answered(unexpected: bytes) -> None:
     listener = StalePacketListener()
-    with pytest.raises(FrameError, match="unasked") as error:
-        listener.feed(unasked)
+    with pytest.raises(FrameError, match="unexpected") as error:
+        listener.feed(unexpected)
     assert error.value.send == b""
     assert listener.feed(STALE) == Done(None, send=ACK)
 
@@ -435,7 +435,7 @@ def test_what_never_becomes_a_packet_is_passed_over_a_few_times_and_no_more() ->
         exchange.expired(True)
 
 
-def test_a_bad_unit_byte_with_the_right_length_is_no_exemption_from_settling() -> None:
+def test_a_bad_unit_byte_with_the_right_length_is_no_exemption_from_resynchronising() -> None:
     heard = REPLY[:1] + b"\x03" + REPLY[2:]
     exchange = acked()
     for _ in range(5):

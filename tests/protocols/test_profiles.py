@@ -105,7 +105,7 @@ def test_replies_are_awaited_as_long_as_the_documents_say(profile: Profile, timi
     assert profile.timings == timings
 
 
-def test_msc_and_dc104_await_each_leg_in_its_own_time() -> None:
+def test_msc_and_dc104_await_each_step_in_its_own_time() -> None:
     first, packet = msc.PROFILE.timings.read, msc.PROFILE.timings.packet
     assert (first, packet) == (ReplyTiming(0.05, 0.5, 1.0, 0.1), ReplyTiming(0.5, 1.0, 1.0, 0.1))
     assert (msc.PROFILE.timings.write, msc.PROFILE.exchange_limit) == (first, 2.0)
@@ -114,7 +114,7 @@ def test_msc_and_dc104_await_each_leg_in_its_own_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ("profile", "probe", "checks"),
+    ("profile", "probe", "sync_reads"),
     [
         (hcp.PROFILE, hcp.Read(1), [hcp.Read(element) for element in CHECKED]),
         (hcp2.PROFILE, hcp2.Read(1), [hcp2.Read(element) for element in CHECKED]),
@@ -125,10 +125,10 @@ def test_msc_and_dc104_await_each_leg_in_its_own_time() -> None:
         (msc.PROFILE, msc.ReadStatus(), [msc.ReadStatus(), msc.ReadFlag(0)]),
     ],
 )
-def test_the_cheap_reads_are_those_that_every_node_has(profile: Profile, probe: Any, checks: Sequence[Any]) -> None:
+def test_the_sync_reads_are_those_that_every_node_has(profile: Profile, probe: Any, sync_reads: Sequence[Any]) -> None:
     assert profile.probe == probe
-    assert list(profile.checks) == checks
-    assert not any(command.writes for command in profile.checks)
+    assert list(profile.sync_reads) == sync_reads
+    assert not any(command.writes for command in profile.sync_reads)
 
 
 @pytest.mark.parametrize(

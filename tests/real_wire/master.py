@@ -20,9 +20,9 @@ from typing import Any
 from busmaster import Bus, BusError, SerialPort, TcpPort
 from busmaster.emulator.memory import MemoryPort
 from busmaster.transport.endpoints import Endpoint
-from tests.campaigns.kinds import elements_of
 from tests.real_wire.kinds import KINDS, Kind, make_line
 from tests.real_wire.slaves import tell
+from tests.verification.campaigns.kinds import elements_of
 
 READS, WRITES = 60, 20
 """How many of each in a row: all callers read at a time, and write at a time, so that answers are alike."""

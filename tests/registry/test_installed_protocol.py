@@ -99,7 +99,7 @@ def test_the_help_names_it_with_its_items_and_options(tally: None, busmaster: Co
     said = " ".join(busmaster("read", "--help").out.split())
     assert "tally" in said.partition("One of")[2]
     assert "tally a counter, a to z, or gate" in said.partition("ITEM, by protocol")[2]
-    assert "--gate N tally: which counter the gate has, 1 for a." in said
+    assert "--gate N tally: which counter gate has, 1 for a." in said
 
 
 def test_its_items_are_listed(tally: None, busmaster: Command) -> None:

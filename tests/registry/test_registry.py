@@ -63,7 +63,7 @@ def test_what_the_documents_say_of_items_is_what_the_handle_does(kind: NodeKind)
     names = [item.item for item in kind.documented]
     assert len(set(names)) == len(names)
     assert set(handle.items()) <= set(names)
-    assert set(handle.names_of_items().values()) <= set(names)
+    assert set(handle._names_of_items().values()) <= set(names)
 
 
 def test_every_protocol_goes_by_a_name_of_its_own() -> None:

@@ -37,7 +37,7 @@ UPGRADE = (
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
 )
 TEN_MEGABYTES = b"\x81\xff" + (10_000_000).to_bytes(8, "big") + bytes(4) + bytes(10_000_000)
-HELLO = b'{"jsonrpc":"2.0","id":0,"method":"hello","params":{"versions":[2]}}'
+HELLO = b'{"jsonrpc":"2.0","id":0,"method":"hello","params":{"versions":[3]}}'
 
 
 class WatchedLine(Line):
@@ -124,7 +124,7 @@ async def _visits(owner: Owner, count: int, chance: random.Random) -> None:
             try:
                 await _visit(owner.address.removeprefix("unix:"), chance)
             except (ConnectionError, asyncio.IncompleteReadError):
-                pass  # it was shown the door
+                pass  # it was shown the interface
 
     await asyncio.gather(*(come() for _ in range(AT_ONCE)))
 

@@ -16,9 +16,9 @@ from typing import Any
 
 from benchmarks.watch import Watch, watched
 from busmaster import Bus, SerialPort, Service
+from busmaster.authorisation.authorisation import Authorisation
+from busmaster.authorisation.record import WriteRecord
 from busmaster.bus.points import Point
-from busmaster.gate.gate import Gate
-from busmaster.gate.record import WriteRecord
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters
 from tests.service.writing import UNIT, say
 
@@ -29,9 +29,9 @@ POINTS = 5
 async def own(watch: Watch) -> int:
     port, path = sys.argv[1:]
     async with Bus(SerialPort(port, baudrate=57600, paced=False)) as bus:
-        gate, records = Gate(bus), list[WriteRecord]()
-        gate.record = records.append
-        async with Service(bus, gate=gate, path=path) as service:
+        authorisation, records = Authorisation(bus), list[WriteRecord]()
+        authorisation.record = records.append
+        async with Service(bus, authorisation=authorisation, path=path) as service:
             node = bus.node(PROFILE, UNIT)
             points: list[Point[Any]] = [Point(node, str(number), ReadRegisters(number, 1)) for number in range(POINTS)]
             group = bus.poll_group("registers", period=PERIOD, points=points)

@@ -18,8 +18,8 @@ HELLO = 0
 @pytest.fixture(autouse=True)
 def _unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may take longer over a write than that is fresh: a test that asks for just this says its age."""
-    for door in ("busmaster.service.errands", "busmaster.gate.gate"):
-        monkeypatch.setattr(f"{door}.FRESH", PATIENCE)
+    for interface in ("busmaster.service.errands", "busmaster.authorisation.authorisation"):
+        monkeypatch.setattr(f"{interface}.FRESH", PATIENCE)
     monkeypatch.setattr("busmaster.service.remote_overview.SOON", PATIENCE)
 
 

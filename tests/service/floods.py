@@ -64,7 +64,7 @@ def frame(data: bytes, *, compressed: bool = False) -> bytes:
     return first + b"\xff" + len(data).to_bytes(8, "big") + bytes(4) + data
 
 
-HELLO = frame(b'{"jsonrpc":"2.0","id":0,"method":"hello","params":{"versions":[2]}}')
+HELLO = frame(b'{"jsonrpc":"2.0","id":0,"method":"hello","params":{"versions":[3]}}')
 
 
 def bomb() -> bytes:

@@ -13,11 +13,11 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection, unix_connect
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, MicroFlexDrive, RemoteBus, Service, connect
+from busmaster.authorisation.authorisation import Authorisation
+from busmaster.authorisation.permission import Access
+from busmaster.authorisation.record import WriteRecord
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
-from busmaster.gate.gate import Gate
-from busmaster.gate.permission import Access
-from busmaster.gate.record import WriteRecord
 from busmaster.registry import make_device
 from busmaster.service.messages import read, written
 from tests.patience import PATIENCE
@@ -34,7 +34,7 @@ class Served:
 
     bus: Bus
     service: Service
-    gate: Gate
+    authorisation: Authorisation
     records: list[WriteRecord]
 
     @property
@@ -80,10 +80,10 @@ async def served(
 ) -> AsyncIterator[Served]:
     devices = [make_device("hcp2", 5), make_device("hcp2", 6), make_device("microflex", 7)]
     async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, devices, paced=False))) as bus:
-        gate, records = Gate(bus, read_only=read_only, access=access), list[WriteRecord]()
-        gate.record = records.append
-        async with Service(bus, gate=gate, path=folder / "line.sock", listen=listen) as service:
-            yield Served(bus, service, gate, records)
+        authorisation, records = Authorisation(bus, read_only=read_only, access=access), list[WriteRecord]()
+        authorisation.record = records.append
+        async with Service(bus, authorisation=authorisation, path=folder / "line.sock", listen=listen) as service:
+            yield Served(bus, service, authorisation, records)
 
 
 def on_a_served_line(
@@ -135,7 +135,7 @@ async def raw(line: Served, *, hello: bool = True, **options: Any) -> AsyncItera
     async with unix_connect(path, **options) as connection:
         client = Raw(connection)
         if hello:
-            assert (await client.ask("hello", versions=[2]))["result"]["version"] == 2
+            assert (await client.ask("hello", versions=[3]))["result"]["version"] == 3
         yield client
 
 

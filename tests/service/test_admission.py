@@ -13,11 +13,11 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from busmaster import Hcp2Controller, bounds, connect
+from busmaster.authorisation.permission import Access, Permission, digest_of
+from busmaster.authorisation.refusals import LimitedReport, Refusals
+from busmaster.authorisation.rights import RIGHTS, Role
 from busmaster.errors import LineDown
-from busmaster.gate.permission import Access, Permission, digest_of
-from busmaster.gate.refusals import LimitedReport, Refusals
-from busmaster.gate.rights import RIGHTS, Role
-from busmaster.service.admission import stranger_to_close
+from busmaster.service.admission import ConnectionRate, connecting_peer, stranger_to_close
 from busmaster.service.visit import Visit
 from busmaster.testing import run_in_virtual_time
 from tests.patience import PATIENCE
@@ -122,12 +122,12 @@ def test_one_that_only_sends_the_safe_state_is_admitted_when_all_places_are_take
             {"method": "hold", "params": {"sequence": 1, "protocol": "hcp2", "address": 5, "max_hold": 1.0}},
         ):
             async with raw(line, hello=False) as client:
-                assert "result" in await client.ask("hello", versions=[2], safe_only=True)
+                assert "result" in await client.ask("hello", versions=[3], safe_only=True)
                 await client.say(**said, **({} if said["method"] == "hold" else {"id": 2}))  # as a plain read is said
                 assert "can send the safe state, and nothing else" in (await client.hear())["error"]["message"]
         async with raw(line, hello=False) as client:
-            await client.ask("hello", versions=[2], safe_only=True)
-            # It comes as far as the gate, which knows no safe state of this line.
+            await client.ask("hello", versions=[3], safe_only=True)
+            # It comes as far as authorisation, which knows no safe state of this line.
             assert "knows no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
 
     among(tmp_path, story)
@@ -142,7 +142,7 @@ def test_of_idle_programs_in_the_places_for_the_safe_state_the_oldest_goes(tmp_p
             clients = []
             for _ in range(bounds.RESERVED_FOR_SAFE + 1):
                 clients.append(await stack.enter_async_context(raw(line, hello=False)))
-                await clients[-1].ask("hello", versions=[2], safe_only=True)
+                await clients[-1].ask("hello", versions=[3], safe_only=True)
             with pytest.raises(ConnectionClosed):
                 await clients[0].hear()
             for client in clients[1:]:
@@ -167,7 +167,7 @@ def test_refused_programs_are_counted_and_reported_at_most_once_a_minute(tmp_pat
         crowd.line.service.tell = told.append
         for _ in range(3):
             await crowd.fill(Role.READ)
-        assert crowd.line.gate.refusals.connections == {"read": 3}
+        assert crowd.line.authorisation.refusals.connections == {"read": 3}
         assert [text.partition(":")[0] for text in told] == ["1 connection was refused, because no place was free"]
         assert [text for _, text in crowd.line.service.line.journal.entries if "refused" in text] == told
         async with connect(crowd.line.address) as own:
@@ -218,8 +218,8 @@ def test_who_opens_many_connections_and_says_nothing_closes_its_own(tmp_path: Pa
         assert service.tcp_address is not None
         host, _, port = service.tcp_address.removeprefix("tcp://").rpartition(":")
         own = await asyncio.open_unix_connection(path)
-        many = [await asyncio.open_connection(host, int(port)) for _ in range(3 * bounds.MOST_STRANGERS)]
-        await until(lambda: service.refused == 2 * bounds.MOST_STRANGERS + 1)
+        many = [await asyncio.open_connection(host, int(port)) for _ in range(bounds.FREE_CONNECTIONS)]
+        await until(lambda: service.refused == bounds.FREE_CONNECTIONS - bounds.MOST_STRANGERS + 1)
         assert service.strangers == bounds.MOST_STRANGERS
         assert os.getuid() in {visit.connection.origin for visit in service._strangers}
         own[1].write(b"x\r\n\r\n")  # it is still heard
@@ -240,3 +240,88 @@ def test_of_strangers_the_oldest_of_the_crowd_is_closed_once_there_are_too_many(
     assert stranger_to_close([one, *crowd]) is None
     last = stranger("another")
     assert stranger_to_close([one, *crowd, last]) is crowd[0]
+
+
+# programs that connect again and again
+
+
+def test_a_peer_that_connects_too_fast_waits_and_then_is_refused_and_others_are_not() -> None:
+    now = 100.0
+    rate = ConnectionRate(lambda: now)
+    delays = [rate.delay("hostile") for _ in range(1000)]
+    free, most = bounds.FREE_CONNECTIONS, bounds.FREE_CONNECTIONS + bounds.MOST_DELAYED
+    assert delays[:free] == [0.0] * free
+    waits = [delay or 0.0 for delay in delays[free:most]]
+    assert waits == pytest.approx([(one + 1) / bounds.CONNECTIONS_A_SECOND for one in range(bounds.MOST_DELAYED)])
+    assert delays[most:] == [None] * (1000 - most)
+    assert rate.delay("another") == 0.0
+    now += 1.0  # what was refused is not held against it
+    again = [rate.delay("hostile") for _ in range(100)]
+    assert sum(delay is not None for delay in again) == bounds.CONNECTIONS_A_SECOND
+    now += 1000.0
+    assert [rate.delay("hostile") for _ in range(free + 1)] == [*[0.0] * free, pytest.approx(0.05)]
+
+
+def test_programs_that_connect_as_they_should_never_wait() -> None:
+    """Ten programs of one machine that try twice a second while the owner is away, and pages with some connections."""
+    now = 100.0
+    rate = ConnectionRate(lambda: now)
+    for _ in range(600):
+        assert [rate.delay("plant") for _ in range(10)] == [0.0] * 10
+        now += 0.5
+    assert [rate.delay("plant") for _ in range(100)] == [0.0] * 100
+
+
+def test_peers_whose_connections_are_counted_are_bounded() -> None:
+    rate = ConnectionRate(lambda: 100.0)
+    for number in range(2 * bounds.MOST_CONNECTING_PEERS):
+        rate.delay(number)
+    assert len(rate._used_until) == bounds.MOST_CONNECTING_PEERS
+    assert next(iter(rate._used_until)) == bounds.MOST_CONNECTING_PEERS
+
+
+def test_each_process_of_the_owners_user_stands_for_itself_and_those_of_another_do_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: 1000)
+    for user in (0, 1000):
+        assert connecting_peer(user, 1) != connecting_peer(user, 2)
+    assert connecting_peer(1001, 1) == connecting_peer(1001, 2)
+    assert connecting_peer("192.0.2.1", 0) != connecting_peer("192.0.2.2", 0)
+
+
+def test_of_a_crowd_that_connects_at_once_some_wait_and_the_rest_is_closed_and_reported(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        told: list[str] = []
+        service = crowd.line.service
+        service.tell = told.append
+        assert service.tcp_address is not None
+        host, _, port = service.tcp_address.removeprefix("tcp://").rpartition(":")
+        for _ in range(bounds.FREE_CONNECTIONS):
+            service.delay("127.0.0.1", 0)
+        came = [await asyncio.open_connection(host, int(port)) for _ in range(bounds.MOST_DELAYED + 8)]
+        for _, writer in came:
+            writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        refusals = crowd.line.authorisation.refusals
+        await until(lambda: refusals.connections["unknown"] > 0)
+        answers = await asyncio.gather(*(reader.read() for reader, _ in came), return_exceptions=True)
+        served = sum(isinstance(answer, bytes) and answer.startswith(b"HTTP/1.1 4") for answer in answers)
+        assert served >= bounds.MOST_DELAYED
+        assert served + refusals.connections["unknown"] == len(came)
+        assert told[0].startswith("1 connection was refused, because the program connects again and again: 1 from 127")
+        for _, writer in came:
+            writer.close()
+        async with connect(crowd.line.address) as own:
+            assert own.about["refused_connections"] == refusals.connections["unknown"]
+
+    among(tmp_path, story)
+
+
+def test_a_program_that_has_to_wait_is_let_in_all_the_same(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        for _ in range(bounds.FREE_CONNECTIONS + 2):
+            crowd.line.service.delay("127.0.0.1", 0)
+        await crowd.come(Role.READ)
+        await crowd.come(Role.WRITE)
+
+    among(tmp_path, story)

@@ -31,6 +31,9 @@ class Ear:
         self.is_open = False
         self.is_over = False
 
+    def delay(self, origin: object, process: int) -> float:
+        return 0.0
+
     def refusal(self, _: object) -> None:
         return None
 

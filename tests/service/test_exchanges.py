@@ -24,7 +24,7 @@ def attempt() -> Attempt:
 
 
 def tapped(line: Served) -> bool:
-    return line.bus.pump.tap is not None
+    return line.bus._pump.tap is not None
 
 
 class Told(NamedTuple):
@@ -43,7 +43,7 @@ class Told(NamedTuple):
     verdict: str
     result: str
     late: bool
-    settled: int
+    quiet_time: int
 
     @property
     def begun(self) -> int:
@@ -91,7 +91,9 @@ def test_each_exchange_is_told_with_what_was_said_and_what_came_of_it(tmp_path: 
     on_a_served_line(tmp_path, story)
 
 
-def test_attempts_at_a_node_that_does_not_answer_are_told_and_the_line_settles_between_them(tmp_path: Path) -> None:
+def test_attempts_at_a_node_that_does_not_answer_are_told_and_the_line_resynchronises_between_them(
+    tmp_path: Path,
+) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         heard = Heard()
         await remote.exchanges(heard)
@@ -103,7 +105,7 @@ def test_attempts_at_a_node_that_does_not_answer_are_told_and_the_line_settles_b
         first, second, *_ = told = heard.exchanges
         assert [(one.attempt, one.verdict) for one in told] == [(n + 1, "no reply") for n in range(len(told))]
         assert {one.request for one in told} == {first.request}
-        assert 0 < second.settled - first.settled <= second.begun - first.ended + 10_000
+        assert 0 < second.quiet_time - first.quiet_time <= second.begun - first.ended + 10_000
 
     on_a_served_line(tmp_path, story)
 
@@ -133,7 +135,7 @@ def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
         listener.received(1.5 + number, b"x" * MOST_BYTES, None)
     [_, passage], _ = listener.take()
     told = json.loads(json.dumps(said_passage(passage)))
-    check("unasked", told)
+    check("unexpected", told)
     assert told == [[[1_500_000, "node", b"x".hex() * MOST_BYTES]], 3 * MOST_BYTES]
     assert listener.take() == ([], 0)
 

@@ -12,8 +12,8 @@ import pytest
 from busmaster import Hcp2Controller, Priority, RemoteBus, Service, connect
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.clients import Hold, LineClient
+from busmaster.arbiter.shared_backlog import PASSED_BY_EACH
 from busmaster.arbiter.transaction import Transaction
-from busmaster.arbiter.turns import PASSED_BY_EACH
 from busmaster.bounds import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -25,7 +25,7 @@ MANY = MOST_REQUESTS + MOST_REQUESTS // 2
 def watched(line: Served) -> list[Transaction]:
     """What is asked on the line from now on, in its order."""
     asked: list[Transaction] = []
-    arbiter = line.bus.shared.arbiter
+    arbiter = line.bus._line.arbiter
     submit = arbiter.submit
 
     def watch(transaction: Transaction, now: float) -> bool:
@@ -241,14 +241,14 @@ def test_a_program_holds_the_line_for_so_many_sequences_and_none_that_cannot_be(
 
 def test_programs_that_have_gone_leave_nothing_on_the_line(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
-        before = line.bus.shared.clients
+        before = line.bus._line.clients
         for _ in range(5):
             async with connect(line.address) as other:
                 async with Hcp2Controller(other, 5).exclusive() as held:
                     await held.read(1)
                 await Hcp2Controller(other, 5).read(2, priority=Priority.POLL)
-            await until(lambda: line.bus.shared.clients == before)
-        backlog = line.bus.shared.arbiter.dispatcher.share()
+            await until(lambda: line.bus._line.clients == before)
+        backlog = line.bus._line.arbiter.dispatcher.share()
         assert all(len(turns._turns) <= 2 for turns in backlog._turns)
 
     on_a_served_line(tmp_path, story)

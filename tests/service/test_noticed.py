@@ -13,10 +13,10 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, Service, connect
+from busmaster.authorisation.permission import Access, Permission
+from busmaster.authorisation.rights import Role
 from busmaster.emulator.line import Line
 from busmaster.errors import LineDown, NoReply, WriteUnconfirmed
-from busmaster.gate.permission import Access, Permission
-from busmaster.gate.rights import Role
 from busmaster.registry import make_device
 from tests.patience import PATIENCE
 from tests.service.lines import Served, on_a_line, served, until
@@ -177,7 +177,7 @@ def test_who_came_by_tcp_without_a_token_goes_when_tokens_are_introduced(tmp_pat
             remote = connect(address)
             await remote.__aenter__()
             assert await Hcp2Controller(remote, 5).read(1) == 0
-            line.gate.take_secrets({"web": hashlib.sha256(b"secret").digest()})
+            line.authorisation.take_secrets({"web": hashlib.sha256(b"secret").digest()})
             await line.alone()
             with pytest.raises((LineDown, ConnectionClosed)):
                 await Hcp2Controller(remote, 5).read(1)

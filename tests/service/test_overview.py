@@ -13,6 +13,8 @@ import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, connect
 from busmaster.arbiter.health import Health
+from busmaster.authorisation.permission import Access, Permission
+from busmaster.authorisation.rights import Role
 from busmaster.bounds import LONGEST_SUSPENSION
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
@@ -20,8 +22,6 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.emulator.line import Line
 from busmaster.errors import BusError, InvalidCommand, LineDown
-from busmaster.gate.permission import Access, Permission
-from busmaster.gate.rights import Role
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.service import overview
@@ -159,7 +159,7 @@ def test_a_pause_and_a_suspension_are_for_all_and_say_whose_wish_they_were(tmp_p
     on_a_watched_line(tmp_path, story)
 
 
-def test_a_value_is_written_through_the_gate_under_the_owners_limits(tmp_path: Path) -> None:
+def test_a_value_is_written_through_the_authorisation_under_the_owners_limits(tmp_path: Path) -> None:
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
         Hcp2Controller(line.bus, 5).point("outputs").limit(maximum=7)
         await view.write("axes", "5/outputs", 5)
@@ -191,12 +191,12 @@ def test_a_read_only_line_says_so_and_writes_nothing(tmp_path: Path) -> None:
 
 def test_who_may_only_read_looks_and_neither_pauses_nor_suspends_nor_writes(tmp_path: Path) -> None:
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
-        line.gate.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
+        line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
         for wish in (view.pause("axes", True), view.suspend("hcp2", 5, 60.0), view.write("axes", "5/outputs", 5)):
             with pytest.raises(InvalidCommand, match="user me may"):
                 await wish
         await view.demand("axes")
-        line.gate.access = Access(users={os.getuid(): Permission("user me", Role.WRITE, {("hcp2", 6): None})})
+        line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.WRITE, {("hcp2", 6): None})})
         with pytest.raises(InvalidCommand, match="user me may not have this rest"):
             await view.pause("axes", True)
         await view.suspend("hcp2", 6, 60.0)

@@ -57,7 +57,7 @@ OTHERS = (
     numbered(WORDS.replace('"hcp2"', '"profibus"'), 3),
     numbered(WORDS.replace('"element":1', '"element":1000'), 3),
     numbered(WORDS.replace('"params"', '"more":{},"params"'), 3),
-    numbered(WORDS.replace('"address":5', '"address":5,"asked":1.5'), 3),
+    numbered(WORDS.replace('"address":5', '"address":5,"requested":1.5'), 3),
     numbered(WORDS.replace('"read","element":1', '"write","element":1,"values":[7.0]'), 3),
     numbered(f'{WORDS[:-1]},"options":{{"retries":0}}}}', 3),
     numbered(f"{WORDS[:-2]}{' ' * SHORT}}}}}", 3),
@@ -119,7 +119,7 @@ def test_a_program_says_a_plain_read_in_the_same_words_each_time(
         assert asked == [numbered(WORDS, first), numbered(WORDS, first + 1)]
         del said[:]
         await node.request(READ, finish_within=5.0)
-        assert "asked" in json.loads(said[0])["params"]  # what it takes to come is a part of its time
+        assert "requested" in json.loads(said[0])["params"]  # what it takes to come is a part of its time
 
     on_a_served_line(tmp_path, story)
 

@@ -20,7 +20,7 @@ def test_only_what_is_not_the_protocols_is_sent() -> None:
     said = said_sync_reads(microflex.PROFILE)
     assert said["probe"] == {"command": "read", "element": 109}
     found = profile_of(HCP2, said["probe"], said["sync_reads"])
-    assert (found.probe, found.checks) == (microflex.PROFILE.probe, microflex.PROFILE.checks)
+    assert (found.probe, found.sync_reads) == (microflex.PROFILE.probe, microflex.PROFILE.sync_reads)
     assert profile_of(HCP2, None, None) is hcp2.PROFILE
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
+from busmaster.authorisation.authorisation import FRESH
 from busmaster.errors import BacklogFull
-from busmaster.gate.gate import FRESH
 from busmaster.service.messages import BUS_ERROR, INVALID_PARAMS
 from tests.patience import PATIENCE
 from tests.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw
@@ -83,7 +83,7 @@ def test_what_a_request_took_to_come_is_taken_off_its_times(
     async def story(line: Served) -> None:
         async with raw(line) as client, busy(line):
             asked = line.bus.now() - PATIENCE / 2
-            said = await client.ask("request", **request_, asked=asked, options={name: PATIENCE / 2 - FRESH})
+            said = await client.ask("request", **request_, requested=asked, options={name: PATIENCE / 2 - FRESH})
             assert error_of(said) == "NotStarted"
 
     on_a_line(tmp_path, story)
@@ -94,7 +94,7 @@ def test_a_request_of_the_future_has_no_more_time_than_one_of_now(request_: dict
     async def story(line: Served) -> None:
         async with raw(line) as client, busy(line):
             said = await client.ask(
-                "request", **request_, asked=line.bus.now() + PATIENCE, options={"finish_within": 0.01}
+                "request", **request_, requested=line.bus.now() + PATIENCE, options={"finish_within": 0.01}
             )
             assert error_of(said) == "NotStarted"
 

@@ -11,15 +11,15 @@ from typing import Any
 import pytest
 
 from busmaster import Hcp2Controller, MemoryPort, RemoteBus, Service, connect
+from busmaster.authorisation.authorisation import SafeWrites
+from busmaster.authorisation.permission import Access, Permission
+from busmaster.authorisation.record import WriteRecord
+from busmaster.authorisation.rights import Role
 from busmaster.config import ConfiguredLine
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, NoReply, Superseded, WriteUnconfirmed
-from busmaster.gate.gate import SafeWrites
-from busmaster.gate.permission import Access, Permission
-from busmaster.gate.record import WriteRecord
-from busmaster.gate.rights import Role
 from busmaster.registry import make_device
 from busmaster.service.safe import SafeWishes
 from tests.patience import PATIENCE
@@ -51,11 +51,11 @@ def on_a_line(folder: Path, text: str, story: Story) -> None:
         port = MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False))
         line = ConfiguredLine(read(Source("line.toml", text)), port=port, outputs=False)
         records: list[WriteRecord] = []
-        line.gate.record = records.append
+        line.authorisation.record = records.append
         async with (
             asyncio.timeout(PATIENCE),
             line,
-            Service(line.bus, gate=line.gate, path=folder / "line.sock") as service,
+            Service(line.bus, authorisation=line.authorisation, path=folder / "line.sock") as service,
             connect(service.address) as remote,
         ):
             await story(line, service, remote, records)
@@ -78,8 +78,8 @@ def test_it_passes_limits_ends_what_waited_and_leaves_the_line_open(tmp_path: Pa
             await absent
         assert await controller.read(10) == 0
         await controller.write(10, 200)
-        assert [(one.door, one.value) for one in records if one.door == "safe"] == [("safe", 0)]
-        assert "process" in next(one.by for one in records if one.door == "safe")
+        assert [(one.interface, one.value) for one in records if one.interface == "safe"] == [("safe", 0)]
+        assert "process" in next(one.by for one in records if one.interface == "safe")
 
     on_a_line(tmp_path, TEXT + SAFE, story)
 
@@ -89,7 +89,7 @@ def test_what_was_decided_before_does_not_undo_it(tmp_path: Path) -> None:
         controller = Hcp2Controller(remote, 5)
         before = controller.node.stops
         await remote.enter_safe_state({"winder/speed": 0})
-        command = controller.write_command(10, (400.0,))
+        command = controller._write_command(10, (400.0,))
         with pytest.raises(Superseded):
             await controller.node.request(command, stops_seen=before)
 
@@ -152,11 +152,11 @@ def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -
             (Permission("user me", Role.READ), "user me may read this line"),
             (Permission("user me", Role.WRITE, {("hcp2", 9): None}), "user me may not write this"),
         ):
-            line.gate.access = Access(users={os.getuid(): permission})
+            line.authorisation.access = Access(users={os.getuid(): permission})
             with pytest.raises(InvalidCommand, match=complaint):
                 await remote.enter_safe_state({"winder/speed": 0})
-        line.gate.access = Access()
-        line.gate.read_only = True
+        line.authorisation.access = Access()
+        line.authorisation.read_only = True
         with pytest.raises(InvalidCommand, match="this line is read-only"):
             await remote.enter_safe_state({"winder/speed": 0})
         assert records == []

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
+from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError, LaterStep, Need, Sizes, no_reply
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Device
@@ -35,7 +35,7 @@ class Asking:
     """One attempt: the unit and function are echoed, an exception is three bytes, everything ends in a CRC."""
 
     sizes = Sizes(7, 7)
-    later: Sequence[LaterLeg] = ()
+    later: Sequence[LaterStep] = ()
     closing = 0
     answered = True
 
@@ -51,7 +51,7 @@ class Asking:
         return self.request[:2] + b"\x02"
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         return self.answers
 
     def size(self) -> int:
@@ -156,7 +156,7 @@ MODBUS = Profile(
     line=LineSettings(19200, parity="E"),
     timings=Timings.uniform(ReplyTiming(0.05, 0.1, 0.2, 0.02)),
     probe=ReadRegister(0),
-    checks=(ReadRegister(0),),
+    sync_reads=(ReadRegister(0),),
 )
 REPLY = bytes.fromhex("11 03 02 02 2b 38 f8")
 OTHER_UNIT = checked(0x12, READ, 2, 2, 0x2B)

@@ -53,14 +53,14 @@ class SilentAboutItsAnswers(Asking):
         self.answers = ()
 
 
-class OwedNothingOfTheKind(Asking):
+class NoneOverdue(Asking):
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         return (b"\x11\x04",)
 
 
 class AnsweredWhole(Asking):
-    """As if the value told one answer from another: what is owed by register 9 could be register 7's."""
+    """As if the value told one answer from another: what is overdue by register 9 could be register 7's."""
 
     def header(self) -> bytes:
         return REPLY if self.request[3] == 7 else checked(17, 3, 2, 0, 0)
@@ -72,9 +72,9 @@ class AnsweredWhole(Asking):
         (AnsweredByAList, "answers is a tuple of what its replies begin with, not \\["),
         (AnsweredByAnything, r"answers is a tuple .* not \(b'',\)"),
         (AnsweredBySomethingElse, "the good reply 11 03 .* begins with none of its answers 11 04"),
-        (AnsweredByTwo, "no leg of its good reply begins with its answer 11 04"),
+        (AnsweredByTwo, "no step of its good reply begins with its answer 11 04"),
         (SilentAboutItsAnswers, "is answered, and does not say by what"),
-        (OwedNothingOfTheKind, "11 03 02 02 2b 38 f8 may come and is not owed: 11 04"),
+        (NoneOverdue, "11 03 02 02 2b 38 f8 may come and is not overdue: 11 04"),
     ],
 )
 def test_what_a_reader_says_wrongly_of_its_answers_is_found(exchange: type[Asking], finding: str) -> None:
@@ -84,7 +84,7 @@ def test_what_a_reader_says_wrongly_of_its_answers_is_found(exchange: type[Askin
 def test_commands_whose_replies_could_be_exchanged_and_that_share_no_answer_are_found() -> None:
     zero = checked(17, 3, 2, 0, 0)
     other = Case(ReadRegister(9, AnsweredWhole), 17, [zero], 0)
-    assert "has the answers 11 03 02 02 2b 38 f8, and none that is owed by another: 11 03 02 00 00" in find(
+    assert "has the answers 11 03 02 02 2b 38 f8, and none that is overdue by another: 11 03 02 00 00" in find(
         reading_with(AnsweredWhole), other
     )
 
@@ -101,6 +101,6 @@ def test_a_broadcast_that_says_by_what_it_is_answered_is_found() -> None:
 
 
 def test_checks_that_write_or_prove_nothing_are_found() -> None:
-    assert "the check WriteRegister" in find(profile=replace(MODBUS, checks=(WriteRegister(0, 0),)))
-    alike = replace(MODBUS, checks=(ReadRegister(0), ReadRegister(1)))
+    assert "the check WriteRegister" in find(profile=replace(MODBUS, sync_reads=(WriteRegister(0, 0),)))
+    alike = replace(MODBUS, sync_reads=(ReadRegister(0), ReadRegister(1)))
     assert "have answers that begin alike: 01 03 02" in find(profile=alike)

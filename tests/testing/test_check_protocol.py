@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
+from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterStep, Need, Sizes, no_reply
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import Refused
@@ -46,7 +46,7 @@ def test_a_sixth_protocol_passes() -> None:
         device=answers_of(Registers(17)),
     )
     assert tally["round trips"] == 4
-    assert tally["flips"] == 8 * sum(len(case.legs[0]) for case in CASES)
+    assert tally["flips"] == 8 * sum(len(case.steps[0]) for case in CASES)
     assert min(tally[kind] for kind in ("cases", "splits", "truncations", "foreign", "garbage")) >= len(CASES)
 
 
@@ -84,8 +84,8 @@ class ReadingOnlyWholeChunks(Asking):
 
 class TakingTheRest(Asking):
     def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
-        step = super().feed(data)
-        return Done(step.value) if isinstance(step, Done) else step
+        progress = super().feed(data)
+        return Done(progress.value) if isinstance(progress, Done) else progress
 
 
 class ContentWithLess(Asking):
@@ -140,12 +140,12 @@ class SizedBackwards(Asking):
 
 class ClosingWithMoreThanItSays(Asking):
     def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
-        step = super().feed(data)
-        return Done(step.value, send=b"\x06", rest=step.rest) if isinstance(step, Done) else step
+        progress = super().feed(data)
+        return Done(progress.value, send=b"\x06", rest=progress.rest) if isinstance(progress, Done) else progress
 
 
 class WithALegTooMany(Asking):
-    later = (LaterLeg(MODBUS.timings.packet, Sizes(1, 1)),)
+    later = (LaterStep(MODBUS.timings.packet, Sizes(1, 1)),)
 
 
 class Unanswered(Asking):
@@ -179,10 +179,10 @@ class NumberingItsRequests(Asking):
         (TurningForEver, "Endless"),
         (SearchingForItsUnit, "00, which is not in starts, and then the reply gives the value 555"),
         (BeginningElsewhere, "its reply begins with 11, which is not in starts"),
-        (SmallerThanItSays, "a leg of 7 bytes is longer than the 5 announced"),
+        (SmallerThanItSays, "a step of 7 bytes is longer than the 5 announced"),
         (SizedBackwards, "typically 9 and at most 8 bytes"),
         (ClosingWithMoreThanItSays, "closes with 1 bytes, not with the 0 announced"),
-        (WithALegTooMany, "1 legs in place of the 2 announced"),
+        (WithALegTooMany, "1 steps in place of the 2 announced"),
         (Unanswered, "a read that is not answered"),
         (WithATimingOfItsOwn, "does not take the read or write timing"),
         (NumberingItsRequests, "sends .*, and then"),
@@ -196,7 +196,7 @@ def test_a_refusal_of_the_wrong_kind_and_a_wrong_value_are_found() -> None:
     class Special(Refused):
         """What a device says that knows more."""
 
-    wrong = [replace(CASES[-1], raises=Special), replace(READING, value=554), replace(READING, legs=[REPLY[:-1]])]
+    wrong = [replace(CASES[-1], raises=Special), replace(READING, value=554), replace(READING, steps=[REPLY[:-1]])]
     findings = find(*wrong, replace(READING, request=b"\x11"))
     assert re.search(r"gives Refused\(.exception 2.*\) in place of Special", findings)
     assert "gives the value 555 in place of 554" in findings

@@ -92,8 +92,8 @@ def test_r3_a_late_reply_that_lies_unread_is_never_taken_for_the_next_one(run: R
             came = bus.state is LineState.EXCHANGE
             time.sleep(0.005)  # the timer is due first
             node.may_answer.set()
-            readable(bus.pump._transport._fd)  # type: ignore[union-attr]  # it is open, and a PortTransport
-            time.sleep(0.3)  # beyond window and lateness
+            readable(bus._pump._transport._fd)  # type: ignore[union-attr]  # it is open, and a PortTransport
+            time.sleep(0.3)  # beyond window and maximum reply delay
             order.notes.clear()
 
         async with Bus(SerialPort(node.path, baudrate=57600), tap=order) as bus:
@@ -107,7 +107,7 @@ def test_r3_a_late_reply_that_lies_unread_is_never_taken_for_the_next_one(run: R
             await asyncio.sleep(waited)
             expiring = asyncio.ensure_future(axis.read(1, retries=0, start_within=0.005))
             await asyncio.sleep(0)
-            asyncio.get_running_loop().call_at(bus.pump._armed - 0.0001, block)
+            asyncio.get_running_loop().call_at(bus._pump._armed - 0.0001, block)
             outcome, value, _ = await asyncio.gather(first, second, expiring, return_exceptions=True)
             if came:
                 assert order.notes[0] == "heard"

@@ -155,7 +155,7 @@ async def test_marks_of_damaged_zeros_are_no_breaks_where_the_driver_counts_thos
                 await asyncio.sleep(0.001)
             return found.damaged, found.breaks
 
-        transport: Any = bus.pump._transport
+        transport: Any = bus._pump._transport
         set_input_flags(transport._fd, 0)
         if counted is not None:
             driver.counts = {n: _wrapped(before[n] + counted.get(n, 0)) for n in before}

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, GarbledReply, Hcp2Controller, MscController, SerialPort
-from busmaster.arbiter.mark import Mark
+from busmaster.arbiter.counters import Mark
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
 from busmaster.protocols.msc import codec as msc
@@ -255,7 +255,7 @@ async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(pty_
                 damage = b""
 
     async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
-        transport = bus.pump._transport
+        transport = bus._pump._transport
         assert transport is not None
         set_input_flags(transport.get_extra_info("serial").fileno(), 0)
         answering = asyncio.ensure_future(node())

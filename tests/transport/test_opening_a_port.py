@@ -248,8 +248,13 @@ def holding_driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]
     monkeypatch.setattr(serial_port, "CLOSE_DEADLINE", 0.001)
     yield lets_go
     lets_go.set()
-    for closing in tuple(serial_port._closings):  # the next test may get a pty with the same number
+    # the next test may get a pty with the same number, and an opening that was given up may still be under way
+    for closing in tuple(serial_port._closings):
         assert closing.over.wait(PATIENCE)
+    for thread in threading.enumerate():
+        if thread.name.startswith("open "):
+            thread.join(PATIENCE)
+            assert not thread.is_alive()
 
 
 @pytest.mark.asyncio

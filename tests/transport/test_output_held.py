@@ -25,8 +25,8 @@ from busmaster import (
     WriteUnconfirmed,
 )
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import LineChange, LineChanged
-from busmaster.arbiter.state import LineState
 from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -43,7 +43,7 @@ from tests.transport.fakes import PtyMaster, plugged, standing_still
 from tests.transport.test_marks import reply
 
 WINDOW = hcp2.PROFILE.timings.read.window
-LATENESS = hcp2.PROFILE.timings.read.lateness
+MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.max_reply_delay
 
 
 def line(delay: float = 0.002) -> Line:
@@ -52,7 +52,7 @@ def line(delay: float = 0.002) -> Line:
 
 
 def transport_of(bus: Bus) -> MemoryTransport:
-    transport = bus.pump._transport
+    transport = bus._pump._transport
     assert isinstance(transport, MemoryTransport)
     return transport
 
@@ -269,7 +269,7 @@ def test_the_wait_for_a_reply_runs_from_when_the_request_has_left() -> None:
             transport_of(bus).release()
             with pytest.raises(NoReply):
                 await reading
-            assert bus.now() - began == pytest.approx(0.3 + LATENESS, abs=0.01)
+            assert bus.now() - began == pytest.approx(0.3 + MAX_REPLY_DELAY, abs=0.01)
 
     run_in_virtual_time(main())
 
@@ -306,13 +306,15 @@ def test_r2_output_let_go_within_its_window_is_noticed_on_a_port_that_was_found_
     async def main() -> None:
         async with Bus(MemoryPort(emulated)) as bus:
             unseen = await driver.awaited(bus, emulated, held=0.5 * WINDOW)
-            assert unseen == pytest.approx(LATENESS - 0.5 * WINDOW, abs=0.01), "a port that never held is not asked"
+            assert unseen == pytest.approx(MAX_REPLY_DELAY - 0.5 * WINDOW, abs=0.01), (
+                "a port that never held is not asked"
+            )
             for held in (2 * WINDOW, 0.5 * WINDOW):
-                assert await driver.awaited(bus, emulated, held=held) == pytest.approx(LATENESS, abs=0.01)
+                assert await driver.awaited(bus, emulated, held=held) == pytest.approx(MAX_REPLY_DELAY, abs=0.01)
             transport_of(bus).abort()
             await asyncio.sleep(3.0)
             waited = await driver.awaited(bus, emulated, held=0.5 * WINDOW)
-            assert waited == pytest.approx(LATENESS, abs=0.01), "it is the same device that is opened again"
+            assert waited == pytest.approx(MAX_REPLY_DELAY, abs=0.01), "it is the same device that is opened again"
 
     run_in_virtual_time(main())
 
@@ -324,7 +326,7 @@ def test_r2_output_let_go_within_its_window_is_noticed_on_a_port_with_flow_contr
 
     async def main() -> None:
         async with Bus(MemoryPort(emulated)) as bus:
-            assert await driver.awaited(bus, emulated, held=0.5 * WINDOW) == pytest.approx(LATENESS, abs=0.01)
+            assert await driver.awaited(bus, emulated, held=0.5 * WINDOW) == pytest.approx(MAX_REPLY_DELAY, abs=0.01)
 
     run_in_virtual_time(main())
 
@@ -385,7 +387,7 @@ def test_closing_does_not_wait_for_output_that_is_held_and_says_that_it_was(held
             waiting = asyncio.ensure_future(request(axis))
             await asyncio.sleep(held)
             began = bus.now()
-        assert bus.now() - began < WINDOW + LATENESS
+        assert bus.now() - began < WINDOW + MAX_REPLY_DELAY
         with pytest.raises(error) as caught:
             await waiting
         assert caught.value.what == "the port had not sent it when the bus was closed"
@@ -465,13 +467,13 @@ async def test_a_tty_stopped_for_longer_than_any_window_delays_its_replies_and_m
 
     async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
         axis = Hcp2Controller(bus, 1)
-        transport: Any = bus.pump._transport
+        transport: Any = bus._pump._transport
         termios.tcflow(transport._fd, termios.TCOOFF)
         readings = [asyncio.ensure_future(axis.read(1, retries=0)) for _ in range(3)]
-        while transport.get_write_buffer_size() == 0:  # noqa: ASYNC110  # the line settles first
+        while transport.get_write_buffer_size() == 0:  # noqa: ASYNC110  # the line resynchronises first
             await asyncio.sleep(0.001)
         requested = transport.get_write_buffer_size()
-        await asyncio.sleep(LATENESS + WINDOW)
+        await asyncio.sleep(MAX_REPLY_DELAY + WINDOW)
         assert transport.get_write_buffer_size() == requested
         termios.tcflow(transport._fd, termios.TCOON)
         for value in (1, 2, 3):
@@ -487,7 +489,7 @@ async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
     monkeypatch.setattr(pump_module, "STUCK_AFTER", 0.1)
     async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
         axis = Hcp2Controller(bus, 1)
-        transport: Any = bus.pump._transport
+        transport: Any = bus._pump._transport
         termios.tcflow(transport._fd, termios.TCOOFF)
         with pytest.raises(
             LineDown,
@@ -495,7 +497,7 @@ async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
             "check CTS, replug",
         ):
             await axis.read(1, retries=0)
-        while bus.pump._transport in (None, transport):  # noqa: ASYNC110  # reopened by itself
+        while bus._pump._transport in (None, transport):  # noqa: ASYNC110  # reopened by itself
             await asyncio.sleep(0.001)
         assert pty_master.read(patience=0.01) == b""
 
@@ -507,7 +509,7 @@ async def test_a_write_that_a_stopped_tty_never_sent_is_unconfirmed_and_says_so_
         async with Bus(port) as bus:
             axis = Hcp2Controller(bus, 1)
             await axis.write(1, 5)
-            transport: Any = bus.pump._transport
+            transport: Any = bus._pump._transport
             termios.tcflow(transport._fd, termios.TCOOFF)
             writing = asyncio.ensure_future(axis.write(1, 6))
             while transport.get_write_buffer_size() == 0:  # noqa: ASYNC110  # nothing tells
@@ -515,7 +517,7 @@ async def test_a_write_that_a_stopped_tty_never_sent_is_unconfirmed_and_says_so_
         with pytest.raises(WriteUnconfirmed, match="the port had not sent it when the bus was closed, 1 attempt"):
             await writing
         async with Bus(port) as bus:
-            transport = bus.pump._transport
+            transport = bus._pump._transport
             termios.tcflow(transport._fd, termios.TCOON)
             assert await Hcp2Controller(bus, 1).read(1) == 5
 
@@ -556,7 +558,7 @@ async def test_a_network_that_stands_still_delays_its_replies_and_mixes_none(ser
         assert [await axis.read(1) for _ in range(3)] == [1, 2, 3]
         with standing_still(server.connection):
             readings = [asyncio.ensure_future(axis.read(1, retries=0)) for _ in range(3)]
-            await asyncio.sleep(LATENESS + 2 * WINDOW)
+            await asyncio.sleep(MAX_REPLY_DELAY + 2 * WINDOW)
         assert await asyncio.gather(*readings) == [4, 5, 6]
     serving.cancel()
 

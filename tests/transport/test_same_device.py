@@ -332,13 +332,13 @@ async def test_the_events_of_a_bus_tell_why_its_port_does_not_come_back_and_anot
     usb.plug(other.path, "A500XYZ", place="1-2")
     give(name, ours)
     bus = Bus(SerialPort(str(name), baudrate=57600))
-    bus.accept_device()
+    bus._accept_device()
     async with bus, asyncio.timeout(PATIENCE):
         events = bus.events()
         give(name, other)
         ours.unplug()
         changes = [await anext(events), await anext(events)]
-        bus.accept_device()
+        bus._accept_device()
         changes.append(await anext(events))
     assert changes == [
         LineChanged(LineChange.DOWN, f"{name} was lost: it hung up"),

@@ -180,10 +180,10 @@ def test_a_reader_says_what_it_heard_in_place_of_its_reply() -> None:
     assert failure.value.heard == b"x1"
 
 
-def test_a_reader_names_what_it_may_still_be_owed() -> None:
-    assert (reader().answers, reader().owed) == ((HEADER,), (HEADER,))
+def test_a_reader_names_what_it_may_still_be_overdue() -> None:
+    assert (reader().answers, reader().overdue) == ((HEADER,), (HEADER,))
     acknowledge = AcknowledgeReader(b"", TIMING)
-    assert (acknowledge.answers, acknowledge.owed, acknowledge.starts) == ((b"\x06",), (b"\x06",), b"\x06\x15")
+    assert (acknowledge.answers, acknowledge.overdue, acknowledge.starts) == ((b"\x06",), (b"\x06",), b"\x06\x15")
     assert (reader().answered, reader().closing, reader().later) == (True, 0, ())
 
 

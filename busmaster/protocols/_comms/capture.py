@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
+from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.telegrams import (
     ACK,
     ANSWERS,
@@ -93,7 +93,7 @@ class CommsDialect:
     def _reply(self, raw: bytes) -> Frame:
         asked, self._asked = self._asked, None
         node = asked.node if asked else None
-        fault = "" if asked else UNASKED
+        fault = "" if asked else UNEXPECTED
         if raw[0] != STX:
             if asked and asked.kind is Kind.READ and raw[0] == ACK:
                 fault = "an ACK answers no read"

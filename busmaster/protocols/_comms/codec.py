@@ -22,8 +22,8 @@ LINE = LineSettings(57600)
 OTHER_LINES = LINE.at(9600, 19200, 38400, 115200)
 CHECKED = (1, 2, 3, 4, 5, 6, 7, 99)
 """Elements that every controller has, the cheap reads that tell one answer from another (R15)."""
-# read to the letter, the 50 ms and 100 ms more make the lateness
-TIMINGS = Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02))
+# read to the letter, the 50 ms and 100 ms more make the maximum reply delay
+TIMINGS = Timings.uniform(ReplyTiming(late_after=0.05, window=0.1, max_reply_delay=0.15, inter_byte_timeout=0.02))
 """Both documents: "normally within 50ms", but other work "could delay the reply by 100mS"."""
 
 

@@ -6,7 +6,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
-from busmaster.bus.handle import Handle, Send, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, checked_count, item_text, read_each, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -21,12 +21,12 @@ T = TypeVar("T")
 class CommsHandle(Handle):
     """A handle of a node with a comms array. Each protocol says how an element is read and written, and its names."""
 
-    read_command: ClassVar[type[ReadElement]]
-    write_command: ClassVar[type[WriteElements]]
+    _read_command: ClassVar[type[ReadElement]]
+    _write_command: ClassVar[type[WriteElements]]
     elements: ClassVar[Mapping[str, Element[object]]] = {}
-    definite: ClassVar[bool] = False
+    _definite: ClassVar[bool] = False
     """Whether every node has the map as it is: what it calls read-only is then refused by number, too."""
-    form: ClassVar[str]
+    _form: ClassVar[str]
     """What an item looks like, for the message to someone who mistyped it."""
 
     @classmethod
@@ -34,7 +34,7 @@ class CommsHandle(Handle):
         return tuple(cls.elements)
 
     @classmethod
-    def names_of_items(cls) -> Mapping[str, str]:
+    def _names_of_items(cls) -> Mapping[str, str]:
         return {str(element.number): name for name, element in cls.elements.items()}
 
     def point(self, item: str) -> Point[Any]:
@@ -50,33 +50,46 @@ class CommsHandle(Handle):
         """
 
         def encode(value: float) -> Command[None]:
-            return self.write_command(number, (value,))
+            return self._write_command(number, (value,))
 
-        read_only = self.definite and any(e.number == number and not e.writable for e in self.elements.values())
-        return Point(self.node, str(number), self.read_command(number), encode=None if read_only else encode)
+        read_only = self._definite and any(e.number == number and not e.writable for e in self.elements.values())
+        return Point(self.node, str(number), self._read_command(number), encode=None if read_only else encode)
 
     def named(self, element: Element[T]) -> Point[T]:
         """Return the point of a named element: decoded, with its unit, and read-only if the map says so."""
 
         def encode(value: Any) -> Command[None]:
             # what a map names is a level, which may be written twice (R7); only Comms 1 to 5 start events
-            return self.write_command(element.number, (value,), idempotent=True)
+            return self._write_command(element.number, (value,), idempotent=True)
 
         return Point(
             self.node,
             element.name,
-            self.read_command(element.number),
+            self._read_command(element.number),
             unit=element.unit,
             decode=element.decode,
             encode=encode if element.writable else None,
         )
 
-    async def read(self, element: int | str, **options: Unpack[ReadOptions]) -> float:
-        """Return the number that an element holds now. Raises Refused for one that the node does not have."""
-        number = element if isinstance(element, int) else self._lookup(element).number
-        return await self.node.request(self.read_command(number), **options)
+    @overload
+    async def read(self, item: int | str, **options: Unpack[ReadOptions]) -> float: ...
 
-    async def write(self, element: int | str, *values: float, **options: Unpack[WriteOptions]) -> None:
+    @overload
+    async def read(self, item: int | str, count: int, **options: Unpack[ReadOptions]) -> tuple[float, ...]: ...
+
+    async def read(
+        self, item: int | str, count: int | None = None, **options: Unpack[ReadOptions]
+    ) -> float | tuple[float, ...]:
+        """Return the number that an element holds; with `count`, those of so many elements from there on, read one by
+        one. Raises Refused for an element that the node does not have.
+        """
+        number = item if isinstance(item, int) else self._lookup(item).number
+        if count is None:
+            return await self.node.request(self._read_command(number), **options)
+        commands = [self._read_command(one) for one in range(number, number + checked_count(count))]
+        return await read_each(self.node, commands, options)
+
+    async def write(self, item: int | str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write values to an element and those after it, acknowledged.
 
         A list that does not fit one telegram of 60 characters is sent in several; if one of them fails, those before
@@ -86,14 +99,14 @@ class CommsHandle(Handle):
 
         Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
         """
-        commands = self.writes(element, values, stop=options.get("safe"))
+        commands = self._writes(item, values, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
         for command in commands:
             await requests.request(command)
         for number, value in enumerate(values if requests.verify else (), commands[0].element):
             await self._verify(requests, number, value)
 
-    def writes(self, element: int | str, values: Sequence[float], *, stop: bool | None = None) -> list[WriteElements]:
+    def _writes(self, element: int | str, values: Sequence[float], *, stop: bool | None = None) -> list[WriteElements]:
         """Return what `write` sends.
 
         Raises InvalidCommand for a value that cannot be sent, or is beyond a limit, by which no `stop` is held; and
@@ -101,24 +114,24 @@ class CommsHandle(Handle):
         its number where it is definite.
         """
         number = element if isinstance(element, int) else self._lookup(element).number
-        if self.definite or not isinstance(element, int):
+        if self._definite or not isinstance(element, int):
             for known in self.elements.values():
                 if known.number in range(number, number + max(1, len(values))) and not known.writable:
                     raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write")
-        commands = [self.write_command(number + offset, part) for offset, part in telegrams(values)]
+        commands = [self._write_command(number + offset, part) for offset, part in telegrams(values)]
         self.node.check(*commands, stop=stop)
         return commands
 
-    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
+    def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Prepare to write consecutive elements, in as many telegrams as it takes."""
         element = int(item) if is_decimal(item) else item
-        self.writes(element, values, stop=options.get("safe"))
+        self._writes(element, values, stop=options.get("safe"))
         return [lambda: self.write(element, *values, **options)]
 
     async def _verify(self, requests: SeveralRequests, number: int, written: float) -> None:
-        command = self.read_command(number)
+        command = self._read_command(number)
         found = await requests.read_back(command)
         if not is_read_back(written, found):
             raise VerifyFailed(
@@ -130,7 +143,7 @@ class CommsHandle(Handle):
     def _lookup(self, name: str) -> Element[object]:
         element = self.elements.get(name)
         if element is None:
-            raise unknown_item(name, self.elements, self.form)
+            raise unknown_item(name, self.elements, self._form)
         return element
 
 

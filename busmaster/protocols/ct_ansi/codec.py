@@ -28,7 +28,7 @@ _HEXADECIMAL = re.compile(rb" *X([0-9A-Fa-f]+)")  # which products send spaces o
 
 
 class Reading(ParameterReading[float]):
-    """One attempt to read a parameter, or one leg of a run: a number with or without a decimal point."""
+    """One attempt to read a parameter, or one step of a run: a number with or without a decimal point."""
 
     __slots__ = ()
 
@@ -134,9 +134,9 @@ PROFILE = Profile(
     broadcast=0,
     line=LINE,
     other_lines=LINE.at(4800, 19200, 2400, 38400),
-    timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
+    timings=Timings.uniform(ReplyTiming(late_after=0.05, window=0.15, max_reply_delay=0.3, inter_byte_timeout=0.05)),
     probe=Read(1, 17),
-    checks=tuple(Read(1, number) for number in range(17, 22)),
+    sync_reads=tuple(Read(1, number) for number in range(17, 22)),
     acks_are_commands=True,
     shares_line_with=frozenset({"mentor"}),
 )

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Unpack
 
 from busmaster.bus.handle import Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster.bus.requester import SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, VerifyFailed
@@ -29,14 +29,14 @@ class CtAnsiDrive(ParameterHandle):
     """
 
     profile: ClassVar[Profile] = PROFILE
-    read_command = Read
-    run_command = ReadRun
+    _read_command = Read
+    _run_command = ReadRun
 
     def point(self, item: str) -> Point[Any]:
         """Return the point of a parameter ("1.21"), or of a run, always read in one exchange ("1.21:8")."""
         text, colon, count = item_text(item).partition(":")
         try:
-            menu, number = self.place_of(text)
+            menu, number = self._place_of(text)
         except InvalidCommand:
             raise unknown_item(item, (), FORM) from None
         if not colon:
@@ -49,29 +49,29 @@ class CtAnsiDrive(ParameterHandle):
     def items(cls) -> tuple[str, ...]:
         return ()
 
-    async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
-        """Return a parameter's value. Raises NoSuchParameter, or InvalidCommand at address 0."""
-        return await self.node.request(Read(*self.place_of(parameter)), **options)
-
-    async def write(self, parameter: str, value: float, **options: Unpack[WriteOptions]) -> None:
-        """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
+    async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
+        """Write a parameter, or several of a menu from `item` on, acknowledged; at address 0 to all drives, which do
+        not answer.
 
         `verify` reads back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is
         sent, for a value that does not fit.
         """
-        menu, number = self.place_of(parameter)
-        command = self._write(menu, number, value)
+        names = self._names(item, values)
+        places = [self._place_of(name) for name in names]
+        commands = [self._write(*place, value) for place, value in zip(places, values, strict=True)]
+        self.node.check(*commands, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
-        await requests.request(command)
-        if requests.verify:
-            check = Read(menu, number)
+        for command in commands:
+            await requests.request(command)
+        for name, place, command in zip(names, places, commands, strict=True) if requests.verify else ():
+            check = Read(*place)
             found = await requests.read_back(check)
             if found != float(command.text):
                 raise VerifyFailed(
-                    f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)
+                    f"{name} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
 
-    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+    def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         return lambda: self.write(item, value, **options)
 

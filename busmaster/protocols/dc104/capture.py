@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
+from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.contract.exchange import Command
 from busmaster.protocols.dc104.codec import Read, Write
 from busmaster.wire.checks import sum8
@@ -42,10 +42,10 @@ class Dc104Dialect:
         if request is None or sender is Direction.NODE:
             return 5
         asked = self._asked
-        doubtful = sender is Direction.UNKNOWN and asked and asked.kind is Kind.READ and asked.item == str(data[1])
-        if doubtful and len(data) < 5 and not quiet:
+        ambiguous = sender is Direction.UNKNOWN and asked and asked.kind is Kind.READ and asked.item == str(data[1])
+        if ambiguous and len(data) < 5 and not quiet:
             return 5
-        return 5 if doubtful and len(data) >= 5 and data[4] == sum8(data[1:4]) else request
+        return 5 if ambiguous and len(data) >= 5 and data[4] == sum8(data[1:4]) else request
 
     def explain(self, raw: bytes, sender: Direction, /) -> Frame:
         if len(raw) in (4, 6):
@@ -63,7 +63,7 @@ class Dc104Dialect:
             elif asked and asked.item != item:
                 frame.fault = f"wrong parameter: {asked.item} was asked"
         frame.answers = asked is not None
-        frame.fault = (_summed(raw) if len(raw) > 1 else "") or frame.fault or ("" if asked else UNASKED)
+        frame.fault = (_summed(raw) if len(raw) > 1 else "") or frame.fault or ("" if asked else UNEXPECTED)
         return frame
 
     def _request(self, raw: bytes) -> Frame:

@@ -18,7 +18,7 @@ from busmaster.contract.exchange import MORE, Done, FrameError, Need, Sizes, no_
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.wire.checks import sum8
-from busmaster.wire.readers import NAK, STX, AcknowledgeReader, SingleLeg
+from busmaster.wire.readers import NAK, STX, AcknowledgeReader, SingleStep
 
 READ = 0xAA
 WRITE = 0x55
@@ -31,7 +31,7 @@ def packet(*between: int) -> bytes:
     return STX + bytes((*between, sum8(bytes(between))))
 
 
-class Reading(SingleLeg):
+class Reading(SingleStep):
     """One attempt to read: five bytes that name the parameter, or a lone NAK."""
 
     __slots__ = ("_buffer", "_parameter", "answers")
@@ -47,7 +47,7 @@ class Reading(SingleLeg):
         self.answers = (STX + bytes((parameter,)),)
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         return self.answers
 
     def feed(self, data: bytes, /) -> Need | Done[int]:
@@ -65,7 +65,9 @@ class Reading(SingleLeg):
         if check != sum8(bytes((parameter, high, low))):
             if rest and buffer[-1] == sum8(buffer[1:-1]):
                 raise other_format(len(buffer), f"a reply has {self.length}")
-            raise FrameError("bad checksum", whole=not rest)  # only a whole frame is spared the lateness (R3)
+            raise FrameError(
+                "bad checksum", whole=not rest
+            )  # only a whole frame is spared the maximum reply delay (R3)
         return Done(high << 8 | low, rest=rest)
 
     def expired(self, started: bool, /) -> Done[int]:
@@ -144,8 +146,8 @@ def _check_parameter(command: Read | Write) -> None:
     object.__setattr__(command, "parameter", whole_number(command.parameter, lowest, highest, "a parameter"))
 
 
-_READ_TIMING = ReplyTiming(nominal=0.05, window=0.1, lateness=0.2, byte_gap=0.02)
-_WRITE_TIMING = ReplyTiming(nominal=0.5, window=0.5, lateness=0.6, byte_gap=0.02)
+_READ_TIMING = ReplyTiming(late_after=0.05, window=0.1, max_reply_delay=0.2, inter_byte_timeout=0.02)
+_WRITE_TIMING = ReplyTiming(late_after=0.5, window=0.5, max_reply_delay=0.6, inter_byte_timeout=0.02)
 PROFILE = Profile(
     name="dc104",
     title="DC104-SER",
@@ -155,7 +157,7 @@ PROFILE = Profile(
     timings=Timings(_READ_TIMING, _WRITE_TIMING, packet=_READ_TIMING),
     probe=Read(1),
     # a reply names its parameter, which tells these apart (R15)
-    checks=tuple(Read(parameter) for parameter in range(1, 9)),
+    sync_reads=tuple(Read(parameter) for parameter in range(1, 9)),
     fixed_rate=True,  # 19200 baud and no other
 )
 """The document gives no times. A write is answered when it is completed, EEPROM included: hence its longer window."""

@@ -21,7 +21,7 @@ STX, READ, WRITE = 0x02, 0xAA, 0x55
 ACK = b"\x06"
 SIZES = {READ: 4, WRITE: 6}
 LAST_PARAMETER = 255
-BYTE_GAP = 0.05  # the manual does not say how a drive finds the start of a packet again
+INTER_BYTE_TIMEOUT = 0.05  # the manual does not say how a drive finds the start of a packet again
 """Seconds after which what was begun is forgotten."""
 LIVE = 1
 """The parameter that moves on a lively drive: a sine about the middle of its range."""
@@ -90,7 +90,7 @@ class EmulatedDc104(Device):
 
     def hear_byte(self, byte: int, now: float) -> None:
         frame = self._frame
-        if frame and now - self.tau - self._heard_at > BYTE_GAP:
+        if frame and now - self.tau - self._heard_at > INTER_BYTE_TIMEOUT:
             frame.clear()
         self._heard_at = now
         if len(frame) == 1 and byte not in SIZES:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar, Unpack, overload
 
-from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, checked_count, encoder, item_text, read_each, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -12,7 +12,7 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import VerifyFailed
+from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.dc104.codec import Read, Write
 
@@ -62,27 +62,43 @@ class Dc104Drive(Handle):
     def items(cls) -> tuple[str, ...]:
         return ()
 
-    async def read(self, parameter: int, **options: Unpack[ReadOptions]) -> int:
-        """Return a parameter's value now. Raises Refused where the drive says NAK."""
-        return await self.node.request(self._read(parameter), **options)
+    @overload
+    async def read(self, item: int, **options: Unpack[ReadOptions]) -> int: ...
 
-    async def write(self, parameter: int, value: int, **options: Unpack[WriteOptions]) -> None:
-        """Write a parameter: acknowledged when the drive has completed it.
+    @overload
+    async def read(self, item: int, count: int, **options: Unpack[ReadOptions]) -> tuple[int, ...]: ...
+
+    async def read(self, item: int, count: int | None = None, **options: Unpack[ReadOptions]) -> int | tuple[int, ...]:
+        """Return a parameter's value; with `count`, those of so many parameters from there on, read one by one.
+
+        Raises Refused where the drive says NAK.
+        """
+        if count is None:
+            return await self.node.request(self._read(item), **options)
+        commands = [self._read(one) for one in range(item, item + checked_count(count))]
+        return await read_each(self.node, commands, options)
+
+    async def write(self, item: int, *values: int, **options: Unpack[WriteOptions]) -> None:
+        """Write a parameter, or several from `item` on: each acknowledged when the drive has completed it.
 
         `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
         outcome. Raises InvalidCommand, before anything is sent, for a value that is not 0 to 65535.
         """
-        command = self._write(parameter, value)
+        if not values:
+            raise InvalidCommand(f"{self.node.label}: there is no value to write to {item}")
+        commands = [self._write(item + offset, value) for offset, value in enumerate(values)]
+        self.node.check(*commands, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
-        await requests.request(command)
-        if requests.verify:
-            found = await requests.read_back(self._read(parameter))
+        for command in commands:
+            await requests.request(command)
+        for command in commands if requests.verify else ():
+            found = await requests.read_back(self._read(command.parameter))
             if found != command.value:
                 raise VerifyFailed(
-                    f"parameter {parameter} reads {found} after {command.value} was written", node=self.node
+                    f"parameter {command.parameter} reads {found} after {command.value} was written", node=self.node
                 )
 
-    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+    def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         return lambda: self.write(int(item), value, **options)
 

@@ -18,6 +18,6 @@ class HcpController(CommsHandle):
     """
 
     profile: ClassVar[Profile] = hcp.PROFILE
-    read_command = hcp.Read
-    write_command = hcp.Write
-    form = "an element number, 1 to 99"
+    _read_command = hcp.Read
+    _write_command = hcp.Write
+    _form = "an element number, 1 to 99"

@@ -7,8 +7,11 @@ from busmaster.protocols.hcp2 import comms_array, microflex
 from busmaster.protocols.hcp2.capture import Hcp2Dialect
 from busmaster.protocols.hcp2.codec import PROFILE, Read, Write
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.registry import NodeKind, Option, Protocol, device_of
+
+__all__ = ["PROTOCOL", "CommandWord", "Read", "StatusWord", "Write"]
 
 PROTOCOL = Protocol(
     profile=PROFILE,

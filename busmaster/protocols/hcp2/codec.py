@@ -54,7 +54,7 @@ PROFILE = Profile(
     line=LINE,
     timings=TIMINGS,
     probe=Read(1),
-    checks=tuple(Read(element) for element in CHECKED),
+    sync_reads=tuple(Read(element) for element in CHECKED),
     other_lines=OTHER_LINES,
     shares_line_with=frozenset({"hcp"}),  # a telegram of the one means nothing to the other
 )

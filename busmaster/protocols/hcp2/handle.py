@@ -22,10 +22,10 @@ class Hcp2Controller(CommsHandle):
     """
 
     profile: ClassVar[Profile] = hcp2.PROFILE
-    read_command = hcp2.Read
-    write_command = hcp2.Write
+    _read_command = hcp2.Read
+    _write_command = hcp2.Write
     elements = comms_array.ELEMENTS
-    form = "an element number, 1 to 255, or a name such as axis0.position"
+    _form = "an element number, 1 to 255, or a name such as axis0.position"
 
     def axis(self, number: int) -> Axis:
         """Return the points of an axis. Raises InvalidCommand unless `number` is 0 to 7."""

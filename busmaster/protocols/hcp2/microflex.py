@@ -111,7 +111,7 @@ PROFILE = replace(
     hcp2.PROFILE,
     kind="microflex",
     probe=hcp2.Read(STATUS_WORD.number),
-    checks=tuple(
+    sync_reads=tuple(
         hcp2.Read(element.number)
         for element in (
             FIRMWARE,

@@ -37,11 +37,11 @@ class MicroFlexDrive(CommsHandle):
     """
 
     profile: ClassVar[Profile] = microflex.PROFILE
-    read_command = hcp2.Read
-    write_command = hcp2.Write
+    _read_command = hcp2.Read
+    _write_command = hcp2.Write
     elements = microflex.ELEMENTS
-    definite = True
-    form = "an element number, 1 to 255, or a name such as speed_measured"
+    _definite = True
+    _form = "an element number, 1 to 255, or a name such as speed_measured"
 
     position = Named(microflex.POSITION)
     axis_error = Named(microflex.AXIS_ERROR)

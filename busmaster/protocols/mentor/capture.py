@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
+from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.telegrams import (
     ACK,
     ANSWERS,
@@ -121,7 +121,7 @@ class MentorDialect:
         step, command = {NAK: (0, "again"), ACK: (1, "next"), BS: (-1, "previous")}[byte]
         frame = Frame(Kind.READ, Direction.HOST, bytes((byte,)), command=command, continues=True)
         if self._armed is None:
-            frame.fault = UNASKED
+            frame.fault = UNEXPECTED
             return frame
         menu, _, parameter = self._armed.item.partition(".")
         frame.node = self._armed.node
@@ -133,7 +133,7 @@ class MentorDialect:
         asked, self._asked = self._asked, None
         frame = Frame(ANSWERS.get(data[0], Kind.VALUE), Direction.NODE, data, answers=asked is not None)
         frame.node = asked.node if asked else None
-        frame.fault = "" if asked else UNASKED
+        frame.fault = "" if asked else UNEXPECTED
         reading = asked is not None and asked.kind is Kind.READ
         if data[0] == STX:
             frame.item, frame.value = _parameter(data[1:5]), characters(data[5:-2])

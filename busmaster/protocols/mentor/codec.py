@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import Any, ClassVar, NoReturn, TypeVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterLeg, Need, Sizes
+from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterStep, Need, Sizes
 from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
@@ -31,7 +31,7 @@ from busmaster.wire.readers import (
     NAK,
     STX,
     AcknowledgeReader,
-    SingleLeg,
+    SingleStep,
     TelegramReader,
     telegram_sizes,
 )
@@ -190,7 +190,7 @@ class Write:
 
 
 class ParameterReading(TelegramReader[T]):
-    """One attempt to read a parameter, or one leg of a run, whatever its data look like."""
+    """One attempt to read a parameter, or one step of a run, whatever its data look like."""
 
     __slots__ = ()
 
@@ -217,12 +217,12 @@ class Reading(ParameterReading[int]):
 
 
 class RunReading:
-    """One attempt to read a run: a leg for each parameter."""
+    """One attempt to read a run: a step for each parameter."""
 
-    __slots__ = ("_leg", "_next", "_short", "_values", "answers", "later", "request", "timing")
+    __slots__ = ("_next", "_short", "_step", "_values", "answers", "later", "request", "timing")
 
     reading: ClassVar[type[ParameterReading[Any]]] = Reading
-    """What reads each leg."""
+    """What reads each step."""
     sizes: ClassVar[Sizes] = Reading.sizes
     starts: ClassVar[bytes] = Reading.starts
     closing: ClassVar[int] = 0
@@ -232,20 +232,20 @@ class RunReading:
         headers = tuple(header_of(run.menu, run.number + run.step * i) for i in range(run.count))
         self.request, _ = read_request(address, run.menu, run.number)
         self.timing = timing
-        self.later: Sequence[LaterLeg] = (LaterLeg(timing, self.sizes, sent=1),) * (run.count - 1)
+        self.later: Sequence[LaterStep] = (LaterStep(timing, self.sizes, sent=1),) * (run.count - 1)
         self._short = _SHORT_COMMANDS[run.step]
         self._next = list(reversed(headers[1:]))
-        self._leg = self.reading(self.request, headers[0], timing)
+        self._step = self.reading(self.request, headers[0], timing)
         self.answers = headers
         self._values: list[Any] = []
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         """The parameter asked for last: the next ones take a word from the host."""
-        return self._leg.answers
+        return self._step.answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[tuple[Any, ...]]:
-        step = self._leg.feed(data)
+        step = self._step.feed(data)
         if not isinstance(step, Done):
             return step
         self._values.append(step.value)
@@ -253,11 +253,11 @@ class RunReading:
             return Done(tuple(self._values), rest=step.rest)
         if step.rest:
             raise FrameError("bytes came before the next parameter was asked for")
-        self._leg = self.reading(self._short, self._next.pop(), self.timing)
+        self._step = self.reading(self._short, self._next.pop(), self.timing)
         return Expect(self.timing, self.sizes, self._short)
 
     def expired(self, started: bool) -> NoReturn:
-        self._leg.expired(started)
+        self._step.expired(started)
 
 
 class Writing(AcknowledgeReader):
@@ -274,7 +274,7 @@ class Writing(AcknowledgeReader):
         return super().feed(data)
 
 
-class Broadcast(SingleLeg):
+class Broadcast(SingleStep):
     """One write to all drives: none answers, and the line is left to them for as long as an answer would take."""
 
     __slots__ = ()
@@ -283,10 +283,12 @@ class Broadcast(SingleLeg):
     starts: ClassVar[bytes] = b""
     answered: ClassVar[bool] = False
     answers: ClassVar[tuple[bytes, ...]] = ()
-    owed: ClassVar[tuple[bytes, ...]] = ()
+    overdue: ClassVar[tuple[bytes, ...]] = ()
 
     def __init__(self, request: bytes, timing: ReplyTiming) -> None:
-        super().__init__(request, replace(timing, turnaround=max(timing.turnaround, timing.nominal)))
+        super().__init__(
+            request, replace(timing, driver_release_time=max(timing.driver_release_time, timing.late_after))
+        )
 
     def feed(self, data: bytes) -> Need | Expect | Done[None]:
         return Done(None, rest=data)
@@ -344,10 +346,10 @@ PROFILE = Profile(
     broadcast=0,
     line=LINE,
     other_lines=LINE.at(4800, 19200, 2400, 38400),  # beyond 9600 with an option module
-    timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
+    timings=Timings.uniform(ReplyTiming(late_after=0.05, window=0.15, max_reply_delay=0.3, inter_byte_timeout=0.05)),
     probe=Read(1, 17),
     # a reply names its parameter, which tells these apart (R15)
-    checks=tuple(Read(1, number) for number in range(17, 22)),
+    sync_reads=tuple(Read(1, number) for number in range(17, 22)),
     acks_are_commands=True,
     shares_line_with=frozenset({"ct-ansi"}),  # with addresses that are drives to both: 11 to 99 without the tens
 )

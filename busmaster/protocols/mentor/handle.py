@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import Any, ClassVar, NamedTuple, TypeVar, Unpack
+from typing import Any, ClassVar, NamedTuple, TypeVar, Unpack, overload
 
 from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
@@ -48,8 +48,8 @@ class ParameterHandle(Handle):
     `decimals` is by parameter. Raises InvalidCommand for what are no digits, or two that differ for one parameter.
     """
 
-    read_command: ClassVar[type[Read]] = Read
-    run_command: ClassVar[type[ReadRun]] = ReadRun
+    _read_command: ClassVar[type[Read]] = Read
+    _run_command: ClassVar[type[ReadRun]] = ReadRun
 
     def __init__(
         self,
@@ -65,39 +65,61 @@ class ParameterHandle(Handle):
         self._decimals: dict[tuple[int, int], int] = {}
         for text, digits in (decimals or {}).items():
             digits = whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
-            if (known := self._decimals.setdefault(self.place_of(text), digits)) != digits:
+            if (known := self._decimals.setdefault(self._place_of(text), digits)) != digits:
                 raise InvalidCommand(f"{text} has {known} decimals by another name, not {digits}")
 
     @staticmethod
-    def place_of(text: str) -> tuple[int, int]:
+    def _place_of(text: str) -> tuple[int, int]:
         """Return menu and number of "1.17" or "01.17". Raises InvalidCommand for anything else."""
         return parse_parameter(text)
 
-    def values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
+    def _values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
         """Return the values of a run that was read."""
         return tuple(sent)
 
-    async def read_run(
-        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
-    ) -> tuple[float, ...]:
-        """Return `count` parameters of a menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
+    @overload
+    async def read(self, item: str, **options: Unpack[ReadOptions]) -> float: ...
 
-        `step` 0 reads the same one again and again. With `chain` it takes one exchange, with one request byte for each
-        after the first: only where no other drive can take or send that byte for its own, that is where every node of
-        the line is a drive that forgets what it last sent when another is addressed. Raises NoSuchParameter where the
-        menu has a gap.
+    @overload
+    async def read(
+        self, item: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
+    ) -> tuple[float, ...]: ...
+
+    async def read(
+        self,
+        item: str,
+        count: int | None = None,
+        *,
+        step: int = 1,
+        chain: bool = False,
+        **options: Unpack[ReadOptions],
+    ) -> float | tuple[float, ...]:
+        """Return a parameter's value, a bit as 0 or 1; with `count`, so many parameters of its menu from there on.
+
+        `step` -1 reads the parameters before it instead of those after it, 0 the same one again and again. They are
+        read one by one. With `chain` they take one exchange, with one request byte for each after the first: only where
+        no other drive can take or send that byte for its own, that is where every node of the line is a drive that
+        forgets what it last sent when another is addressed. Raises NoSuchParameter, also where the menu has a gap, and
+        InvalidCommand at address 0.
         """
-        run = self.run_command(*self.place_of(parameter), count, step)
+        if count is None:
+            if chain or step != 1:
+                raise InvalidCommand(f"{self.node.label}: chain and step need a count of parameters")
+            return await self._read_one(item, options)
+        run = self._run_command(*self._place_of(item), count, step)
         if chain:
-            return self.values_of(run, await self.node.request(run, **options))
+            return self._values_of(run, await self.node.request(run, **options))
         requests = SeveralRequests(self.node, options)
-        return self.values_of(run, [await requests.request(self.read_command(*place)) for place in places_of(run)])
+        return self._values_of(run, [await requests.request(self._read_command(*place)) for place in places_of(run)])
 
-    async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
+    async def _read_one(self, item: str, options: ReadOptions) -> float:
+        return await self.node.request(self._read_command(*self._place_of(item)), **options)
+
+    async def _read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
         """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
         parameter, _, count = item_text(item).partition(":")
         if is_decimal(count) and not chain:
-            return await self.read_run(parameter, int(count))
+            return await self.read(parameter, int(count))
         return await self.point(item).read()
 
 
@@ -111,7 +133,7 @@ class MentorDrive(ParameterHandle):
     The line carries whole numbers. `decimals` says of how many digits a parameter's last ones are decimals: its values
     are then in its own unit, rounded to that; without an entry a value is the number on the line. A parameter that the
     guide names goes by that name too, and then has the guide's decimals: `read("speed_reference_1")` is in %. `chained`
-    lets poll groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read_run`
+    lets poll groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read`
     for when that is safe. The first handle of a drive says so, or none.
     """
 
@@ -141,7 +163,7 @@ class MentorDrive(ParameterHandle):
         return tuple(NAMED)
 
     @classmethod
-    def names_of_items(cls) -> Mapping[str, str]:
+    def _names_of_items(cls) -> Mapping[str, str]:
         return {f"{parameter.menu:02d}.{parameter.number:02d}": name for name, parameter in NAMED.items()}
 
     def point(self, item: str) -> Point[Any]:
@@ -179,41 +201,45 @@ class MentorDrive(ParameterHandle):
 
     def _run_point(self, item: str, run: ReadRun) -> Point[tuple[float, ...]]:
         decimals = tuple(self._decimals.get(parameter) for parameter in places_of(run))
-        return ScaledPoint(self.node, item, run, decode=lambda sent: self.values_of(run, sent), decimals=decimals)
+        return ScaledPoint(self.node, item, run, decode=lambda sent: self._values_of(run, sent), decimals=decimals)
 
-    async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
-        """Return a parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
-        place = self._place(parameter)
+    async def _read_one(self, item: str, options: ReadOptions) -> float:
+        place = self._place(item)
         found = await self.node.request(Read(place.menu, place.number), **options)
         return from_line(found, place.decimals)
 
     async def write(
         self,
-        parameter: str,
-        value: float,
-        *,
+        item: str,
+        *values: float,
         wide: bool = False,
         high_resolution: bool = False,
         **options: Unpack[WriteOptions],
     ) -> None:
-        """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
+        """Write a parameter, or several of a menu from `item` on, acknowledged; at address 0 to all drives, which do
+        not answer.
 
         `wide` is for 16-bit integers; those of the guide (13.14, 15.60 to 15.63) are sent so by themselves. With
         `high_resolution` a value without declared decimals counts in tenths of what a read returns. `verify` reads
         back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is sent, for a value
         that does not fit.
         """
-        place = self._place(parameter)
-        command = place.write(value, wide=wide, high_resolution=high_resolution)
+        names = self._names(item, values)
+        commands = [
+            self._place(name).write(value, wide=wide, high_resolution=high_resolution)
+            for name, value in zip(names, values, strict=True)
+        ]
+        self.node.check(*commands, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
-        await requests.request(command)
-        if requests.verify:
-            check = Read(place.menu, place.number)
+        for command in commands:
+            await requests.request(command)
+        for name, command in zip(names, commands, strict=True) if requests.verify else ():
+            check = Read(command.menu, command.number)
             found = await requests.read_back(check)
             # a reply has five characters always, and so not the tenths that were written
             if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
                 raise VerifyFailed(
-                    f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)
+                    f"{name} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
 
     async def write_all(
@@ -229,7 +255,7 @@ class MentorDrive(ParameterHandle):
         command = self._place(parameter).write(value, wide=wide, high_resolution=high_resolution)
         await self.bus.node(mentor.PROFILE, 0).request(command, **options)
 
-    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+    def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         parameter, _, kind = item.partition(":")
         return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", **options)
@@ -239,12 +265,12 @@ class MentorDrive(ParameterHandle):
 
         A name brings the guide's decimals unless others are declared.
         """
-        where = self.place_of(text)
+        where = self._place_of(text)
         decimals = NAMED[text].decimals if text in NAMED else 0
         return Place(*where, self._decimals.get(where, decimals or None))
 
     @staticmethod
-    def place_of(text: str) -> tuple[int, int]:
+    def _place_of(text: str) -> tuple[int, int]:
         """Return menu and number of "1.17", "01.17", or a name that the guide gives.
 
         Raises InvalidCommand for anything else.
@@ -252,7 +278,7 @@ class MentorDrive(ParameterHandle):
         named = NAMED.get(str(text))  # whatever it is: what is no text is refused below
         return parse_parameter(text) if named is None else named.place
 
-    def values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
+    def _values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
         return tuple(from_line(n, self._decimals.get(place)) for n, place in zip(sent, places_of(run), strict=True))
 
 

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
+from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.contract.exchange import Command
 from busmaster.protocols.modbus.codec import (
     BROADCAST,
@@ -107,7 +107,7 @@ class ModbusDialect:
             data = raw[3:-2]
             frame.value = words_text(data) if raw[1] > READS["discrete"] else bits_text(data, count_of(frame.item))
         if asked is None:
-            frame.fault = UNASKED
+            frame.fault = UNEXPECTED
         elif raw[0] != asked.raw[0] or raw[1] & ~REFUSED != asked.raw[1]:
             frame.fault = f"wrong answer: function {asked.raw[1]} of unit {asked.raw[0]} was asked"
         elif frame.kind is Kind.ACK and raw[2:6] != asked.raw[2:6]:

@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import MORE, Done, FrameError, LaterLeg, Sizes, Step, no_reply, other_format
+from busmaster.contract.exchange import MORE, Done, FrameError, LaterStep, Progress, Sizes, no_reply, other_format
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
@@ -39,7 +39,7 @@ HIGHEST = 0xFFFF
 LISTED = 8
 """Values that a command's text lists; of more it says how many."""
 SILENCE = 0.00175
-"""Seconds between frames: 3.5 characters, or this above 19200 baud. Here it is the reply's turnaround."""
+"""Seconds between frames: 3.5 characters, or this above 19200 baud. Here it is the reply's driver release time."""
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -107,7 +107,7 @@ class Conversation(Generic[T]):
 
     __slots__ = ("_buffer", "_decode", "_frames", "answered", "answers", "request", "sizes", "starts", "timing")
 
-    later: ClassVar[Sequence[LaterLeg]] = ()
+    later: ClassVar[Sequence[LaterStep]] = ()
     closing: ClassVar[int] = 0
 
     def __init__(self, frames: Frames, timing: ReplyTiming, decode: Callable[[bytes], T]) -> None:
@@ -115,7 +115,11 @@ class Conversation(Generic[T]):
         self.request = frames.request
         self.answered = frames.answered
         # nobody answers a write to all: the units are left as long as an answer would take
-        self.timing = timing if self.answered else replace(timing, turnaround=max(timing.turnaround, timing.nominal))
+        self.timing = (
+            timing
+            if self.answered
+            else replace(timing, driver_release_time=max(timing.driver_release_time, timing.late_after))
+        )
         self.answers = frames.answers
         self.starts = frames.starts
         self.sizes = frames.sizes
@@ -123,10 +127,10 @@ class Conversation(Generic[T]):
         self._buffer = b""
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         return self.answers
 
-    def feed(self, data: bytes, /) -> Step[T]:
+    def feed(self, data: bytes, /) -> Progress[T]:
         buffer = self._buffer = self._buffer + data
         header, size = self._frames.header, self._frames.size
         if buffer.startswith(self._frames.refusal):
@@ -141,10 +145,12 @@ class Conversation(Generic[T]):
         if not is_sound(buffer[:size]):
             if is_sound(buffer):
                 raise other_format(len(buffer), f"the reply to this has {size}")
-            raise FrameError("bad CRC", whole=len(buffer) == size)  # only a whole frame is spared the lateness (R3)
+            raise FrameError(
+                "bad CRC", whole=len(buffer) == size
+            )  # only a whole frame is spared the maximum reply delay (R3)
         return Done(self._decode(buffer[len(header) : size - 2]), rest=buffer[size:])
 
-    def _refused(self, buffer: bytes) -> Step[T]:
+    def _refused(self, buffer: bytes) -> Progress[T]:
         if len(buffer) < 5:
             return MORE
         if with_crc(buffer[:3]) != buffer:  # to the byte: a sound frame and the byte 00 have a right CRC, too
@@ -345,9 +351,13 @@ PROFILE = Profile(
         *LINE.at(38400, 115200, 57600),
         *LineSettings(19200, parity="O").at(19200, 9600),
     ),
-    timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.2, lateness=0.4, byte_gap=0.02, turnaround=SILENCE)),
+    timings=Timings.uniform(
+        ReplyTiming(
+            late_after=0.05, window=0.2, max_reply_delay=0.4, inter_byte_timeout=0.02, driver_release_time=SILENCE
+        )
+    ),
     probe=ReadRegisters(0),  # a unit without it refuses, which is an answer too (R11)
     # unit, function and length are all that tells answers apart, so the lengths differ (R15)
-    checks=tuple(ReadRegisters(0, count) for count in range(1, 5)),
+    sync_reads=tuple(ReadRegisters(0, count) for count in range(1, 5)),
     broadcast=BROADCAST,
 )

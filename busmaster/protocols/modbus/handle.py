@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, checked_count, item_text, read_each, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -79,6 +79,21 @@ class Place:
         if self.count is not None:
             return tuple(raw)
         return raw[0] if self.is_bit else self.number.decode(raw)
+
+    def reads(self, count: int, item: str) -> list[ReadBits | ReadRegisters]:
+        """Return what reads `count` values from here on, in as many exchanges as it takes. Raises InvalidCommand."""
+        if self.count is not None:
+            raise InvalidCommand(f"{item} is a run already: read so many values from {self.table}:{self.first} on")
+        kind = ReadBits if self.is_bit else ReadRegisters
+        most = kind.most - kind.most % self.width  # a number is never torn
+        end = self.first + count * self.width
+        return [kind(at, min(most, end - at), self.table) for at in range(self.first, end, most)]
+
+    def decode_each(self, raw: Sequence[Any]) -> tuple[Any, ...]:
+        """Return the values of what `reads` has read."""
+        if self.is_bit:
+            return tuple(raw)
+        return tuple(self.number.decode(raw[at : at + self.width]) for at in range(0, len(raw), self.width))
 
     def write_at_once(self, value: Any, item: str) -> WriteCoils | WriteRegisters:
         """Return the one command that writes its value, or the values of a run. Raises InvalidCommand."""
@@ -154,9 +169,17 @@ class ModbusUnit(Handle):
     def items(cls) -> tuple[str, ...]:
         return ()
 
-    async def read(self, item: str, **options: Unpack[ReadOptions]) -> Any:
-        """Return what an item holds now. Raises Refused, with the exception's name, for what the unit does not have."""
-        return await self.point(item).read(**options)
+    async def read(self, item: str, count: int | None = None, **options: Unpack[ReadOptions]) -> Any:
+        """Return the value of an item; with `count`, a tuple of so many values from there on.
+
+        More than 125 registers or 2000 bits take several exchanges: their values are not all of one moment, but no
+        number is torn. Raises Refused, with the exception's name, for what the unit does not have.
+        """
+        if count is None:
+            return await self.point(item).read(**options)
+        place = Place.parse(item)
+        raw = await read_each(self.node, place.reads(checked_count(count), item), options)
+        return place.decode_each([one for part in raw for one in part])
 
     async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write values to an item and what lies behind it, acknowledged; at address 0 to all units: none answers.
@@ -172,12 +195,12 @@ class ModbusUnit(Handle):
         for command in commands if requests.verify else ():
             await self._verify(requests, command)
 
-    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
+    def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Prepare to write consecutive places, in as few exchanges as they fit."""
         self._writes(item, values, options)
         return [lambda: self.write(item, *values, **options)]
 
-    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+    def _run_items(self, item: str, count: int) -> tuple[str, ...]:
         """Return what each value from an item on is called, each at its own address."""
         place = Place.parse(item)
         kind = "" if place.count is not None else item.partition(":")[2].partition(":")[2]

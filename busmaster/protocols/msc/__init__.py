@@ -8,6 +8,7 @@ from busmaster.protocols.msc.codec import PROFILE
 from busmaster.protocols.msc.handle import MscController
 from busmaster.protocols.msc.items import ITEMS, width_of
 from busmaster.protocols.msc.listing import read_listing
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 ADDRESS_STEP = Option(
@@ -22,6 +23,8 @@ MODEL = Option(
     choices=("MSC-250", "MSC-850", "MSC-850/32"),
     about="Which model it is, and so which commands it knows. For its emulated unit MSC-250 by default.",
 )
+
+__all__ = ["PROTOCOL", "ProgramStatus"]
 
 PROTOCOL = Protocol(
     profile=PROFILE,

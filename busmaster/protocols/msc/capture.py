@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from busmaster.capture.frames import UNACKED, UNASKED, Direction, Frame, Kind
+from busmaster.capture.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
 from busmaster.contract.exchange import Command
 from busmaster.protocols.msc import codec
 from busmaster.wire.checks import sum16
@@ -109,7 +109,7 @@ class MscDialect:
         frame.kind = Kind.VALUE
         frame.answers = asked is not None
         if asked is None:
-            frame.fault = frame.fault or UNASKED
+            frame.fault = frame.fault or UNEXPECTED
         elif not self._acked:
             frame.fault = frame.fault or UNACKED
         elif frame.node != asked.node or frame.command != asked.command:
@@ -122,13 +122,13 @@ class MscDialect:
         asked = self._asked
         frame = Frame(Kind.ACK if raw[0] == ACK else Kind.NAK, sender, raw, asked.node if asked else None)
         if sender is Direction.HOST:
-            frame.fault = "" if self._answer else UNASKED
+            frame.fault = "" if self._answer else UNEXPECTED
             self._answer = b""
             if frame.kind is Kind.ACK:
                 self._asked = None
         else:
             frame.answers = asked is not None and not self._acked
-            frame.fault = "" if frame.answers else UNASKED
+            frame.fault = "" if frame.answers else UNEXPECTED
             self._acked = frame.kind is Kind.ACK
             if asked and (frame.kind is Kind.NAK or not OPS.get(asked.command, OPS["DWRITE"]).reply):
                 self._asked = None

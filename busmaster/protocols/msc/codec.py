@@ -41,7 +41,7 @@ class _Reading:
 
 
 class _Writing:
-    """A program may consume what was written, so no write may be repeated unasked."""
+    """A program may consume what was written, so no write may be repeated unexpected."""
 
     __slots__ = ()
     writes = True
@@ -372,7 +372,10 @@ PROFILE = Profile(
     line=LineSettings(9600),
     timings=Timings(read=_FIRST, write=_FIRST, packet=ReplyTiming(0.5, 1.0, 1.0, 0.1)),
     probe=ReadStatus(),
-    checks=(ReadStatus(), ReadFlag(0)),  # a reply repeats the name of its command, which tells these two apart (R15)
+    sync_reads=(
+        ReadStatus(),
+        ReadFlag(0),
+    ),  # a reply repeats the name of its command, which tells these two apart (R15)
     exchange_limit=2.0,  # a packet that is damaged again and again is then ACKed away and asked for anew
     listen=StalePacketListener,  # a packet whose ACK was lost would be repeated five times, into other exchanges
     fixed_rate=True,  # 9600 baud and no other

@@ -10,10 +10,10 @@ The conversation ("Data transfer sequence"):
     host: ACK              ->  done
     host: NAK              ->  the packet again, at most five times
 
-Any byte can stand anywhere in a packet, so a reader counts from STX and never searches. Where the count itself is
-in doubt (a damaged header, bytes where none belong) the reader is lost: it swallows what comes until the line
-pauses for a byte gap, and speaks only then. So it never talks into a packet, and never takes a byte from the middle
-of one for an ACK.
+Any byte can stand anywhere in a packet, so a reader counts from STX and never searches. Where the count itself is in
+doubt (a damaged header, bytes where none belong) the reader is lost: it swallows what comes until the line pauses for a
+inter-byte timeout, and speaks only then. So it never talks into a packet, and never takes a byte from the middle of one
+for an ACK.
 
 A reply names its command but no data address. So a packet that comes before the request's ACK is never a reply:
 it answers something older; it is ACKed and dropped, and the ACK still awaited. If that packet is said twice, the
@@ -32,11 +32,11 @@ from busmaster.contract.exchange import (
     Done,
     Expect,
     FrameError,
-    LaterLeg,
+    LaterStep,
     Need,
+    Progress,
     Refused,
     Sizes,
-    Step,
     no_reply,
     other_format,
 )
@@ -157,8 +157,8 @@ class PacketExchange(Generic[T]):
     def __init__(self, request: bytes, timings: Timings, reply: Reply | None, decode: Callable[[bytes], T]) -> None:
         self.request = request
         self.timing = timings.write if reply is None else timings.read
-        self.later: Sequence[LaterLeg] = (
-            () if reply is None else (LaterLeg(timings.packet, Sizes(reply.size, LONGEST_PACKET)),)
+        self.later: Sequence[LaterStep] = (
+            () if reply is None else (LaterStep(timings.packet, Sizes(reply.size, LONGEST_PACKET)),)
         )
         self.closing = 0 if reply is None else len(ACK)
         self.answers = (ACK,) if reply is None else (reply.header,)
@@ -172,11 +172,11 @@ class PacketExchange(Generic[T]):
         self._other: FrameError | None = None
 
     @property
-    def owed(self) -> tuple[bytes, ...]:
+    def overdue(self) -> tuple[bytes, ...]:
         """An ACK, and the packet behind it."""
         return self.answers if self._acked or self._reply is None else (ACK, *self.answers)
 
-    def feed(self, data: bytes, /) -> Step[T]:
+    def feed(self, data: bytes, /) -> Progress[T]:
         buffer = self._buffer
         buffer += data
         if not buffer:
@@ -224,7 +224,7 @@ class PacketExchange(Generic[T]):
         """
         return self._failure
 
-    def _accepted(self) -> Step[T]:
+    def _accepted(self) -> Progress[T]:
         if self._reply is None and not self._stale:
             return Done(self._decode(b""), rest=bytes(self._buffer))
         self._acked = True
@@ -251,7 +251,7 @@ class PacketExchange(Generic[T]):
                 raise FrameError("more bytes without a pause than any packet has")
         return MORE
 
-    def _take(self, whole: bytes) -> Step[T]:
+    def _take(self, whole: bytes) -> Progress[T]:
         # a packet before the ACK is never the reply, however well it fits: a reply names no data address
         reply = self._reply if self._acked else None
         mine = reply is not None and reply.echoed_by(whole)
@@ -318,7 +318,7 @@ class StalePacketListener:
         if send and not buffer:
             return Done(None, send=send)
         if buffer[:1] != STX or len(buffer) > LONGEST_PACKET:
-            raise FrameError(f"{len(heard)} unasked bytes, the first of them {heard[0]:02x}", send=send)
+            raise FrameError(f"{len(heard)} unexpected bytes, the first of them {heard[0]:02x}", send=send)
         self._buffer = buffer
         return MORE
 

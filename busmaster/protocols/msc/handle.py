@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NoReturn, Unpack
+from typing import Any, ClassVar, NoReturn, Unpack, overload
 
-from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, checked_count, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, Priority, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -105,7 +105,7 @@ class MscController(Handle):
             return self._flag_point(int(number))
         if name not in self.symbols and not is_decimal(name):
             raise unknown_item(item, (*self.items(), *self.symbols), FORM)
-        address = self.address_of(name)
+        address = self._address_of(name)
         if colon:
             return Run.of(self, item, address, int(number))
         return Point(self.node, item, DataRead(address), encode=lambda value: DataWrite(address, value))
@@ -118,7 +118,7 @@ class MscController(Handle):
 
         return Point(self.node, f"flag:{flag}", ReadFlag(flag), encode=encode)
 
-    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+    def _run_items(self, item: str, count: int) -> tuple[str, ...]:
         """Return what each value of a run is called.
 
         That is its address, or the run's with the value's number where it is unknown.
@@ -126,10 +126,10 @@ class MscController(Handle):
         name = item.partition(":")[0]
         if self.address_step is None:
             return tuple(f"{name}[{i}]" for i in range(count))
-        address = self.address_of(name)
+        address = self._address_of(name)
         return tuple(str(address + i * self.address_step) for i in range(count))
 
-    async def read_item(self, item: str, **options: Any) -> Any:
+    async def _read_item(self, item: str, **options: Any) -> Any:
         """Do as `point(item).read()` does; read the flags of a model without RFLAGS one by one."""
         try:
             return await self.point(item).read()
@@ -138,20 +138,20 @@ class MscController(Handle):
                 raise
             return await self.flags()
 
-    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
+    def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Prepare to write consecutive data addresses, in blocks and one by one."""
         point = self.point(item)
         if isinstance(point, Run):
             point.check_length(values)
         elif len(values) == 1:
-            return super().prepare_write(item, values, **options)
+            return super()._prepare_write(item, values, **options)
         name = item.partition(":")[0]
         encoder(self.point(name))
-        parts = writes(self.address_of(name), values, self.address_step)
+        parts = writes(self._address_of(name), values, self.address_step)
         self.node.check(*(command for command, _ in parts), stop=options.get("safe"))
         return [lambda: self.write_block(name, values, **options)]
 
-    def address_of(self, where: int | str) -> int:
+    def _address_of(self, where: int | str) -> int:
         """Return the data address of a symbol, or an address as it is. Raises InvalidCommand for no such symbol."""
         if not isinstance(where, str):
             return where
@@ -163,35 +163,44 @@ class MscController(Handle):
 
     # values
 
-    async def read(self, where: int | str, **options: Unpack[ReadOptions]) -> int:
-        """Return the value at a data address or symbol, now. Raises Refused for an address outside the data area."""
-        return await self.node.request(DataRead(self.address_of(where)), **options)
+    @overload
+    async def read(self, item: int | str, **options: Unpack[ReadOptions]) -> int: ...
 
-    async def write(self, where: int | str, value: int, **options: Unpack[WriteOptions]) -> None:
-        """Write one value, acknowledged.
+    @overload
+    async def read(self, item: int | str, count: int, **options: Unpack[ReadOptions]) -> tuple[int, ...]: ...
+
+    async def read(
+        self, item: int | str, count: int | None = None, **options: Unpack[ReadOptions]
+    ) -> int | tuple[int, ...]:
+        """Return the value at a data address or symbol; with `count`, so many consecutive values, 32 an exchange.
+
+        More than 32 values are not all of one moment. Where the last 32 would reach beyond the data area and are
+        refused, the values are read one by one. Raises Refused for an address outside the data area, and InvalidCommand
+        for more than 32 while the address step is unknown. `start_within` is for each exchange.
+        """
+        address = self._address_of(item)
+        if count is None:
+            return await self.node.request(DataRead(address), **options)
+        values: list[int] = []
+        requests = SeveralRequests(self.node, options)
+        for part in reads(address, checked_count(count), self.address_step):
+            values += await self._read_part(part, requests.request)
+        return tuple(values)
+
+    async def write(self, item: int | str, *values: int, **options: Unpack[WriteOptions]) -> None:
+        """Write a value, or consecutive values, acknowledged: `write_block` without its progress.
 
         `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
         outcome: not where the program consumes what is written. Raises InvalidCommand, before anything is sent, for
         what is no signed 32-bit number.
         """
-        await self.write_block(where, [value], **options)
-
-    async def read_block(self, where: int | str, count: int, **options: Unpack[ReadOptions]) -> tuple[int, ...]:
-        """Return `count` consecutive values, 32 an exchange: not all of one moment, if they are more.
-
-        Where the last 32 would reach beyond the data area and are refused, the values are read one by one. Raises
-        InvalidCommand for more than 32 while the address step is unknown. `start_within` is for each exchange.
-        """
-        address = self.address_of(where)
-        values: list[int] = []
-        requests = SeveralRequests(self.node, options)
-        for part in reads(address, count, self.address_step):
-            values += await self._read_part(part, requests.request)
-        return tuple(values)
+        if not values:
+            raise InvalidCommand(f"{self.node.label}: there is no value to write to {item}")
+        await self.write_block(item, values, **options)
 
     async def write_block(
         self,
-        where: int | str,
+        item: int | str,
         values: Iterable[int],
         *,
         progress: Progress | None = None,
@@ -204,7 +213,7 @@ class MscController(Handle):
         many; those to be verified count twice. Raises InvalidCommand, before anything is sent, for a value that is no
         signed 32-bit number, and for more than one exchange while the address step is unknown.
         """
-        address = self.address_of(where)
+        address = self._address_of(item)
         wanted = tuple(values)
         requests = SeveralRequests(self.node, options)
         done = Count(progress, len(wanted) * (1 + requests.verify))
@@ -218,7 +227,7 @@ class MscController(Handle):
 
     async def load_cam(
         self,
-        where: int | str,
+        item: int | str,
         values: Iterable[int],
         *,
         progress: Progress | None = None,
@@ -231,15 +240,15 @@ class MscController(Handle):
         if options.get("priority") is None:
             options["priority"] = Priority.BACKGROUND
         # the program does not use the table meanwhile, so nothing consumes a value that is written twice
-        await self.write_block(where, values, progress=progress, verify=True, idempotent=True, **options)
+        await self.write_block(item, values, progress=progress, verify=True, idempotent=True, **options)
 
-    async def find_address_step(self, where: int | str) -> int:
+    async def find_address_step(self, item: int | str) -> int:
         """Find what the address grows by from one value to the next, and keep it in `address_step`.
 
-        `where` is the first of a few values that differ and that nothing changes meanwhile: a block read from there
+        `item` is the first of a few values that differ and that nothing changes meanwhile: a block read from there
         is compared with single reads. Raises InvalidCommand where they do not tell; then give the step.
         """
-        address = self.address_of(where)
+        address = self._address_of(item)
         block = await self.node.request(BlockRead(address))
         found = {step: await self._value_or_none(address + step) for step in ADDRESS_STEPS}
         bytewise = found[4] == block[1]
@@ -363,10 +372,10 @@ class Run(Point[tuple[int, ...]]):
         return True
 
     async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> tuple[int, ...]:
-        """Do as `Point.read` does, or as `MscController.read_block` where it is longer than a block."""
+        """Do as `Point.read` does, or as `MscController.read` where it is longer than a block."""
         if self.count <= BLOCK:
             return await Point.read(self, max_age=max_age, **options)
-        return await self.handle.read_block(self.address, self.count, **options)
+        return await self.handle.read(self.address, self.count, **options)
 
     async def write(self, value: Sequence[int], **options: Unpack[WriteOptions]) -> None:
         """Do as `MscController.write_block` does.

@@ -11,11 +11,10 @@ from __future__ import annotations
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
-from busmaster import InvalidCommand, Point, Refused, VerifyFailed
-from busmaster.bus.handle import Handle, encoder, unknown_item
-from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster import InvalidCommand, Point, Refused
+from busmaster.bus.handle import Handle, unknown_item
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
@@ -25,19 +24,19 @@ from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Delay, Device, held
 from busmaster.emulator.traceable import TraceableMemory
 from busmaster.registry import NodeKind, Option, Protocol, everywhere
-from busmaster.wire.readers import SingleLeg
+from busmaster.wire.readers import SingleStep
 
 CR = b"\r"
 
 
-class Talk(SingleLeg):
+class Talk(SingleStep):
     """One attempt: the reply begins with `header`, and ends with CR."""
 
     def __init__(self, request: str, header: str, digits: int, timing: ReplyTiming) -> None:
         super().__init__(request.encode() + CR, timing)
         self.header = header.encode()
         self.starts = self.header[:1] + b"-"
-        self.answers = self.owed = (self.header,)
+        self.answers = self.overdue = (self.header,)
         self.length = len(header) + digits + 1
         self.sizes = Sizes(self.length, self.length)
         self.heard = b""
@@ -103,7 +102,9 @@ class Turnstile(Handle):
         title="Tally",
         addresses=range(10),
         line=LineSettings(9600),
-        timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02)),
+        timings=Timings.uniform(
+            ReplyTiming(late_after=0.05, window=0.1, max_reply_delay=0.15, inter_byte_timeout=0.02)
+        ),
         probe=Count("a"),
         shares_line_with=frozenset({"mentor"}),
     )
@@ -117,15 +118,6 @@ class Turnstile(Handle):
         if len(counter) != 1 or counter not in string.ascii_lowercase:
             raise unknown_item(item, ("gate",), "a counter, a to z, or gate")
         return Point(self.node, item, Count(counter), encode=lambda value: Preset(counter, value))
-
-    async def read(self, item: str, **options: Unpack[ReadOptions]) -> int:
-        return await self.point(item).read(**options)
-
-    async def write(self, item: str, value: int, **options: Unpack[WriteOptions]) -> None:
-        point, requests = self.point(item), SeveralRequests(self.node, options)
-        await requests.request(encoder(point)(value))
-        if requests.verify and await requests.read_back(point.command) != value:
-            raise VerifyFailed(f"{item} is not {value}", node=self.node)
 
     @classmethod
     def items(cls) -> tuple[str, ...]:
@@ -203,7 +195,7 @@ def make_device(
     return EmulatedTurnstile(address, delay=delay, gate=gate)
 
 
-GATE = Option("gate", "whole", "which counter the gate has, 1 for a")
+GATE = Option("gate", "whole", "which counter gate has, 1 for a")
 
 
 PROTOCOL = Protocol(
@@ -219,7 +211,7 @@ PROTOCOL = Protocol(
                     Item(letter, letter, "how many have passed", access="read/write")
                     for letter in string.ascii_lowercase
                 ),
-                Item("gate", "", "the counter that the gate has", access="read/write"),
+                Item("gate", "", "the counter that gate has", access="read/write"),
             ),
             options=(GATE,),
             emulated=(GATE,),

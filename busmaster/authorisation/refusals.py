@@ -1,0 +1,202 @@
+"""Connections and logins that a line or one of its interfaces refuses: counted, reported, and slowed down.
+
+A refusal can come a thousand times a second. So each kind is reported at once, then at most once a minute with a count,
+and what is remembered of each peer is bounded.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import inf
+
+from busmaster.bounds import (
+    FREE_LOGINS,
+    LOGINS_FORGOTTEN,
+    LONGEST_LOGIN_PAUSE,
+    MOST_LOGIN_PEERS,
+    MOST_REPORTED,
+    SHORTEST_LOGIN_PAUSE,
+)
+
+REPORT_EVERY = 60.0
+"""Seconds from one report of a kind to the next."""
+NAMED = 3
+"""Peers that one report names."""
+OTHERS = "others"
+TOO_FAST = "unknown"
+"""The role of connections that are closed before they show who they are."""
+INTERFACES = ("service", "web", "opcua")
+"""Where a program logs in."""
+MOST_GOOD = 16
+"""Names of tokens that are remembered for one peer."""
+
+Told = Callable[[str], None]
+
+
+class LimitedReport:
+    """Reports what happens often: the first time at once, then at most once in REPORT_EVERY, with the counts since.
+
+    `text` makes a sentence of the counts. A report is given to `tell`, on the running loop.
+    """
+
+    def __init__(self, tell: Told, text: Callable[[Counter[str]], str]) -> None:
+        self._tell = tell
+        self._text = text
+        self._counts: Counter[str] = Counter()
+        self._timer: asyncio.TimerHandle | None = None
+
+    def note(self, what: str = "", count: int = 1) -> None:
+        """Count it; report it now if the last report is a minute old."""
+        if what not in self._counts and len(self._counts) >= MOST_REPORTED:
+            what = OTHERS
+        self._counts[what] += count
+        if self._timer is None:
+            self._report()
+
+    def _report(self) -> None:
+        self._timer = None
+        if self._counts:
+            counts, self._counts = self._counts, Counter()
+            self._tell(self._text(counts))
+            self._timer = asyncio.get_running_loop().call_later(REPORT_EVERY, self._report)
+
+
+class Refusals:
+    """What one line has refused, for its log, its metrics and `status`. Those of `on_report` are told a sentence."""
+
+    def __init__(self) -> None:
+        self.connections: Counter[str] = Counter()
+        """Connections for which no place was free, by the role of the program; of TOO_FAST, which came too fast."""
+        self.logins: Counter[str] = Counter()
+        """Failed logins, by the interface."""
+        self.on_report: list[Told] = []
+        self._reports: dict[str, LimitedReport] = {}
+
+    def note_connection(self, role: str) -> None:
+        """Count a program for which no place was free, and report it."""
+        self.connections[role] += 1
+        self._report("", _refused_text).note(role)
+
+    def note_rate(self, peer: str) -> None:
+        """Count a connection that was closed because its peer connects too fast, and report it."""
+        self.connections[TOO_FAST] += 1
+        self._report(TOO_FAST, _too_fast_text).note(peer)
+
+    def note_login(self, interface: str, peer: str, count: int = 1) -> None:
+        """Count failed logins of a peer, and report them."""
+        self.logins[interface] += count
+        self._report(interface, lambda counts: failed_text(interface, counts)).note(peer, count)
+
+    def _report(self, kind: str, text: Callable[[Counter[str]], str]) -> LimitedReport:
+        return self._reports.setdefault(kind, LimitedReport(self._tell, text))
+
+    def _tell(self, text: str) -> None:
+        for tell in self.on_report:
+            tell(text)
+
+
+def _refused_text(counts: Counter[str]) -> str:
+    many = counts.total()
+    roles = ", ".join(f"{count} of role {role}" for role, count in counts.most_common())
+    return (
+        f"{many} connection{'s were' if many > 1 else ' was'} refused, because no place was free: {roles}. "
+        "`busmaster status` shows how many programs use the line"
+    )
+
+
+def _too_fast_text(counts: Counter[str]) -> str:
+    many = counts.total()
+    return (
+        f"{many} connection{'s were' if many > 1 else ' was'} refused, because the program connects again and again: "
+        f"{_peers_text(counts)}"
+    )
+
+
+def _peers_text(counts: Counter[str]) -> str:
+    first = counts.most_common(NAMED)
+    peers = ", ".join(f"{count} from {peer}" for peer, count in first)
+    return peers + (f" and {len(counts) - len(first)} more" if len(counts) > len(first) else "")
+
+
+def failed_text(interface: str, counts: Counter[str]) -> str:
+    """Return the report of failed logins, whose counts are by peer."""
+    many = counts.total()
+    return f"{many} failed login{'s' * (many > 1)} at {interface}: {_peers_text(counts)}"
+
+
+@dataclass(slots=True)
+class _Peer:
+    """What is remembered of one peer: `until` is when its next login is checked."""
+
+    failures: int = 0
+    last: float = -inf
+    until: float = -inf
+    good: dict[str, None] = field(default_factory=dict)
+    """Names with which it has logged in: a guesser at the same address, or behind the same proxy, does not lock these
+    out."""
+
+
+class Logins:
+    """Judges logins by token or password, and slows down a peer that guesses.
+
+    After FREE_LOGINS failures a peer has to wait after each further one: SHORTEST_LOGIN_PAUSE at first, then twice as
+    long each time, up to LONGEST_LOGIN_PAUSE. A login that comes sooner is refused, whatever it shows. Other peers
+    never wait. `failed` is told the peer of each login that failed.
+    """
+
+    def __init__(self, failed: Callable[[str], None], now: Callable[[], float]) -> None:
+        self._failed = failed
+        self._now = now
+        self._peers: OrderedDict[str, _Peer] = OrderedDict()
+        """The one that logged in, or failed to, longest ago first."""
+
+    def judge(self, host: str, name: str | None) -> float | None:
+        """Judge a login of the peer at `host` as `name`, None if what it shows is wrong.
+
+        Return None if it succeeds, else the seconds after which this peer can try again.
+        """
+        key, now = peer_of(host), self._now()
+        peer = self._peers.pop(key, None) or _Peer()
+        if now - peer.last > LOGINS_FORGOTTEN:
+            peer.failures = 0
+        self._peers[key] = peer
+        if len(self._peers) > MOST_LOGIN_PEERS:
+            self._peers.popitem(last=False)
+        if name is not None and (now >= peer.until or name in peer.good):
+            peer.good.setdefault(name)
+            if len(peer.good) > MOST_GOOD:
+                del peer.good[next(iter(peer.good))]
+            return None
+        self._failed(key)
+        if now >= peer.until:
+            peer.failures, peer.last = peer.failures + 1, now
+            peer.until = now + pause_after(peer.failures)
+        return peer.until - now
+
+
+def pause_after(failures: int) -> float:
+    """Return for how many seconds a peer waits after its last failure."""
+    beyond = failures - FREE_LOGINS
+    return 0.0 if beyond <= 0 else min(LONGEST_LOGIN_PAUSE, SHORTEST_LOGIN_PAUSE * 2.0 ** min(beyond - 1, 32))
+
+
+def peer_of(host: str) -> str:
+    """Return what stands for a peer: its address; of IPv6 the network of 64 bits, which one machine has for itself."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if isinstance(address, ipaddress.IPv4Address):
+        return str(address)
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(address) if address.is_loopback else str(ipaddress.ip_network((address, 64), strict=False))
+
+
+def wait_text(seconds: float) -> str:
+    """Return what a peer is told whose login is not checked."""
+    return f"too many failed logins from this address: try again in {max(1, round(seconds))} s"

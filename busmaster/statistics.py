@@ -1,0 +1,16 @@
+"""What `statistics` returns for a bus, a node and a poll group; and the times of one request."""
+
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.learned import LearnedTimes
+from busmaster.arbiter.transaction import Timeline
+from busmaster.bus.polling import GroupStatistics
+
+__all__ = [
+    "DriverErrors",
+    "GroupStatistics",
+    "LearnedTimes",
+    "LineStatistics",
+    "NodeStatistics",
+    "Quantiles",
+    "Timeline",
+]

@@ -1,0 +1,54 @@
+"""Old names: nothing answers to one, and the error says the new one."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from busmaster import InvalidCommand, ReplyTiming
+from busmaster.config import load
+from busmaster.renames import ROOT, STATISTICS, TIMES
+from busmaster.statistics import LineStatistics
+
+PAGE = Path(__file__).parents[1] / "docs" / "upgrading.md"
+GOOD = {"late_after": 0.05, "window": 0.1, "max_reply_delay": 0.2, "inter_byte_timeout": 0.02}
+
+
+@pytest.mark.parametrize("old", TIMES)
+def test_an_old_argument_is_an_error_that_names_the_new_one(old: str) -> None:
+    named = {name: value for name, value in GOOD.items() if name != TIMES[old]}
+    with pytest.raises(TypeError, match=rf"no argument '{old}': it is now '{TIMES[old]}'"):
+        ReplyTiming(**named, **{old: 0.1})
+
+
+def test_another_wrong_argument_is_an_error_as_it_is_everywhere() -> None:
+    with pytest.raises(TypeError, match="unexpected keyword argument 'windows'"):
+        ReplyTiming(**GOOD, windows=1)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("table", ["nodes.winder.timing", "protocols.hcp2.timing", "nodes.winder.timing.write"])
+@pytest.mark.parametrize("old", TIMES)
+def test_an_old_key_is_an_error_that_names_the_new_one_and_the_command(old: str, table: str, tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    node = '[nodes.winder]\nprotocol = "hcp2"\naddress = 5\n'
+    path.write_text(f'port = "/dev/none?baudrate=57600"\n{node}[{table}]\n{old} = 0.01\n')
+    with pytest.raises(InvalidCommand) as refused:
+        load(path)
+    assert str(refused.value).endswith(
+        f"{table}.{old}: no such key; it is now {TIMES[old]!r}: "
+        f"`busmaster migrate {path} --write` changes all old names of the file"
+    )
+
+
+def test_the_page_lists_every_name() -> None:
+    text = PAGE.read_text()
+    for old in (*TIMES, *STATISTICS):
+        assert f"| `{old}` | `{(TIMES | STATISTICS)[old]}`" in text
+    rows = [line for line in text.splitlines() if line.startswith("| `busmaster.")]
+    for old, (where, new) in ROOT.items():
+        [row] = [row for row in rows if re.search(rf"[`.]{old}`", row.split(" | ")[0])]
+        assert where in row
+        assert old == new or f"{new}`" in row
+    assert all(hasattr(LineStatistics, new) for new in STATISTICS.values())

@@ -1,0 +1,112 @@
+"""One mutant in a copy of the tree: do the tests notice it?
+
+Those that run what is changed are asked, to the first failure: most mutants die in the first second.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator
+
+from tests.verification.mutation.asked import NEAR, Measured, asked, changed_lines
+from tests.verification.mutation.places import WITHOUT_BYTECODE, Mutant
+from tests.verification.mutation.warm import UNLIKE
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a mutant: `killed`, `survived`, or `impossible` where the operator changed nothing."""
+
+    outcome: str
+    seconds: float
+    test: str
+    """The test that noticed it."""
+    diff: str
+
+
+class Copy:
+    """A copy of what is committed, where files may be changed, and warm processes that run its tests."""
+
+    def __init__(self, root: Path, folder: Path) -> None:
+        subprocess.run(["git", "clone", "--quiet", "--shared", str(root), str(folder)], check=True)
+        self.folder = folder
+        self._warm: dict[str, subprocess.Popen[str]] = {}
+
+    def measure(self, near: bool, file: Path) -> None:
+        """Write what is known of the tests into a file. Raises RuntimeError if they fail already."""
+        process = self._start("measure", str(file), *asked(near))
+        if process.wait() != 0:
+            raise RuntimeError(f"the tests fail without a mutant:\n{self._said('measure').read_text()[-2000:]}")
+
+    def tried(self, mutant: Mutant, near: bool, measured: Measured) -> Verdict:
+        """Change the copy, ask its tests (`near`: only the room's) to the first failure, and change it back."""
+        start = time.monotonic()
+        path = self.folder / mutant.module
+        source = path.read_text()
+        mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+        if mutated is None or mutated == source:
+            return Verdict("impossible", 0.0, "", "")
+        before = path.stat()
+        path.write_text(mutated)
+        try:
+            test = self._noticed_by(mutant, changed_lines(source, mutated), near, measured)
+        finally:
+            path.write_text(source)
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # the compiled original is valid again
+        diff = difflib.unified_diff(source.splitlines(), mutated.splitlines(), lineterm="")
+        seconds = round(time.monotonic() - start, 1)
+        return Verdict("killed" if test else "survived", seconds, test or "", "\n".join(diff))
+
+    def _noticed_by(self, mutant: Mutant, lines: set[int], near: bool, measured: Measured) -> str | None:
+        """Return the test that notices what is changed now, or None."""
+        paths = list(NEAR[mutant.room]) if near else asked(near)
+        running = measured.running(mutant.module, lines)
+        if "" not in running:
+            tests = measured.quickest(running, paths)
+            if not tests:
+                return None
+            answer = self._answer("answer", asked(near), module=mutant.module, tests=tests)
+            if answer["status"] != UNLIKE:
+                return answer["test"] if answer["status"] else None
+        answer = self._answer("import", [], paths=paths, tests=measured.quickest(measured.seconds, paths))
+        return answer["test"] or "while they are collected" if answer["status"] else None
+
+    def _answer(self, what: str, collected: Iterable[str], **request: Any) -> Any:
+        """Return what a warm process says to a request. It is started with what it has collected."""
+        if what not in self._warm:
+            self._warm[what] = self._start(what, *collected)
+        process = self._warm[what]
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(json.dumps(request) + "\n")
+        process.stdin.flush()
+        line = process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"the tests have ended:\n{self._said(what).read_text()[-2000:]}")
+        return json.loads(line)
+
+    def _start(self, what: str, *arguments: str) -> subprocess.Popen[str]:
+        """Start a warm process."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "tests.verification.mutation.warm", what, str(self._said(what)), *arguments],
+            cwd=self.folder,
+            env=os.environ | WITHOUT_BYTECODE | {"PYTHONPATH": str(self.folder), "CI": "true"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def _said(self, what: str) -> Path:
+        """Return the file that a warm process speaks into."""
+        return self.folder.with_name(f"{self.folder.name}-{what}.txt")
