@@ -101,7 +101,8 @@ def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pyt
     assert "WRONG" in caught(protocol, "wrong").problems[0]
 
 
-@EVERY_PROTOCOL
+# Modbus keeps a silence between frames that is longer than a byte: there this bug does no harm
+@pytest.mark.parametrize("protocol", one_by_default(protocol for protocol in KINDS if protocol != "modbus"))
 def test_a_byte_time_left_out_of_the_max_reply_delay_brings_a_wrong_value(
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
