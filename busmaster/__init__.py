@@ -40,7 +40,9 @@ from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 if TYPE_CHECKING:
-    from busmaster.config.line import open_line
+    from busmaster.app.line.configured_line import open_line
+    from busmaster.app.service.remote import RemoteBus, connect
+    from busmaster.app.service.service import Service
     from busmaster.emulator.memory import MemoryPort
     from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
     from busmaster.protocols.dc104.handle import Dc104Drive
@@ -50,8 +52,6 @@ if TYPE_CHECKING:
     from busmaster.protocols.mentor.handle import MentorDrive
     from busmaster.protocols.modbus.handle import ModbusUnit
     from busmaster.protocols.msc.handle import MscController
-    from busmaster.service.remote import RemoteBus, connect
-    from busmaster.service.service import Service
 
 __all__ = [
     "LEARNED",
@@ -115,10 +115,10 @@ ON_DEMAND = {
     "MicroFlexDrive": "busmaster.protocols.hcp2.microflex_handle",
     "ModbusUnit": "busmaster.protocols.modbus.handle",
     "MscController": "busmaster.protocols.msc.handle",
-    "RemoteBus": "busmaster.service.remote",
-    "Service": "busmaster.service.service",
-    "connect": "busmaster.service.remote",
-    "open_line": "busmaster.config.line",
+    "RemoteBus": "busmaster.app.service.remote",
+    "Service": "busmaster.app.service.service",
+    "connect": "busmaster.app.service.remote",
+    "open_line": "busmaster.app.line.configured_line",
 }
 """Public names that a bus alone does not need, and the modules which are imported when these are asked for."""
 

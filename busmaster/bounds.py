@@ -207,3 +207,5 @@ MOST_WAITING_WRITES = 100
 """Write requests of one connection that have not been answered."""
 MOST_SHOWN_POINTS = 20_000
 """Points that are shown, with those that the line no longer has: clients may have subscribed to them."""
+
+__all__ = [name for name in sorted(globals()) if name.isupper()]

@@ -8,64 +8,180 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, Unpack
 
-from busmaster.arbiter.clients import Hold, LineClient
+from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE, Hold, LineClient
+from busmaster.arbiter.counters import Mark, RecentUtilisation
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.learned import LearnedTimes
-from busmaster.arbiter.tap import Tap
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.learned import LearnedTimes, window_of
+from busmaster.arbiter.on_wire import Echo
+from busmaster.arbiter.tap import Attempt, Tap, Verdict
+from busmaster.arbiter.transaction import BACKGROUND, COMMAND, POLL, URGENT, Poll, Transaction
+from busmaster.arbiter.unexpected import QUIET
 from busmaster.bus.bus import Bus
+from busmaster.bus.exclusive import HeldNode, checked_hold
 from busmaster.bus.handle import Handle, Send
+from busmaster.bus.limits import Limit
+from busmaster.bus.meaning import MOST_DIGITS, OF_QUANTITIES, PLAIN, MeansNothing, Named
 from busmaster.bus.node import Node, Request
 from busmaster.bus.points import Point
 from busmaster.bus.reads_after_writes import ReadsAfterWrites
-from busmaster.bus.requester import CommandOptions, RequestOptions, WriteOptions
+from busmaster.bus.requester import (
+    ORDINARY,
+    CommandOptions,
+    NodeSource,
+    Requester,
+    RequestOptions,
+    WriteOptions,
+    checked_priority,
+)
 from busmaster.bus.samples import Sample
 from busmaster.bus.shared_line import SharedLine
-from busmaster.contract.learning import Learned
+from busmaster.bus.snapshots import Cycles, Outdated, ReadAfterWrite
+from busmaster.bus.suitability import check_company, check_settings
+from busmaster.contract.arguments import (
+    LONGEST_NUMBER,
+    Between,
+    guess,
+    host_and_port,
+    is_decimal,
+    meant,
+    seconds,
+    whole_number,
+)
+from busmaster.contract.driver import Driver
+from busmaster.contract.exchange import Command, Exchange, FrameError
+from busmaster.contract.items import Bit, Item
+from busmaster.contract.learning import Learned, documented
+from busmaster.contract.places import Changing, Placed, Telling
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
+from busmaster.files import FOLDER_MODE, MODE, check_regular, open_file, read_file
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.planning.merging import Merge
+from busmaster.renames import TIMES, now_called
+from busmaster.transport import identity
+from busmaster.transport.clock import clock_of
+from busmaster.transport.endpoints import is_paced, is_served
+from busmaster.transport.holders import PROC, holders, how_to_open, owning_group, serves
+from busmaster.transport.identity import USB, resolve
+from busmaster.transport.kernel import OpenPort, open_port
 from busmaster.transport.pump import Waiter
 
 __all__ = [
+    "BACKGROUND",
+    "COMMAND",
+    "FOLDER_MODE",
+    "LEAST_SHARE",
+    "LONGEST_NUMBER",
+    "MODE",
+    "MOST_DIGITS",
+    "MOST_SHARE",
+    "OF_QUANTITIES",
+    "ORDINARY",
+    "PLAIN",
+    "POLL",
+    "PROC",
+    "QUIET",
+    "TIMES",
+    "URGENT",
+    "USB",
+    "Attempt",
+    "Between",
+    "Bit",
+    "Changing",
+    "Command",
+    "CommandOptions",
+    "Cycles",
+    "Driver",
+    "Echo",
+    "Exchange",
+    "FrameError",
+    "Handle",
+    "HeldNode",
     "Hold",
+    "Item",
+    "Learned",
     "LearnedTimes",
+    "Limit",
     "LineClient",
+    "Mark",
+    "MeansNothing",
+    "Merge",
+    "Named",
     "NodeRecord",
+    "NodeSource",
+    "OpenPort",
+    "Outdated",
+    "Placed",
+    "Poll",
+    "Profile",
+    "ReadAfterWrite",
     "ReadsAfterWrites",
+    "RecentUtilisation",
     "Request",
+    "RequestOptions",
+    "Requester",
+    "Send",
     "SharedLine",
+    "Tap",
+    "Telling",
     "Transaction",
+    "Verdict",
     "Waiter",
+    "WriteOptions",
     "accept_device",
     "add_tap",
     "begin_with",
+    "check_company",
+    "check_regular",
+    "check_settings",
+    "checked_hold",
     "checked_options",
+    "checked_priority",
+    "clock_of",
+    "documented",
     "give_back",
     "give_up",
+    "guess",
     "has_node",
     "hold",
+    "holders",
+    "host_and_port",
+    "how_to_open",
+    "identity",
+    "is_decimal",
     "is_kept",
+    "is_paced",
+    "is_served",
     "last_value",
     "lend_node",
     "line_of",
     "lost_seconds",
+    "meant",
     "names_of_items",
+    "now_called",
+    "open_file",
+    "open_port",
+    "owning_group",
     "plan_in_steps",
     "prepare_write",
+    "read_file",
     "read_item",
     "reads_after_writes",
     "record_of",
     "remove_tap",
     "rename",
+    "resolve",
     "run",
     "run_items",
+    "seconds",
+    "serves",
     "set_reply_time",
     "start",
     "take_only_safe_writes",
     "take_overheard",
     "times_to_keep",
+    "whole_number",
+    "window_of",
 ]
 
 T = TypeVar("T")

@@ -200,7 +200,7 @@ def remote(address: str) -> None:
 
     step("a program that connects, and the view")
     anyio.run(read)
-    import busmaster.cli.live  # noqa: F401
+    import busmaster.app.cli.live  # noqa: F401
 
 
 def main() -> int:

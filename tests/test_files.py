@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.app.outputs.growing_file import GrowingFile
+from busmaster.app.outputs.spool import Spool
 from busmaster.capture.files import CaptureFiles
 from busmaster.files import open_file
-from busmaster.outputs.growing_file import GrowingFile
-from busmaster.outputs.spool import Spool
 
 PACKAGE = Path(__file__).parent.parent / "busmaster"
-FOR_ALL_TO_READ = {"service/folder.py"}
+FOR_ALL_TO_READ = {"app/service/folder.py"}
 """Say who owns a line, to whoever wants to know."""
 
 

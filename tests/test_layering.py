@@ -9,13 +9,35 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).parent.parent / "busmaster"
 BASE = {"contract", "errors", "bounds", "renames"}
 """What a protocol and the arbiter agree on: every room may use it."""
-ALL = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") and entry.name[0] != "_"}
+LIBRARY_OF_THE_APPLICATION = {
+    *("", "bounds", "capture", "emulator", "errors", "events", "ext", "planning", "registry", "statistics"),
+}
+"""The modules of the library that the application imports: the root, `ext`, and eight that are public. This list is
+frozen: what the application needs beyond it goes into `busmaster.ext`, which is documented and versioned."""
+APPLICATION: dict[str, set[str]] = {
+    "app.service": set(),
+    "app.outputs": {"app.service"},
+    "app.interfaces": {"app.service"},
+    "app.config": {"app.service", "app.outputs"},
+    "app.line": {"app.config", "app.service", "app.outputs"},
+    "app.diagnostics": {"app.config", "app.service"},
+    "app.cli": {
+        *("app.config", "app.diagnostics", "app.interfaces", "app.line", "app.outputs", "app.service"),
+    },
+}
+"""The rooms of the application, and which others of them each may import."""
+DEMO = {"app.cli.demo_line"}
+"""The demo shows certain drives, so it imports them."""
+ON_DEMAND = {"app.line.configured_line", "app.service.remote", "app.service.service"}
+"""What the root offers of the application. It is imported when it is first used."""
 
+LIBRARY = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") and entry.name[0] != "_"} - {
+    "app",
+    "config",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "bounds": set(),
@@ -27,39 +49,21 @@ MAY_IMPORT: dict[str, set[str]] = {
     "planning": {"planning", "arbiter"} | BASE,
     "transport": {"transport", "arbiter"} | BASE,
     "bus": {"bus", "transport", "arbiter", "planning"} | BASE,
-    "ext": {"bus", "transport", "arbiter", "planning"} | BASE,
+    "ext": {"bus", "transport", "arbiter", "planning", "files"} | BASE,
     "events": {"bus", "arbiter"},
     "statistics": {"bus", "arbiter"},
     "emulator": {"emulator", "wire"} | BASE,
     "emulator.world": {"emulator", "wire", "arbiter"} | BASE,
     "emulator.memory": {"emulator", "transport"} | BASE,
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
-    "authorisation": {"authorisation", "ext", "bus", "arbiter"} | BASE,
-    "service": {"service", "authorisation", "registry", "ext", "bus", "arbiter", "planning", "outputs.values", "files"}
-    | BASE,
-    "interfaces": {
-        "interfaces",
-        "service",
-        "bus.samples",
-        "bus.snapshots",
-        "authorisation.authorisation",
-        "authorisation.permission",
-        "authorisation.record",
-        "authorisation.refusals",
-        "files",
-    }
-    | BASE,
-    "outputs": {"outputs", "authorisation", "ext", "bus", "arbiter", "files"} | BASE,
     "capture": {"capture", "wire", "registry", "arbiter.tap", "files"} | BASE,
-    "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,
-    "discovery": {"discovery", "doctor", "registry", "config", "transport", "arbiter"} | BASE,
-    "config": ALL - {"capture", "testing", "cli", "interfaces", "protocols", "discovery"},
-    "testing": ALL - {"cli", "config", "interfaces", "protocols"},
-    "__init__": ALL - {"cli", "interfaces"},
-    "__main__": ALL,
-    "cli": ALL - {"protocols"},
-    "cli.demo": ALL,
-    "cli.demo_line": ALL,
+    "testing": LIBRARY - {"protocols"},
+    "__init__": LIBRARY | ON_DEMAND,
+    "__main__": {"app.cli"},
+    "app": {"app"},
+    "config": set(),
+    **{room: {room, *others, *LIBRARY_OF_THE_APPLICATION - {""}} for room, others in APPLICATION.items()},
+    **{module: {"app.cli", "protocols", *LIBRARY_OF_THE_APPLICATION - {""}} for module in DEMO},
 }
 OPEN: dict[str, set[str]] = {
     "arbiter": {
@@ -67,34 +71,38 @@ OPEN: dict[str, set[str]] = {
         *("shared_backlog", "tap", "transaction", "unexpected"),
     },
     "bus": {
-        *("alarms", "bus", "exclusive", "handle", "limits", "meaning", "node", "points", "polling", "requester"),
-        *("samples", "snapshots", "suitability"),
+        *("alarms", "bus", "exclusive", "handle", "limits", "meaning", "node", "points", "polling"),
+        *("reads_after_writes", "requester", "samples", "shared_line", "snapshots", "suitability"),
     },
-    "capture": {"decode", "files", "frames", "pcapng", "recorder", "replay", "telegrams"},
-    "cli": {""},
-    "config": {"", "points_table", "points_taking", "rewriting", "service"},
-    "contract": {"arguments", "driver", "exchange", "items", "learning", "places", "profile", "timing"},
-    "discovery": {"search", "steps", "writing"},
-    "interfaces": {"following", "opcua", "opcua_access", "web"},
-    "doctor": {"adapters", "diagnosis", "examination", "probing", "uart"},
-    "emulator": {"chance", "device", "faults", "line", "memory", "motion", "serve", "traceable"},
     "bounds": {""},
-    "renames": {""},
+    "capture": {"", "decode", "files", "frames", "pcapng", "recorder", "replay", "telegrams"},
+    "contract": {"arguments", "driver", "exchange", "items", "learning", "places", "profile", "timing"},
+    "emulator": {"", "chance", "device", "faults", "line", "memory", "motion", "serve", "traceable"},
     "errors": {""},
+    "events": {""},
     "ext": {""},
     "files": {""},
-    "authorisation": {"authorisation", "payload", "permission", "record", "refusals", "rights"},
-    "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},
-    "service": {
-        *("folder", "messages", "picture", "remote", "remote_exchanges", "remote_group", "remote_overview", "service"),
-        *("tcp", "touches"),
-    },
+    "renames": {""},
+    "statistics": {""},
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
     },
     "wire": {"characters", "checks", "numbers", "readers"},
+    "app.cli": {""},
+    "app.config": {
+        *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "sections", "service"),
+        *("source", "table", "templates"),
+    },
+    "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},
+    "app.interfaces": {"following", "opcua", "opcua_access", "web"},
+    "app.line": {"", "points_table", "points_taking"},
+    "app.outputs": {"base", "cells", "distributor", "settings"},
+    "app.service": {
+        *("authorisation", "folder", "messages", "payload", "permission", "picture", "record", "refusals", "remote"),
+        *("remote_exchanges", "remote_group", "remote_overview", "rights", "service", "tcp", "touches", "values"),
+    },
 }
 """The modules of each room that other rooms may import; "" is the room itself. The others are its own affair.
 
@@ -214,35 +222,63 @@ def allows(module: str, name: str) -> bool:
     return within(name, PARTS[part]) if other is None else other in WITHIN[part] and builds_on(module, name)
 
 
-@pytest.mark.parametrize("module", [name for name in modules() if name != "protocols"])
-def test_a_module_imports_only_the_layers_below_it(module: str) -> None:
+def room_of(module: str) -> str:
+    """The room of a module: a package or module of the root's, or of the application's."""
+    parts = module.split(".")
+    return ".".join(parts[:2]) if parts[0] == "app" else parts[0]
+
+
+def own_imports(module: str) -> Iterator[str]:
+    """What the module imports of this package, without the package's name, for types and in functions too."""
     for name in imports(module, types=True):
-        if name == "busmaster":
-            assert module.split(".")[0] in ("cli", "__main__"), f"{module} imports the package's root, a cycle"
-        elif name.startswith("busmaster."):
-            assert allows(module, name.removeprefix("busmaster.")), f"{module} may not import {name}"
+        if name.split(".")[0] == "busmaster":
+            yield name.removeprefix("busmaster").removeprefix(".")
+
+
+def test_a_module_imports_only_the_layers_below_it() -> None:
+    wrong = [
+        f"{module} may not import {name or 'the root'}"
+        for module in modules()
+        if module != "protocols"
+        for name in own_imports(module)
+        if not (allows(module, name) if name else room_of(module) in {*APPLICATION, "__main__"})
+    ]
+    assert wrong == []
+
+
+def test_the_application_imports_nothing_of_the_library_but_what_is_listed() -> None:
+    taken = {
+        name
+        for module in modules()
+        if room_of(module) in APPLICATION and module not in DEMO
+        for name in own_imports(module)
+        if not name.startswith("app.")
+    }
+    assert taken == LIBRARY_OF_THE_APPLICATION
 
 
 FACES = ("__init__", "ext", "protocols")
 """What gives users names of many rooms."""
 
 
-@pytest.mark.parametrize("module", [name for name in modules() if name not in FACES])
-def test_no_room_reaches_into_another(module: str) -> None:
+def test_no_room_reaches_into_another() -> None:
     """What a room keeps to itself can be changed without a look at the others."""
-    for name in imports(module, types=True):
-        room, _, inner = name.removeprefix("busmaster.").partition(".")
-        if name.startswith("busmaster.") and room not in ("protocols", module.split(".")[0]):
-            assert inner in OPEN.get(room, ()), f"{module} imports {name}, which {room} keeps to itself"
+    wrong = [
+        f"{module} imports {name}, which {room} keeps to itself"
+        for module in modules()
+        if module not in FACES
+        for name in own_imports(module)
+        if name and (room := room_of(name)) not in ("protocols", room_of(module))
+        if name[len(room) + 1 :] not in OPEN.get(room, ())
+    ]
+    assert wrong == []
 
 
 def circles() -> list[set[str]]:
     """Sets of modules that import each other, types included."""
     names = set(modules())
-    ways = {
-        module: {name.removeprefix("busmaster.") for name in imports(module, types=True)} & names - {module}
-        for module in names
-    }
+    ways = {module: {name or "__init__" for name in own_imports(module)} & names - {module} for module in names}
+    ways["__init__"] -= ON_DEMAND
     reach = {module: reached(ways, module) for module in names}
     found: list[set[str]] = []
     for module in sorted(names):
@@ -268,22 +304,36 @@ def test_no_files_import_each_other_in_a_circle() -> None:
     assert circles() == []
 
 
-@pytest.mark.parametrize("module", [name for name in modules() if is_pure(name)])
-def test_a_pure_module_reads_no_clock_and_opens_no_port(module: str) -> None:
-    forbidden = CLOCKS_AND_PORTS - (row(SEEDED, module) or set())
-    taken = {name.split(".")[0] for name in imports(module)} & forbidden
-    assert not taken, f"{module} imports {', '.join(sorted(taken))}"
+def test_a_pure_module_reads_no_clock_and_opens_no_port() -> None:
+    wrong = [
+        f"{module} imports {name}"
+        for module in modules()
+        if is_pure(module)
+        for name in {name.split(".")[0] for name in imports(module)}
+        if name in CLOCKS_AND_PORTS - (row(SEEDED, module) or set())
+    ]
+    assert wrong == []
 
 
-@pytest.mark.parametrize(
-    "module", [name for name in modules() if within(name, {"emulator"}) or part_of(name) == "device"]
-)
-def test_the_emulator_draws_only_from_a_generator_it_was_handed(module: str) -> None:
-    for node in ast.walk(ast.parse(source_of(module).read_text())):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "random":
-            assert node.attr == "Random", f"{module}:{node.lineno} uses the shared generator random.{node.attr}"
-        if isinstance(node, ast.ImportFrom) and node.module == "random":
-            assert [alias.name for alias in node.names] == ["Random"], f"{module}:{node.lineno}"
+def test_the_emulator_draws_only_from_a_generator_it_was_handed() -> None:
+    wrong = [
+        f"{module}:{node.lineno}"
+        for module in modules()
+        if within(module, {"emulator"}) or part_of(module) == "device"
+        for node in ast.walk(ast.parse(source_of(module).read_text()))
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id == "random"
+            and node.attr != "Random"
+        )
+        or (
+            isinstance(node, ast.ImportFrom)
+            and node.module == "random"
+            and [alias.name for alias in node.names] != ["Random"]
+        )
+    ]
+    assert wrong == []
 
 
 def test_the_checks_see_an_import_inside_a_function_and_skip_one_for_types() -> None:
@@ -296,9 +346,10 @@ def test_what_the_core_may_import_outside_the_package_is_its_three_dependencies(
     """The extras stay optional: nothing below the command line and the outputs needs them."""
     optional = {"click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib"}
     optional |= {"asyncua", "starlette", "uvicorn", "websockets"}
-    holders = {"cli", "config", "capture", "doctor", "interfaces", "outputs", "service", "testing", "__main__"}
-    for module in modules():
-        if module.split(".")[0] in holders:
-            continue
-        taken = {name.split(".")[0] for name in imports(module)} & optional
-        assert not taken, f"{module} needs {', '.join(sorted(taken))}, which is an extra"
+    wrong = [
+        f"{module} needs {name}, which is an extra"
+        for module in modules()
+        if module.split(".")[0] not in ("app", "capture", "testing")
+        for name in {name.split(".")[0] for name in imports(module)} & optional
+    ]
+    assert wrong == []

@@ -119,7 +119,7 @@ def test_importing_it_needs_no_extra() -> None:
     ("what", "unneeded"),
     [
         ("import busmaster", r"busmaster\.(emulator|protocols|registry|config|cli)\b"),
-        ("from busmaster.cli import main; main(['--help'])", r"rich\b|textual\b"),
+        ("from busmaster.app.cli import main; main(['--help'])", r"rich\b|textual\b"),
     ],
 )
 def test_what_is_not_needed_is_not_loaded(what: str, unneeded: str) -> None:
@@ -134,7 +134,7 @@ def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
     code = (
         "import importlib.util as u, sys; find = u.find_spec; "
         "u.find_spec = lambda name, *rest: None if name in ('click', 'rich') else find(name, *rest); "
-        "from busmaster.cli import main; sys.exit(main(['--help']))"
+        "from busmaster.app.cli import main; sys.exit(main(['--help']))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE, capture_output=True, text=True)
     assert done.returncode == 2

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
 import pytest
 
 from busmaster import InvalidCommand, ReplyTiming
-from busmaster.config import load
+from busmaster.app.config import load
 from busmaster.renames import ROOT, STATISTICS, TIMES
 from busmaster.statistics import LineStatistics
 
@@ -52,3 +53,8 @@ def test_the_page_lists_every_name() -> None:
         assert where in row
         assert old == new or f"{new}`" in row
     assert all(hasattr(LineStatistics, new) for new in STATISTICS.values())
+
+
+def test_the_old_name_of_the_configuration_names_the_new_ones() -> None:
+    with pytest.raises(ImportError, match=r"ConfiguredLine and check are in busmaster\.app\.line"):
+        importlib.import_module("busmaster.config")

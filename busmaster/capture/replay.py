@@ -256,7 +256,7 @@ def result_of(ending: Ending) -> Result:
     return Result(Outcome.GARBLED, f"a bug in the protocol's reader: {error!r}")
 
 
-def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
+def replay_packets(packets: Iterable[Packet]) -> Iterator[Replayed]:
     """Yield each exchange of a capture, in order."""
     heard = list(listen(packets))
     run: _Run | None = None

@@ -15,7 +15,7 @@ from typing import NamedTuple, SupportsIndex
 from busmaster.errors import InvalidCommand
 
 HIGHEST_PORT = 65535
-MOST_DIGITS = 20
+LONGEST_NUMBER = 20
 """Of a number in a text: none here has more, and Python makes no number of some thousands."""
 
 
@@ -64,7 +64,7 @@ def _float(value: Real) -> float:
 
 def is_decimal(text: str) -> bool:
     """Return whether a text is a whole number without a sign, in digits as the command line takes them: 20 at most."""
-    return text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS
+    return text.isascii() and text.isdigit() and len(text) <= LONGEST_NUMBER
 
 
 def host_and_port(text: str) -> tuple[str, int]:

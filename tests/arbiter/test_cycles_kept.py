@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
+from busmaster.app.service.rights import READ, RIGHTS, WRITE, Role
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import set_members
 from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
-from busmaster.authorisation.rights import READ, RIGHTS, WRITE, Role
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import Bench, request_of, right_answer, up
 

@@ -6,10 +6,10 @@ from collections import Counter
 
 import pytest
 
+from busmaster.app.service.rights import READ, RIGHTS, WRITE
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.shared_backlog import MOST_LEFT
 from busmaster.arbiter.transaction import Priority
-from busmaster.authorisation.rights import READ, RIGHTS, WRITE
 from tests.arbiter.test_turns import Desk
 
 URGENT, COMMAND, POLL, BACKGROUND = Priority

@@ -20,7 +20,7 @@ from busmaster.bus.samples import Sample
 from busmaster.errors import NoReply
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2.handle import Hcp2Controller
-from tests.outputs.cycles import cycle, point
+from tests.app.outputs.cycles import cycle, point
 from tests.stories import cycles, on_a_bus
 
 LIMITS = Meaning(low=10, high=20, hysteresis=2)

@@ -13,7 +13,7 @@ from busmaster.bus.bus import Bus
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
-from busmaster.capture.replay import replay
+from busmaster.capture.replay import replay_packets
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort
@@ -52,7 +52,7 @@ async def record(path: Path, echo: bool) -> list[Packet]:
 async def test_every_exchange_of_a_bus_is_recorded_with_its_outcome(tmp_path: Path, echo: bool) -> None:
     packets = await record(tmp_path / "line.pcapng", echo)
     assert [packet.micros for packet in packets] == sorted(packet.micros for packet in packets)
-    exchanges = list(replay(packets))
+    exchanges = list(replay_packets(packets))
     assert not [f"{one.command}: {one.recorded}, {one.now}" for one in exchanges if one.changed or not one.judged]
     assert [(one.node, one.command, one.recorded.outcome) for one in exchanges][:4] == [
         (1, "write elements 10-11 = 1.5,-2", Outcome.OK),
@@ -94,7 +94,7 @@ async def test_each_protocol_reads_back_as_it_was_recorded(
                 if point.writable:
                     await point.write(value)
     with path.open("rb") as file:
-        exchanges = list(replay(read_packets(file)))
+        exchanges = list(replay_packets(read_packets(file)))
     assert not [f"{one.command}: {one.recorded}, {one.now}" for one in exchanges if one.changed]
     assert {one.recorded.outcome for one in exchanges} == {Outcome.OK}
     assert len(exchanges) > len(items)
@@ -160,4 +160,4 @@ def test_a_drive_of_another_protocol_that_speaks_alike_is_named_as_what_it_is(tm
     with path.open("rb") as file:
         packets = list(read_packets(file))
     assert [packet.protocol for packet in packets] == ["mentor"] * 2 + ["ct-ansi"] * 2 + ["mentor"] * 2
-    assert [(one.node, one.changed) for one in replay(packets)] == [(11, False), (12, False), (11, False)]
+    assert [(one.node, one.changed) for one in replay_packets(packets)] == [(11, False), (12, False), (11, False)]

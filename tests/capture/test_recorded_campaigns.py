@@ -10,7 +10,7 @@ from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, PcapngWriter, read_packets
-from busmaster.capture.replay import replay
+from busmaster.capture.replay import replay_packets
 from tests.tiers import in_turn_by_default
 from tests.verification.campaigns.hunt import Hunt
 from tests.verification.campaigns.kinds import KINDS
@@ -67,7 +67,7 @@ def test_a_replay_says_what_the_arbiter_said(protocol: str, mix: str) -> None:
     assert len(outcomes) == len(judged)
     assert outcomes == {(one.transaction, one.number): Outcome[one.verdict.name] for one in tape.ended if one.verdict}
 
-    exchanges = list(replay(packets))
+    exchanges = list(replay_packets(packets))
     assert len(exchanges) == len(tape.ended)
     for one, attempt in zip(exchanges, tape.ended, strict=True):
         assert one.recorded.outcome.name == attempt.verdict.name if attempt.verdict else None

@@ -13,7 +13,7 @@ from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
-from busmaster.capture.replay import Replayed, replay
+from busmaster.capture.replay import Replayed, replay_packets
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
@@ -117,14 +117,14 @@ GOOD = [
 def test_what_todays_readers_make_of_a_recorded_exchange_is_what_was_recorded(
     turns: list[Turn], record: Callable[..., list[Packet]]
 ) -> None:
-    (one,) = replay(record(*turns))
+    (one,) = replay_packets(record(*turns))
     assert one.judged
     assert not one.changed, f"was {one.recorded}, is {one.now}"
 
 
 def test_a_whole_capture_is_cut_into_its_exchanges() -> None:
-    everything = list(replay(recorded(*(turn for turns in GOOD for turn in turns))))
-    heard = list(replay(packet for turns in GOOD for packet in overheard(*turns)))
+    everything = list(replay_packets(recorded(*(turn for turns in GOOD for turn in turns))))
+    heard = list(replay_packets(packet for turns in GOOD for packet in overheard(*turns)))
     assert len(everything) == len(heard) == len(GOOD)
     assert not any(one.changed for one in everything + heard)
     by_frames = {Outcome.OK, Outcome.NO_REPLY, Outcome.GARBLED, Outcome.REFUSED}
@@ -135,7 +135,7 @@ READ = exchange(hcp2.Read(105), 255, HCP2, "02 36 39 34 30 39 36 03 07")
 
 
 def only(packets: list[Packet]) -> Replayed:
-    (one,) = replay(packets)
+    (one,) = replay_packets(packets)
     return one
 
 
@@ -189,7 +189,7 @@ def test_a_request_that_no_command_sends_is_a_change_if_it_was_answered() -> Non
 
 def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
     with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
-        exchanges = list(replay(read_packets(file)))
+        exchanges = list(replay_packets(read_packets(file)))
     assert not any(one.changed for one in exchanges)
     assert all(one.judged for one in exchanges)
     assert len(exchanges) == 13

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import click
 
-from busmaster.cli.app import STATUSES, cli
+from busmaster.app.cli.app import STATUSES, cli
 from busmaster.registry import kinds
 
 ENVIRONMENT = {

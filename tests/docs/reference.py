@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import busmaster
 import busmaster.bounds
-from busmaster.config.keys import REQUIRED, Key
-from busmaster.config.schema import tables
+from busmaster.app.config.keys import REQUIRED, Key
+from busmaster.app.config.schema import tables
 from tests.docs.command_line import manual, page
 from tests.docs.pages import ROOT
 

@@ -18,10 +18,10 @@ from typing import Any
 import click
 import pytest
 
-from busmaster.cli.app import cli
-from busmaster.config import ConfiguredLine
-from busmaster.config.sections import read
-from busmaster.config.source import Source
+from busmaster.app.cli.app import cli
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
 from tests.docs.pages import PAGES, ROOT, Block, Mark, blocks, name_of, parts, prose
 from tests.docs.shell import Shell, commands, joined
 

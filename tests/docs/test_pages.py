@@ -54,11 +54,11 @@ def test_every_page_can_be_found_from_the_index(page: Path) -> None:
 def test_the_picture_and_the_table_of_rooms_have_every_room() -> None:
     page = ROOT / "docs" / "architecture.md"
     [picture] = blocks(page, "text")
-    rooms = {path.stem for path in (ROOT / "busmaster").iterdir() if path.suffix in ("", ".py") and path.name[0] != "_"}
-    rooms -= {"py"}  # py.typed
-    assert {
-        Path(name).stem for name in re.findall(r"^\| `busmaster/(\w+)(?:/|\.py)`", prose(page), re.MULTILINE)
-    } == rooms
+    folders = (ROOT / "busmaster", ROOT / "busmaster" / "app")
+    paths = [path for folder in folders for path in folder.iterdir() if path.suffix in ("", ".py")]
+    rooms = {path.stem for path in paths if path.name[0] != "_"} - {"app"}
+    listed = re.findall(r"^\| `busmaster/(?:app/)?(\w+)(?:/|\.py)`", prose(page), re.MULTILINE)
+    assert set(listed) == rooms
     assert rooms - {"dissectors"} <= set(re.findall(r"\w+", picture.text))
 
 

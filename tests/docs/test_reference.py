@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 import pytest
 
-from busmaster.cli.app import cli
+from busmaster.app.cli.app import cli
 from tests.docs.command_line import ENVIRONMENT, EXAMPLES
 from tests.docs.pages import ROOT
 from tests.docs.reference import files

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.config import ConfiguredLine, FileError, emulated_line, load
-from busmaster.config.points_table import points_csv, rows
-from busmaster.config.points_taking import taken
+from busmaster.app.config import FileError, emulated_line, load
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.line.points_table import points_csv, rows
+from busmaster.app.line.points_taking import taken
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.listing import read_listing

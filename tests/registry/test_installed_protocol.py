@@ -12,21 +12,21 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, MemoryPort
+from busmaster.app.config import emulated_line as line_of_file
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import FileError, Source
+from busmaster.app.line import ConfiguredLine
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
-from busmaster.capture.replay import replay
-from busmaster.config import ConfiguredLine
-from busmaster.config import emulated_line as line_of_file
-from busmaster.config.sections import read
-from busmaster.config.source import FileError, Source
+from busmaster.capture.replay import replay_packets
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import discovery, find, kinds, make_device, protocols
 from busmaster.testing.fixtures import LineFactory, emulated_line, virtual_time
 from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.app.cli.conftest import Command, busmaster
 from tests.capture.test_dissector import dissect
-from tests.cli.conftest import Command, busmaster
 
 __all__ = ["busmaster", "emulated_line", "virtual_time"]
 
@@ -190,7 +190,7 @@ def test_a_capture_names_it_by_text_and_is_replayed(tally: None, tmp_path: Path,
         packets = list(read_packets(file))
     assert {packet.protocol for packet in packets} == {"tally"}
     assert [packet.outcome for packet in packets if packet.outcome] == [Outcome.OK, Outcome.OK]
-    assert [(str(one.command), one.changed) for one in replay(packets)] == [
+    assert [(str(one.command), one.changed) for one in replay_packets(packets)] == [
         ("write counter a = 5", False),
         ("read counter a", False),
     ]

@@ -15,7 +15,7 @@ from busmaster.registry import kinds, protocols
 PACKAGE = Path(__file__).parents[2] / "busmaster"
 NAMES = {name.replace("-", "_") for name in (*kinds(), *(protocol.name for protocol in protocols()))} | {"mint"}
 """Those of the protocols, and of products that speak them."""
-EXCEPTED = {"__init__.py", "renames.py", "cli/demo.py", "cli/demo_line.py"}
+EXCEPTED = {"__init__.py", "renames.py", "app/cli/demo.py", "app/cli/demo_line.py"}
 """The public names, and the demo, which shows certain drives."""
 MODULES = [
     path

@@ -19,7 +19,7 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.transport import kernel
 from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_port
 from busmaster.transport.tcp import TcpPort
-from tests.outputs.cycles import until as outside_until
+from tests.app.outputs.cycles import until as outside_until
 from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged, standing_still
 from tests.transport.test_marks import set_input_flags

@@ -56,7 +56,9 @@ def test_the_ways_pass_what_every_request_passes() -> None:
     assert any(name.startswith("transport/pump.py") for name in names["local read: functions"])
     assert any("codec.py" in name for name in names["local read: functions"])
     assert not any("emulator/" in name or "mint.py" in name for name in names["local read: functions"])
-    assert any(name.startswith("authorisation/") for name in names["remote write: functions of the owner"])
+    assert any(
+        name.startswith("app/service/authorisation.py") for name in names["remote write: functions of the owner"]
+    )
     assert found["remote write: functions of the owner"] < found["remote write: functions"]
     assert "Authorisation" in names["remote write: objects of the owner"]
 

@@ -19,10 +19,10 @@ NEAR: dict[str, tuple[str, ...]] = {
 """The tests of a room: `--near` asks no others."""
 FURTHER = (
     "tests/capture",
-    "tests/config",
+    "tests/app/config",
     "tests/emulator",
     "tests/planning",
-    "tests/service",
+    "tests/app/service",
     "tests/verification/campaigns",
     "tests/verification/proof",
 )

@@ -15,7 +15,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from tests.outputs.brokers import MOSQUITTO
+from tests.app.outputs.brokers import MOSQUITTO
 from tests.ports import free_port
 from tests.verification.plant.programs import until
 

@@ -19,8 +19,8 @@ import random
 import sys
 import time
 
-from busmaster.cli.emulate import own_port, serve
-from busmaster.config import LineFile, emulated_line, line_settings, load
+from busmaster.app.cli.emulate import own_port, serve
+from busmaster.app.config import LineFile, emulated_line, line_settings, load
 from busmaster.emulator.device import Device
 from busmaster.emulator.faults import CALM, Faults
 from busmaster.emulator.line import Line

@@ -24,7 +24,7 @@ def skew(path: str) -> float:
 def main(path: str, *arguments: str) -> int:
     time.time = lambda: TRUE_TIME() + skew(path)
     time.strftime = lambda pattern: TRUE_STRFTIME(pattern, time.localtime(time.time()))  # type: ignore[assignment,misc]  # the jump
-    from busmaster.cli import main as busmaster
+    from busmaster.app.cli import main as busmaster
 
     return busmaster(arguments)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.outputs.brokers import needs_mosquitto
+from tests.app.outputs.brokers import needs_mosquitto
 from tests.tiers import one_by_default
 from tests.verification.plant.faults import FAULTS
 from tests.verification.plant.trial import trial

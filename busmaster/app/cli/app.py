@@ -1,0 +1,254 @@
+"""The group of commands, and how each ends: with what status and which one line."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any, TextIO
+
+import click
+
+from busmaster.app.cli.ending import Ending
+from busmaster.app.cli.output import Level, note
+from busmaster.app.cli.terminal import printable
+from busmaster.errors import BusError, InvalidCommand, NoReply
+from busmaster.ext import meant
+
+OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+STATUSES = {
+    str(OK): "All is good.",
+    str(
+        FAILED
+    ): "An error came from the line, a port or a file; one line on standard error says what, and what to try.",
+    str(WRONG_USAGE): "The usage or a value is wrong, and nothing was sent.",
+    str(INTERRUPTED): "Ctrl-C ended it.",
+    "128 + N": "Signal N ended it; of `run` and `serve` SIGTERM is no error, and ends with 0.",
+}
+"""With what a command ends; where one means more by it, its help says so."""
+COMMANDS = (
+    "demo",
+    "read",
+    "write",
+    "poll",
+    "scan",
+    "discover",
+    "emulate",
+    "run",
+    "serve",
+    "status",
+    "top",
+    "web",
+    "opcua",
+    "safe",
+    "check",
+    "migrate",
+    "plan",
+    "points",
+    "monitor",
+    "doctor",
+    "replay",
+    "items",
+)
+"""One module of this package each, which defines `command`; imported only when it is asked for."""
+
+
+class Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands that are there, in the order of the help."""
+        return [name for name in COMMANDS if importlib.util.find_spec(f"busmaster.app.cli.{name}")]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command and return it; None for a name that is none."""
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        command = importlib.import_module(f"busmaster.app.cli.{cmd_name}").command
+        assert isinstance(command, click.Command)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that the arguments name. Raises UsageError, with what was meant, for a name that is none."""
+        known = self.list_commands(ctx)
+        if args and not args[0].startswith("-") and args[0] not in known:
+            raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], known)}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command and return its result, or the exit status of what it raised."""
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except BaseException as error:
+            return status_of(error)
+
+
+def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> None:
+    """Print the version and end the command, if it was asked for."""
+    if asked:
+        try:
+            number = importlib.metadata.version("busmaster")
+        except importlib.metadata.PackageNotFoundError:
+            number = "(not installed)"
+        click.echo(f"busmaster {number}")
+        ctx.exit()
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--version", is_flag=True, expose_value=False, is_eager=True, callback=version, help="Print the version.")
+def cli() -> None:
+    """One master for many drives on one serial line.
+
+    PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E); usb:SERIAL for the USB
+    adapter with that serial number, whatever its path; or socket://HOST:PORT for a serial server that passes raw TCP.
+    A PORT that another busmaster owns is used through its owner; `busmaster status` lists those. `read`, `write`,
+    `poll` and `scan` take the address of an owner too: unix:PATH, or tcp://HOST:PORT with a token in BUSMASTER_TOKEN.
+    """
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit status.
+
+    The status is 0 if all is good, 1 after an error from the line, 2 after wrong usage, 130 after Ctrl-C. Never raises.
+    """
+    listen_quietly()
+    print_somewhere()
+    try:
+        with Ending() as ending:
+            result = cli.main(args=arguments, prog_name="busmaster", standalone_mode=False, obj=ending)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return WRONG_USAGE
+    except click.UsageError as error:
+        return complain(usage_text(error), WRONG_USAGE)
+    except click.ClickException as error:
+        return complain(error.format_message(), WRONG_USAGE)
+    except (click.Abort, KeyboardInterrupt):
+        return INTERRUPTED
+    except (OSError, SystemExit) as error:  # outside a command: --help prints before one is invoked
+        return status_of(error)
+    return result if isinstance(result, int) else OK
+
+
+def print_somewhere() -> None:
+    """Replace standard output or standard error by nothing where its reader has closed it.
+
+    Whoever closed it wants to hear nothing there: print would use the other.
+    """
+    if sys.stdout is None or sys.stderr is None:
+        nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  it stays open as long as the process
+        sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
+
+
+def listen_quietly() -> None:
+    """Keep logs and warnings off standard error, where one line says what went wrong.
+
+    BUSMASTER_DEBUG=1 shows them.
+    """
+    if os.environ.get("BUSMASTER_DEBUG"):
+        logging.basicConfig(level=logging.DEBUG)
+    else:
+        logging.getLogger().addHandler(logging.NullHandler())
+        warnings.showwarning = show_warning
+
+
+def show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print a warning meant for the user as one line on standard error; leave out any other."""
+    if issubclass(category, UserWarning):
+        print(f"busmaster: warning: {printable(str(message))}", file=file or sys.stderr, flush=True)
+
+
+def usage_text(error: click.UsageError) -> str:
+    """Return what is wrong, and what was meant, or else where to look."""
+    text = error.format_message().rstrip(".").replace(". Did you mean", ": did you mean")
+    text = text[:1].lower() + text[1:]
+    return text if error.ctx is None or text.endswith("?") else f"{text}; see {error.ctx.command_path} --help"
+
+
+def complain(text: str, status: int) -> int:
+    """Say on one line of standard error what went wrong, and return `status`."""
+    note(" ".join(text.split()), Level.ERROR)
+    return status
+
+
+def status_of(error: BaseException) -> int:
+    """Say in one line what went wrong, and return the status with which the process ends.
+
+    An error that nobody foresaw is raised again under BUSMASTER_DEBUG=1.
+    """
+    error = only_one(error)
+    match error:
+        case KeyboardInterrupt():
+            return INTERRUPTED
+        case SystemExit():
+            return error.code if isinstance(error.code, int) else FAILED
+        # an OSError, too: so it comes before that case
+        case BrokenPipeError():
+            forget_standard_output()
+            return OK
+        case click.ClickException() | InvalidCommand():
+            text = error.format_message() if isinstance(error, click.ClickException) else str(error)
+            return complain(text, WRONG_USAGE)
+        case BusError():
+            return complain(bus_error_text(error), FAILED)
+        case OSError():
+            if not can_flush():  # a full disk: Python would complain of what is still held once more at exit
+                forget_standard_output()
+            what = error.strerror or str(error)
+            return complain(f"{error.filename}: {what}" if error.filename else what, FAILED)
+        case _:
+            if os.environ.get("BUSMASTER_DEBUG"):
+                raise error
+            kind = type(error).__name__
+            return complain(f"internal error: {kind}: {error}; BUSMASTER_DEBUG=1 shows where", FAILED)
+
+
+def bus_error_text(error: BusError) -> str:
+    """Return what the error says, without the command where only the node matters."""
+    if not isinstance(error, NoReply):
+        return str(error)
+    text = f"{error.label}: {error.what}" if error.label else error.what
+    if error.attempts:
+        text += f", {error.attempts} attempt{'' if error.attempts == 1 else 's'}"
+    return f"{text}; {error.hint}" if error.hint else text
+
+
+def only_one(error: BaseException) -> BaseException:
+    """Take an error out of a task group's wrapping: the first that says something, Ctrl-C before all."""
+    while isinstance(error, BaseExceptionGroup):
+        interrupts = error.subgroup(KeyboardInterrupt)
+        error = (interrupts or error).exceptions[0]
+    return error
+
+
+def can_flush() -> bool:
+    """Flush standard output, and tell whether that worked."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return False
+    return True
+
+
+def forget_standard_output() -> None:
+    """Point standard output at nothing: what is left unsaid must not complain at exit.
+
+    Whoever read it has gone, which is no error.
+    """
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(devnull, sys.stdout.fileno())
+    os.close(devnull)

@@ -1,0 +1,71 @@
+"""The audit log on standard error: for systemd's journal, or whoever reads there."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+
+from busmaster.app.cli.output import Level, note
+
+NAME = "busmaster.audit"
+TICK = 0.05
+MOST_WAITING_ENTRIES = 1_000
+"""Lines that may wait for a standard error from which nobody takes them."""
+FAREWELL = 2.0
+"""Seconds in which it is to take the rest, at the end."""
+
+
+class AuditLog(logging.Handler):
+    """Prints what comes to the log "busmaster.audit", in `with`, in a thread of its own: it never holds up the line.
+
+    `is_free` says whether a line may be printed now; where a live view is drawn, it may not.
+    """
+
+    def __init__(self, is_free: Callable[[], bool]) -> None:
+        super().__init__(logging.INFO)
+        self._is_free = is_free
+        self._log = logging.getLogger(NAME)
+        self._level_before = self._log.level
+        self._waiting: deque[tuple[str, Level]] = deque()  # loop and thread share it: what they do with it is atomic
+        self._lost = 0
+        self._stop = threading.Event()
+        # a daemon: a standard error that takes nothing must not keep the process from ending
+        self._thread = threading.Thread(target=self._print, name="busmaster audit log", daemon=True)
+
+    def __enter__(self) -> AuditLog:
+        self._level_before = self._log.level
+        self._log.setLevel(logging.INFO)
+        self._log.addHandler(self)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._log.removeHandler(self)
+        self._log.setLevel(self._level_before)
+        self._stop.set()
+        self._thread.join(FAREWELL)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Have it printed. Never waits."""
+        if not self._is_free():
+            return
+        if len(self._waiting) >= MOST_WAITING_ENTRIES:
+            self._lost += 1
+            return
+        level = Level.WARNING if record.levelno >= logging.WARNING else Level.INFO
+        self._waiting.append((f"audit: {record.getMessage()}", level))
+
+    def _print(self) -> None:
+        told, last = 0, False
+        while not last:
+            last = self._stop.wait(TICK)
+            while self._waiting:
+                note(*self._waiting.popleft())
+            if (lost := self._lost) > told:
+                note(f"audit: {lost - told} writes are not listed here: nobody took the lines", Level.WARNING)
+                told = lost

@@ -1,0 +1,100 @@
+"""`--capture FILE`, the same on every command: the line recorded while the command runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import click
+
+from busmaster.app.cli.output import note
+from busmaster.app.cli.parsing import Whole
+from busmaster.capture import COUNT, SIZE, Recorder
+
+F = TypeVar("F", bound=Callable[..., Any])
+MEGABYTE = 1_000_000
+LIMITS = "busmaster.capture"
+"""Where the command's context keeps what is said of a capture beside its name."""
+
+
+def _limit(name: str, metavar: str, default: int, text: str) -> Callable[[F], F]:
+    """Return an option whose value goes to the command's context, and not to the command itself."""
+    return click.option(
+        name,
+        type=Whole(min=1),
+        default=default,
+        show_default=True,
+        metavar=metavar,
+        expose_value=False,
+        callback=_keep,
+        help=text,
+    )
+
+
+def _keep(context: click.Context, option: click.Parameter, value: int) -> None:
+    context.meta[f"{LIMITS}.{option.name}"] = value
+
+
+def capture_option(command: F) -> F:
+    """Give a command `capture`, the path or None; its limits reach `capturing` by the command's context."""
+    options = (
+        _limit("--capture-files", "N", COUNT, "Keep so many files of the capture, the newest."),
+        _limit(
+            "--capture-mb",
+            "MB",
+            SIZE // MEGABYTE,
+            "Begin the next file of the capture, FILE-2 and so on, after so many megabytes.",
+        ),
+        click.option(
+            "--capture",
+            type=click.Path(dir_okay=False),
+            metavar="FILE",
+            help="Record the line: a pcapng file for Wireshark, or for busmaster replay. None is overwritten.",
+        ),
+    )
+    for option in options:
+        command = option(command)
+    return command
+
+
+@contextmanager
+def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = False) -> Iterator[Recorder | None]:
+    """Yield a recorder to be the bus's tap, or None without a path.
+
+    Enter it outside the loop: leaving waits for the disk. What it is named, and what could not be recorded, is said on
+    standard error: at once, or at the end where a live view may be drawn. Raises UsageError if the file cannot be
+    written at all.
+    """
+    if path is None:
+        yield None
+        return
+    context = click.get_current_context(silent=True)
+    limits = context.meta if context is not None else {}
+    held: list[str] = []
+    say = held.append if sys.stdout.isatty() and sys.stdin.isatty() else note
+    try:
+        recorder = Recorder(
+            path,
+            port=port,
+            protocol=protocol,
+            echo=echo,
+            size=limits.get(f"{LIMITS}.capture_mb", SIZE // MEGABYTE) * MEGABYTE,
+            count=limits.get(f"{LIMITS}.capture_files", COUNT),
+            say=say,
+        )
+    except OSError as error:
+        raise click.UsageError(f"--capture {path}: {error.strerror}") from None
+    if recorder.path != path:
+        note(f"{path} is there already: the capture goes to {recorder.path}")
+    try:
+        with recorder:
+            yield recorder
+    finally:
+        for text in held:
+            note(text)
+    if recorder.error is not None:
+        note(f"the capture ends early: {recorder.path}: {recorder.error.strerror}")
+    if recorder.dropped:
+        note(f"the capture lacks {recorder.dropped} events, which could not be written in time")

@@ -1,0 +1,153 @@
+"""`busmaster emulate`: drives that are not there, on a pseudo-terminal or a TCP port."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from collections.abc import Sequence
+from math import inf
+
+import click
+
+from busmaster import SerialPort, TcpPort
+from busmaster.app.cli.arguments import line_settings, nodes_option, seconds_option, single_nodes
+from busmaster.app.cli.lines import file_argument, load
+from busmaster.app.cli.output import emit
+from busmaster.app.cli.parsing import Whole, option_type, parsed
+from busmaster.app.cli.protocols import protocol_option
+from busmaster.app.config import LineFile, emulated_line
+from busmaster.app.line import ConfiguredLine
+from busmaster.emulator import NAMES, Delay, Faults, Line, LineServer, serve_pty, serve_tcp
+from busmaster.errors import LineDown
+from busmaster.ext import USB, Profile, host_and_port
+from busmaster.registry import find, make_device
+
+LOOK_FOR_SIGNALS = 0.2
+"""Seconds from one look to the next."""
+
+
+@click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
+@file_argument(required=False)
+@protocol_option(required=False, text="One of {}; without a file.")
+@nodes_option
+@click.option(
+    "--pty", is_flag=False, flag_value="", metavar="[LINK]", help="A pseudo-terminal (the default), and a link to it."
+)
+@click.option("--tcp", type=option_type(host_and_port), metavar="HOST:PORT", help="A TCP port; 0 picks a free one.")
+@click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
+@click.option("--paced", is_flag=True, help="Bytes take their time on the wire.")
+@click.option(
+    "--reply-delay",
+    type=option_type(Delay.parse),
+    metavar="MS[-MS]",
+    help="From a request to its reply, in milliseconds; 2 by default.",
+)
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help=f"What goes wrong with every drive, like lost=0.1. Again for more. One of {' '.join(NAMES)}.",
+)
+@click.option("--seed", type=int, metavar="N", help="Makes what is random repeatable; the file's, or 1, by default.")
+@seconds_option
+def command(
+    path: str | None,
+    protocol: str | None,
+    nodes: tuple[int, ...] | None,
+    pty: str | None,
+    tcp: tuple[str, int] | None,
+    baud: int | None,
+    paced: bool,
+    reply_delay: Delay | None,
+    faults: tuple[str, ...],
+    seed: int | None,
+    seconds: float | None,
+) -> None:
+    """Emulate the drives of a line until Ctrl-C. The first line printed is the PORT to use.
+
+    With LINE.toml all its nodes, as its [emulator] says, at its port: a TCP port of this machine, or a link to a
+    pseudo-terminal, which is never made under /dev. Without a file node 1 alone unless --nodes names others.
+    """
+    if pty is not None and tcp is not None:
+        raise click.UsageError("either --pty or --tcp, not both")
+    if path is not None:
+        if protocol is not None or nodes is not None or baud is not None:
+            raise click.UsageError("the file says protocol, nodes and baud rate")
+        file = load(path)
+        if pty is None and tcp is None:
+            pty, tcp = own_port(file.port)
+        line = line_of(file, reply_delay, faults, seed, paced)
+    else:
+        line = drives(protocol, nodes, baud, reply_delay, faults, seed, paced)
+    with serve(line, pty, tcp) as server:
+        emit(server.path)
+        serve_for(seconds)
+
+
+def serve_for(seconds: float | None) -> None:
+    """Wait so many seconds, or for ever, while the line's own thread serves it.
+
+    A signal that the system hands to that thread wakes nobody here, so that it is looked for.
+    """
+    end = inf if seconds is None else time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        time.sleep(min(left, LOOK_FOR_SIGNALS))
+
+
+def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: int | None, paced: bool) -> Line:
+    """Return the file's line; what the command line says goes before what the file says."""
+    ConfiguredLine(file, outputs=False)  # what is wrong in it is said here as everywhere
+    line = emulated_line(file, paced=paced or None, seed=seed)
+    for device in line.devices:
+        device.delay = delay or device.delay
+        device.faults = parsed(Faults.parse, faults) if faults else device.faults
+    return line
+
+
+def own_port(port: SerialPort | TcpPort) -> tuple[str | None, tuple[str, int] | None]:
+    """Return the link, or the address, by which `busmaster run` with the same file will find the line."""
+    if isinstance(port, TcpPort):
+        return None, (port.host, port.port)
+    is_device = port.path.startswith(USB) or os.path.abspath(port.path).startswith("/dev/")
+    return None if is_device else port.path, None
+
+
+def drives(
+    protocol: str | None,
+    nodes: tuple[int, ...] | None,
+    baud: int | None,
+    delay: Delay | None,
+    faults: tuple[str, ...],
+    seed: int | None,
+    paced: bool,
+) -> Line:
+    """Make the line that the command line says, without a file. Raises UsageError."""
+    if protocol is None:
+        raise click.UsageError("name a LINE.toml, or the drives: --protocol P")
+    profile = find(protocol).profile
+    devices = [make_device(protocol, address, delay=delay) for address in nodes_to_emulate(profile, nodes)]
+    wrong = parsed(Faults.parse, faults)
+    for device in devices:
+        device.faults = wrong
+    chance = random.Random(1 if seed is None else seed)
+    return Line(line_settings(profile, baud), devices, chance=chance, paced=paced)
+
+
+def nodes_to_emulate(profile: Profile, nodes: Sequence[int] | None) -> Sequence[int]:
+    """Return the addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
+    if nodes is not None:
+        return single_nodes(profile, nodes)
+    return (1,) if 1 in profile.addresses else profile.addresses[:1]
+
+
+def serve(line: Line, link: str | None, address: tuple[str, int] | None) -> LineServer:
+    """Serve the line on TCP if there is an address, else on a pty. Raises LineDown for what cannot be had."""
+    try:
+        return serve_tcp(line, *address) if address else serve_pty(line, link or None)
+    except OSError as error:
+        where = f"{address[0]}:{address[1]}" if address else link or "a pseudo-terminal"
+        hint = "use another port, or 0 for a free one" if address else "name a link that is not there yet"
+        what = os.strerror(error.errno) if error.errno else str(error)
+        raise LineDown(f"cannot serve on {where}: {what}", hint=hint) from error

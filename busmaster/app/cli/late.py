@@ -1,0 +1,69 @@
+"""Nodes that answer after their reply window: the commands say so, and which window would fit."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio
+
+from busmaster import Bus
+from busmaster.app.cli.output import Level, note
+from busmaster.app.service.remote import RemoteBus
+from busmaster.errors import NoReply
+from busmaster.events import MaxReplyDelayRaised, RepliesLate
+
+STEP = 0.05
+"""Suggested windows are multiples of this many seconds."""
+ROOM = 1.5
+"""How much longer than the late answer took they are."""
+
+
+class LateNodes:
+    """The nodes of a bus that have answered late, and after how many seconds."""
+
+    def __init__(self, *, in_file: bool = False) -> None:
+        self._in_file = in_file
+        self._ages: dict[int, tuple[str, float]] = {}
+
+    async def listen(self, bus: Bus | RemoteBus) -> None:
+        """Note late answers, until cancelled."""
+        async for event in bus.events():
+            if isinstance(event, MaxReplyDelayRaised | RepliesLate):
+                self._ages[event.node.address] = (event.node.label, event.age)
+
+    async def explain(self, error: NoReply, max_reply_delay: float) -> None:
+        """Say in an error what to try where its node is only late. Waits as long as the answer may still come."""
+        await anyio.sleep(max_reply_delay)
+        if error.address is not None and error.address in self._ages:
+            _, age = self._ages.pop(error.address)
+            error.hint = advice(age)
+
+    def tell(self) -> None:
+        """Print on standard error, once for each late node, what to try."""
+        for label, age in self._ages.values():
+            note(f"{label}: {advice(age, in_file=self._in_file)}", Level.WARNING)
+        self._ages.clear()
+
+
+def advice(age: float, *, in_file: bool = False) -> str:
+    """Return what to try for a node that has answered after so many seconds: an option, or what to write `in_file`."""
+    window = math.ceil(ROOM * age / STEP) * STEP
+    what = f"set timing = {{ window = {window:g} }} in its section" if in_file else f"try --timeout {window * 1000:.0f}"
+    return f"it answers late, after {age * 1000:.0f} ms: {what}"
+
+
+@asynccontextmanager
+async def late_nodes(bus: Bus | RemoteBus, *, in_file: bool = False) -> AsyncIterator[LateNodes]:
+    """Listen for late answers on an open bus until the end of the block, where those not told yet are told."""
+    late = LateNodes(in_file=in_file)
+    listening = asyncio.create_task(late.listen(bus))
+    await asyncio.sleep(0)  # it hears from now on
+    try:
+        yield late
+    finally:
+        await asyncio.sleep(0)  # it hears what came last
+        listening.cancel()
+        late.tell()

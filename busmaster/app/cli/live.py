@@ -1,0 +1,355 @@
+"""The screen: draws the picture of a line, and says to the line's owner what the person wishes."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from functools import partial
+from typing import Any, ClassVar, Protocol
+
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.widgets import Static
+
+from busmaster.app.cli.app import INTERRUPTED
+from busmaster.app.cli.cells import column_widths, fit, gauge_line, group_line, header_line, row_line, title_line
+from busmaster.app.cli.details import details_text
+from busmaster.app.cli.dialog import STYLE as STYLE_OF_DIALOGS
+from busmaster.app.cli.dialog import AskValue, AskWords, AskYes, Show
+from busmaster.app.cli.parsing import parse_value
+from busmaster.app.cli.table import Table
+from busmaster.app.service.picture import Frame, Group, Node, Picture, Row, matching
+from busmaster.errors import BusError, InvalidCommand
+
+SUSPENDED_FOR = 60.0
+SILENT_AFTER = 2.0
+"""Seconds without a word of the line's owner after which that is said."""
+ASKED_EVERY = 1.0
+"""Seconds between two questions for the details that are shown."""
+EVENTS = 3
+ORDERS = ("listed", "item", "oldest", "trouble")
+STYLE = """
+Screen { background: ansi_default; color: ansi_default; }
+Screen Static { background: ansi_default; color: ansi_default; }
+#head, #columns, #foot { height: auto; }
+"""
+KEYS = (
+    ("?", "keys"),
+    ("q", "quit"),
+    ("Enter", "details"),
+    ("/", "filter"),
+    ("o", "order"),
+    ("p", "pause"),
+    ("s", "suspend"),
+    ("w", "write"),
+    ("d", "poll now"),
+)
+HELP = """\
+?       these keys
+↑ ↓     another row; also Page up, Page down, Home, End
+Enter   details of the row: limits, last exchange, past
+/       only rows with some words: node, item, group, health
+o       order: by node, by item, oldest first, trouble first
+p P     pause the row's group, all groups; again: go on
+d D     poll the row's group now, all groups
+s       suspend the row's node, or let it go on (asks)
+w       write the row's point (asks)
+q       {leave}
+Ctrl-C  the same, with exit status 130
+
+!  could not be read: its last good value, growing old
+↑ ↓  beyond its limit     ~  came late     ?  older than a write to it"""
+
+
+class Line(Protocol):
+    """What a person may do on a line."""
+
+    async def pause(self, group: str, paused: bool, /) -> None: ...
+
+    async def demand(self, group: str, /) -> None: ...
+
+    async def suspend(self, protocol: str, address: int, for_: float, /) -> None: ...
+
+    async def details(self, group: str, key: str, /) -> Mapping[str, Any]: ...
+
+    async def write(self, group: str, key: str, value: Any, /) -> None: ...
+
+
+class Screen(App[int]):
+    """Draws `picture` whenever `take_picture` says that there is news. Its result is an exit status."""
+
+    ENABLE_COMMAND_PALETTE = False
+    CSS = f"{STYLE}{STYLE_OF_DIALOGS}"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "leave(0)", show=False),
+        Binding("ctrl+c", f"leave({INTERRUPTED})", show=False, priority=True),
+        Binding("question_mark,h,f1", "help", show=False),
+        Binding("enter", "details", show=False),
+        Binding("slash", "filter", show=False),
+        Binding("o", "order", show=False),
+        Binding("p", "pause(False)", show=False),
+        Binding("P", "pause(True)", show=False),
+        Binding("d", "demand(False)", show=False),
+        Binding("D", "demand(True)", show=False),
+        Binding("s", "suspend", show=False),
+        Binding("w", "write", show=False),
+    ]
+
+    def __init__(self, picture: Picture, line: Line, *, read_only: bool = False, leave: str = "leave") -> None:
+        super().__init__(ansi_color=True)  # the terminal's own colours; and none at all with NO_COLOR
+        self.picture = picture
+        self.line = line
+        self.read_only = read_only
+        self.leave = leave
+        """What q does, in words."""
+        self.words = ""
+        self.order = ORDERS[0]
+        self.said: tuple[float, str] | None = None
+        """What became of the last wish, and when."""
+        self.away = ""
+        """Why the line's owner is not there, "" while it is."""
+        self.heard = time.monotonic()
+        self.head = Static(id="head")
+        self.columns = Static(id="columns")
+        self.table = Table(self._row_line)
+        self.foot = Static(id="foot")
+        self._widths = column_widths(80)
+        self._frame: Frame | None = None
+        """Of the rows that are drawn: the picture may be another's by now, who has told nothing yet."""
+        self._of_node: Mapping[tuple[str, int], Node] = {}
+        self._of_group: Mapping[str, Group] = {}
+        self._due = False
+
+    def compose(self) -> ComposeResult:
+        yield from (self.head, self.columns, self.table, self.foot)
+
+    def on_mount(self) -> None:
+        """Begin to draw."""
+        self.theme = "ansi-dark"
+        self.table.focus()
+        self.set_interval(SILENT_AFTER / 2, self.draw)
+        self.draw()
+
+    def on_resize(self) -> None:
+        """Fit the picture to the terminal's new size."""
+        self.call_after_refresh(self.draw)
+
+    # drawing
+
+    def take_picture(self) -> None:
+        """Draw what there is news of, soon. May be called from outside."""
+        self.heard = time.monotonic()
+        if not self._due and self.is_running:
+            self._due = True
+            self.call_later(self.draw)
+
+    def draw(self) -> None:
+        """Draw all that there is."""
+        self._due = False
+        frame = self.picture.frame
+        if frame is None:
+            self.head.update(Text(fit(" waiting for the program that owns the line", self.size.width)))
+            return
+        self._widths = column_widths(self.size.width)
+        self._frame = frame
+        self._of_node = self.picture.nodes
+        groups = self.picture.groups
+        self._of_group = {group.name: group for group in groups}
+        self.table.show(self._rows())
+        self.head.update(self._head(frame, groups))
+        self.columns.update(header_line(self._widths))
+        self.foot.update(self._foot(frame))
+
+    def _rows(self) -> list[Row]:
+        places = {key: place for place, key in enumerate(self._of_node)}
+        rows = sorted(
+            matching(self.picture.rows, self._of_node, self.words),
+            key=lambda row: places.get((row.protocol, row.address), len(places)),
+        )
+        match self.order:
+            case "item":
+                rows.sort(key=lambda row: row.item)
+            case "oldest":
+                rows.sort(key=lambda row: -1.0 if row.asked is None else row.asked)
+            case "trouble":
+                rows.sort(key=self._soundness)
+        return rows
+
+    def _soundness(self, row: Row) -> tuple[bool, bool, bool, bool]:
+        node = self._of_node.get((row.protocol, row.address))
+        up = node is not None and node.health == "up"
+        return not row.error, up, not row.alarm, row.quality not in ("late", "stale")
+
+    def _row_line(self, row: Row, selected: bool) -> Text:
+        assert self._frame is not None
+        node, group = self._of_node.get((row.protocol, row.address)), self._of_group.get(row.group)
+        return row_line(row, node, group, self._frame, self._widths, selected)
+
+    def _head(self, frame: Frame, groups: list[Group]) -> Text:
+        width, room = self.size.width, max(1, self.size.height // 8)
+        lines = [title_line(frame, width, self._trouble()), gauge_line(frame, width)]
+        shown = groups
+        if len(groups) > room:  # the selected row's is among those that are shown
+            row = self.table.selected
+            first = [group for group in groups if row is not None and group.name == row.group]
+            shown = (first + [group for group in groups if group not in first])[: max(1, room - 1)]
+        lines += [group_line(group, width) for group in shown]
+        if len(shown) < len(groups):
+            lines.append(Text(fit(f" and {len(groups) - len(shown)} more groups", width)))
+        if frame.left_out:
+            lines.append(Text(fit(f" {frame.left_out} points more than are shown", width), "bold"))
+        return Text("\n").join(lines)
+
+    def _trouble(self) -> str:
+        """Return why what is shown may be old, "" while there is news."""
+        silent = time.monotonic() - self.heard
+        if self.away:
+            return "its owner is away"
+        return f"no news for {silent:.0f} s" if silent > SILENT_AFTER else ""
+
+    def _foot(self, frame: Frame) -> Text:
+        width, row = self.size.width, self.table.selected
+        lines: list[Text] = []
+        if self.away:
+            lines.append(Text(fit(f" {self.away}", width), "bold"))
+        if row is not None and row.error:
+            lines.append(Text(fit(f" {row.name}: {row.error}", width), "bold"))
+        happened = [*frame.events, *([self.said] if self.said else [])]
+        began = frame.now - frame.elapsed
+        for when, text in sorted(happened)[-EVENTS if self.size.height >= 24 else -1 :]:
+            lines.append(Text(fit(f" {when - began:7.1f} s  {text}", width)))
+        shown = [
+            text for text in (self.words and f"filter: {self.words}", self.order != "listed" and self.order) if text
+        ]
+        lines.append(keys_line(width, self.leave, ", ".join(shown)))
+        return Text("\n").join(lines)
+
+    # what the person wishes
+
+    def _wish(self, what: str, doing: Callable[[], Coroutine[Any, Any, None]], done: str = "") -> None:
+        """Have it done while the picture goes on, and say what became of it."""
+
+        async def run() -> None:
+            try:
+                await doing()
+            except (BusError, InvalidCommand) as error:
+                self._say(f"{what}: {error.what if isinstance(error, BusError) else error}")
+            else:
+                if done:
+                    self._say(done)
+
+        self.run_worker(run(), exit_on_error=False)
+
+    def _say(self, text: str) -> None:
+        self.said = (self.picture.frame.now if self.picture.frame else 0.0), text
+        self.draw()
+
+    def action_leave(self, status: int) -> None:
+        """End it."""
+        self.exit(status)
+
+    def action_help(self) -> None:
+        """Show the keys."""
+        self.push_screen(Show(Text(HELP.format(leave=self.leave))))
+
+    def action_filter(self) -> None:
+        """Ask which rows are shown."""
+
+        def take(words: str | None) -> None:
+            if words is not None:
+                self.words = words
+                self.draw()
+
+        self.push_screen(AskWords(self.words), take)
+
+    def action_order(self) -> None:
+        """Show the rows in another order."""
+        self.order = ORDERS[(ORDERS.index(self.order) + 1) % len(ORDERS)]
+        self.draw()
+
+    def _chosen(self, all_groups: bool) -> list[Group]:
+        row = self.table.selected
+        return [group for group in self._of_group.values() if all_groups or (row and group.name == row.group)]
+
+    def action_pause(self, all_groups: bool) -> None:
+        """Pause the row's group, or all groups, or go on with what is paused."""
+        groups = self._chosen(all_groups)
+        paused = not all(group.paused for group in groups)
+        for group in groups:
+            self._wish(f"pause {group.name}", partial(self.line.pause, group.name, paused))
+
+    def action_demand(self, all_groups: bool) -> None:
+        """Poll the row's group, or all groups, now."""
+        for group in self._chosen(all_groups):
+            self._wish(f"poll {group.name}", partial(self.line.demand, group.name))
+
+    def action_suspend(self) -> None:
+        """Ask whether the row's node is to be suspended, or to go on."""
+        row = self.table.selected
+        node = self._of_node.get((row.protocol, row.address)) if row is not None else None
+        if node is None:
+            return
+        rests = node.health == "suspended"
+        question = (
+            f"let {node.label} go on" if rests else f"suspend {node.label} for {SUSPENDED_FOR:.0f} s, all its polls"
+        )
+
+        def take(meant: bool | None) -> None:
+            if meant:
+                seconds = 0.0 if rests else SUSPENDED_FOR
+                self._wish(question, partial(self.line.suspend, node.protocol, node.address, seconds))
+
+        self.push_screen(AskYes(f"{question}?"), take)
+
+    def action_write(self) -> None:
+        """Ask for a value of the selected point, and again whether to write it."""
+        row, frame = self.table.selected, self.picture.frame
+        if row is None or frame is None:
+            return
+        if self.read_only or frame.read_only or not row.writable:
+            self._say(f"{row.name} is read-only" if not row.writable else "this view is read-only")
+            return
+
+        def take(text: str | None) -> None:
+            if text is not None:
+                name = f"{row.name} = {text}"
+                self._wish(name, partial(self.line.write, row.group, row.key, parse_value(text)), f"{name} written")
+
+        self.push_screen(AskValue(row.name, row.unit), take)
+
+    def action_details(self) -> None:
+        """Show all that is known of the selected point, as it changes."""
+        row = self.table.selected
+        if row is None:
+            return
+        shown = Show(self._details(row, {}))
+
+        async def follow() -> None:
+            await self.push_screen(shown)
+            while shown.is_attached:
+                try:
+                    told = await self.line.details(row.group, row.key)
+                except (BusError, InvalidCommand) as error:
+                    told = {"gone": str(error)}
+                shown.update(self._details(row, told))
+                await asyncio.sleep(ASKED_EVERY)
+
+        self.run_worker(follow(), exit_on_error=False)
+
+    def _details(self, row: Row, told: Mapping[str, Any]) -> Text:
+        now = next((one for one in self.picture.rows if one.identity == row.identity), row)
+        node, group = self._of_node.get((row.protocol, row.address)), self._of_group.get(row.group)
+        return details_text(now, node, group, told, self.picture.frame, max(20, self.size.width - 4))
+
+
+def keys_line(width: int, leave: str, shown: str) -> Text:
+    """Draw the keys, as many as there is room for, and what is shown of the rows."""
+    line = Text(f" {shown} " if shown else " ", "reverse" if shown else "")
+    for key, label in KEYS:
+        more = Text.assemble((key, "bold"), f" {leave if key == 'q' else label}  ")
+        if line.cell_len + more.cell_len > width:
+            break
+        line = Text.assemble(line, more) if line.cell_len > 1 else Text.assemble(" ", more)
+    return line

@@ -1,0 +1,114 @@
+"""Arguments as they are written: each reader refuses what is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import click
+
+from busmaster import LEARNED
+from busmaster.errors import InvalidCommand
+from busmaster.ext import Learned, is_decimal
+from busmaster.registry import kinds
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+LONGEST_WINDOW = 60.0
+"""Seconds. Maximum reply delay moves with it, and a line is first listened to for that long."""
+
+
+class Whole(click.IntRange):
+    """Says "is not a valid whole number" of what is none."""
+
+    name = "whole number"
+
+
+def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
+    """Return a reader for click's `type=`.
+
+    A value that `parse` refuses with InvalidCommand is wrong usage of that option.
+    """
+
+    def convert(text: str) -> T:
+        try:
+            return parse(text)
+        except InvalidCommand as error:
+            raise click.BadParameter(str(error)) from None
+
+    return convert
+
+
+def parse_nodes(text: str) -> tuple[int, ...]:
+    """Return the addresses of `1-8,255`. Raises InvalidCommand."""
+    addresses: dict[int, None] = {}
+    for part in text.split(","):
+        first, dash, last = (piece.strip() for piece in part.partition("-"))
+        if not is_decimal(first) or (dash and not is_decimal(last)):
+            raise InvalidCommand(f"a node list is written like 1-8,255, not {text!r}")
+        start, stop = int(first), int(last or first)
+        if start > stop:
+            raise InvalidCommand(f"a range goes upwards: {stop}-{start}, not {part.strip()}")
+        if not any(stop in kind.profile.addresses or stop == kind.profile.broadcast for kind in kinds().values()):
+            raise InvalidCommand(f"no protocol has a node {stop}")
+        addresses.update(dict.fromkeys(range(start, stop + 1)))
+    return tuple(addresses)
+
+
+def parse_seconds(text: str) -> float:
+    """Return a time in seconds, above 0. Raises InvalidCommand for any other."""
+    seconds = parse_value(text)
+    if not 0 < seconds < float("inf"):
+        raise InvalidCommand(f"a time is above 0, not {text}")
+    return seconds
+
+
+def parse_window(text: str) -> float | Learned:
+    """Read a reply window in milliseconds, or `learned`, and return it in seconds.
+
+    Raises InvalidCommand for one that is far too long.
+    """
+    if text == "learned":
+        return LEARNED
+    seconds = parse_seconds(text) / 1000
+    if seconds > LONGEST_WINDOW:
+        raise InvalidCommand(f"a reply window is at most {LONGEST_WINDOW * 1000:.0f} ms, not {text}")
+    return seconds
+
+
+def parse_items(text: str) -> tuple[str, ...]:
+    """Return the items of `--items a,b,c`. Raises InvalidCommand for none."""
+    items = tuple(item for item in (part.strip() for part in text.split(",")) if item)
+    if not items:
+        raise InvalidCommand("--items names at least one item")
+    return tuple(dict.fromkeys(items))
+
+
+def parse_assignment(text: str) -> tuple[str, tuple[float, ...]]:
+    """Return the item and the numbers of `ITEM=VALUE[,VALUE...]`. Raises InvalidCommand."""
+    item, equals, values = text.partition("=")
+    if not equals or not item.strip() or not values.strip():
+        raise InvalidCommand(f"an assignment is written ITEM=VALUE, like 1=123.456, not {text!r}")
+    return item.strip(), tuple(parse_value(part) for part in values.split(","))
+
+
+def parse_value(text: str) -> float:
+    """Return the number; a whole one stays whole. Hexadecimal (0x41) is taken for the words. Raises InvalidCommand."""
+    text = text.strip()
+    try:
+        return int(text, 16) if text.lower().startswith("0x") else int(text)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        raise InvalidCommand(f"{text!r} is no number") from None
+
+
+def parsed(parse: Callable[[S], T], value: S) -> T:
+    """Return what `parse` makes of an argument; what it refuses is wrong usage. Raises UsageError."""
+    try:
+        return parse(value)
+    except InvalidCommand as error:
+        raise click.UsageError(str(error), click.get_current_context()) from None

@@ -1,0 +1,233 @@
+"""`busmaster run`: poll what a file says, with its outputs."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+import anyio
+import click
+
+from busmaster import ext
+from busmaster.app.cli.app import FAILED, OK
+from busmaster.app.cli.arguments import View, viewed
+from busmaster.app.cli.audit_log import AuditLog
+from busmaster.app.cli.capturing import capture_option, capturing
+from busmaster.app.cli.ending import Ending, until_ended
+from busmaster.app.cli.hangups import Hangups
+from busmaster.app.cli.lines import file_argument, load, other_port, port_option
+from busmaster.app.cli.output import Level, note, number_text
+from busmaster.app.cli.plan import losses_text
+from busmaster.app.cli.reaching import check_no_owner
+from busmaster.app.cli.safe import tell_unsafe
+from busmaster.app.cli.serving import secrets_of, served, service_of
+from busmaster.app.cli.systemd import ServiceManager
+from busmaster.app.cli.watching import Watch, follow
+from busmaster.app.config import LineFile
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.outputs.base import OutputStatistics
+from busmaster.errors import InvalidCommand
+
+SWITCH_INTERVAL = 0.0005
+"""Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
+WORTH_SAYING = 0.005
+"""Share of the line that learned reply times would spare below which nothing is said of them."""
+FAREWELL = 2.0
+"""Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
+
+
+@click.command(short_help="Poll what a file says, with its outputs.")
+@file_argument()
+@port_option
+@capture_option
+@viewed
+def command(path: str, port: str | None, capture: str | None, view: View) -> int:
+    """Poll the groups of LINE.toml until a signal ends it, and feed the outputs that it enables.
+
+    On a terminal a live table; else, or with --plain, a line for each value; with --json one for each cycle. A summary
+    on standard error ends it: of groups, of nodes, and of what each output has written and dropped. There each write
+    from outside is told too, with what became of it. An output that is slow or down never holds up the line. A port
+    that is missing is waited for. SIGHUP has the file read again.
+
+    When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
+    confirmed; else 0 after SIGTERM, 130 after Ctrl-C, and 128 and its number after another signal.
+    """
+    with Hangups() as hangups:  # first of all: SIGHUP ends a process that does not hear it
+        return run(path, port, capture, view, hangups)
+
+
+def run(path: str, port: str | None, capture: str | None, view: View, hangups: Hangups) -> int:
+    """Run the line of a file until it is told to end, and return the exit status."""
+    file = load(path)
+    endpoint = other_port(file, port)
+    where = endpoint or file.port
+    check_no_owner(where)
+    protocols = {node.protocol for node in file.nodes.values()}
+    only = protocols.pop() if len(protocols) == 1 else ""
+    usual = sys.getswitchinterval()
+    context = click.get_current_context()
+    context.call_on_close(lambda: sys.setswitchinterval(usual))
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
+        line = ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only)
+        line.authorisation.take_secrets(secrets_of(file))
+        running = Running(
+            line,
+            path,
+            view,
+            hangups,
+            ending := context.find_object(Ending),
+        )
+        if ending is not None:
+            ending.patience = running.line.safe_state.within + FAREWELL
+        try:
+            with AuditLog(running.watch.may_print):
+                status = until_ended(running.run)
+        except (KeyboardInterrupt, SystemExit) as ended:
+            stopped = isinstance(ended, SystemExit) and ended.code == 128 + signal.SIGTERM
+            if running.left_safely and not stopped:
+                raise
+            status = OK  # how a service is stopped is no failure of it
+        return status if running.left_safely else FAILED
+
+
+class Running:
+    """One line that runs as a file says, until it is told to end. `left_safely` says whether its safe state holds."""
+
+    def __init__(self, line: ConfiguredLine, path: str, view: View, hangups: Hangups, ending: Ending | None) -> None:
+        self.line = line
+        self.left_safely = True
+        self._leaving = False
+        self._path = path
+        self._view = view
+        self._hangups = hangups
+        self._ending = ending
+        self.watch = Watch(line.bus, line.file.title, view, authorisation=line.authorisation, steady=True, of_file=True)
+        self._manager = ServiceManager()
+
+    async def run(self) -> int:
+        """Run the line until it is told to end, send its safe state, and return the exit status."""
+        entered = False
+        self.line.outputs.tell = self._tell_of_output
+        service = service_of(self.line)  # now: it keeps what happens as the line is opened
+        if service is not None:
+            service.tell = self._tell_of_refusals
+        try:
+            async with self.line:
+                entered = True
+                try:
+                    async with served(service, tell=self._view.silent) as self.watch.service:
+                        return await self._poll()
+                finally:
+                    await self._leave()
+        finally:
+            for counts in self.line.outputs.statistics() if entered else ():
+                note(output_text(counts))
+            self._manager.close()
+
+    async def _poll(self) -> int:
+        for group in self.line.groups.values():
+            self.watch.add(group)
+        self._say_what_is_polled()
+        self._manager.ready()
+
+        async def beside() -> None:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._manager.show_life, self.line.bus)
+                tasks.start_soon(self._hear_hangups)
+                tasks.start_soon(self._say_what_learning_would_gain)
+                try:
+                    await anyio.sleep_forever()
+                finally:
+                    # at once: what is shown may take its time to end, and so may an output that a new file replaces
+                    await self._leave()
+
+        return await follow(self.watch, beside)
+
+    def _say_what_is_polled(self) -> None:
+        if not self.line.groups:
+            note("nothing is polled: the file has no [groups.NAME]", Level.WARNING)
+        if self.line.safe_state:
+            writes = (f"{write.point.key} = {number_text(write.value)}" for write in self.line.safe_state.writes)
+            note(f"safe state: when this ends, {', '.join(writes)} within {self.line.safe_state.within:g} s")
+        else:
+            note("no safe state: when this ends, nodes keep what was written to them last (see [safe])")
+
+    async def _say_what_learning_would_gain(self) -> None:
+        """Say once what learned reply times would spare of the line, where a node has none."""
+        if self.line.groups and any(node.could_learn for node in self.line.file.nodes.values()):
+            losses = (await ext.plan_in_steps(self.line.bus)).losses
+            if losses.documented - losses.learned >= WORTH_SAYING:
+                note(losses_text(losses))
+
+    async def _hear_hangups(self) -> None:
+        while True:
+            await self._hangups.next()
+            await self._read_again()
+
+    async def _read_again(self) -> None:
+        """Go on as the file says now, and with whatever device has the port's name.
+
+        A file that is wrong is told, and the line goes on as it was.
+        """
+        self._manager.reloading()
+        ext.accept_device(self.line.bus)
+        try:
+            file, secrets = await anyio.to_thread.run_sync(self._checked_file)
+            await self.line.take(file)
+            self.line.authorisation.take_secrets(secrets)
+        except (InvalidCommand, OSError) as error:
+            note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
+        else:
+            if self.watch.service is not None:
+                self.watch.service.line.title = file.title
+            self.watch.replace_groups(self.line.groups.values())
+            note(f"{self._path} was read again", Level.NOTICE)
+            self._say_what_is_polled()
+        self._manager.ready()
+
+    def _checked_file(self) -> tuple[LineFile, dict[str, bytes]]:
+        """Load the file and its tokens, and check them.
+
+        Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
+        """
+        file = load(self._path)
+        # made for its complaints alone: `take` wants a file of which a line can be made
+        ConfiguredLine(file, port=self.line.bus.endpoint)
+        return file, secrets_of(file)
+
+    def _tell_of_output(self, text: str) -> None:
+        down = any(counts.error for counts in self.line.outputs.statistics())
+        self.watch.announce(text, Level.WARNING if down else Level.NOTICE)
+
+    def _tell_of_refusals(self, text: str) -> None:
+        """Report what the service refused, unless the screen shows it among the events of the line."""
+        if self.watch.may_print():
+            note(text, Level.WARNING)
+
+    def _why(self) -> str:
+        """Return what ends the run."""
+        number = self._ending.number if self._ending is not None else 0
+        return signal.Signals(number).name if number else "the end of the run"
+
+    async def _leave(self) -> None:
+        """Send the safe state, once: nothing else is written any more."""
+        if self._leaving:
+            return
+        self._leaving = True
+        self._manager.stopping()
+        if self.line.safe_state:
+            outcomes = await self.line.safe_state.enter(self.line.authorisation, self._why())
+            self.left_safely = tell_unsafe(outcomes) == OK
+            if self.left_safely:
+                note(f"the safe state is confirmed: {', '.join(outcomes)}", Level.NOTICE)
+
+
+def output_text(counts: OutputStatistics) -> str:
+    """Return the line that says what an output has written and dropped, and what it is down with."""
+    text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
+    if counts.suppressed:
+        text += f", {counts.suppressed} suppressed as no news"
+    if counts.spilled:
+        text += f", {counts.spilled} kept on disk for the next time"
+    return f"{text}, down: {counts.error}" if counts.error else text

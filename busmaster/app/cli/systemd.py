@@ -1,0 +1,97 @@
+"""What systemd is told of a service, by datagrams: that it is ready, that it lives, that it reloads, that it stops.
+
+The protocol is a few lines (sd_notify): NAME=VALUE, a line each, to the socket that NOTIFY_SOCKET names.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Mapping
+
+import anyio
+
+from busmaster import Bus, Health, LineState
+
+AT_LEAST = 0.1
+"""Seconds from one sign of life to the next, whatever was asked for."""
+
+
+class ServiceManager:
+    """Tells systemd, or nobody where there is none. Nothing that goes wrong with it holds up or ends anything.
+
+    `interval` is the seconds within which systemd wants a sign of life, 0 for none.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        path = environment.get("NOTIFY_SOCKET", "")
+        # @ stands for the zero byte that begins an abstract address
+        self._address = "\0" + path[1:] if path.startswith("@") else path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if path else None
+        if self._socket is not None:
+            self._socket.setblocking(False)  # a manager that does not read holds up no line
+        micros = environment.get("WATCHDOG_USEC", "")
+        # a child inherits what was meant for its parent: the process id tells
+        wanted = micros.isdecimal() and environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self.interval = int(micros) / 1e6 if wanted and path else 0.0
+
+    def tell(self, **fields: str | int) -> None:
+        """Send these fields, as one message."""
+        if self._socket is not None:
+            text = "\n".join(f"{name}={value}" for name, value in fields.items())
+            try:
+                self._socket.sendto(text.encode(), self._address)
+            except OSError:
+                pass
+
+    def ready(self) -> None:
+        """Say that the service does what it is for; also after `reloading`."""
+        self.tell(READY=1)
+
+    def reloading(self) -> None:
+        """Say that the service reads its file again, until it is `ready`."""
+        self.tell(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
+
+    def stopping(self) -> None:
+        """Say that the service ends, in order."""
+        self.tell(STOPPING=1)
+
+    def close(self) -> None:
+        """Close the socket; nothing is told any more."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    async def show_life(self, bus: Bus) -> None:
+        """Give a sign of life twice an interval, as long as the line moves; until cancelled."""
+        if not self.interval:
+            return
+        movement = Movement(bus)
+        while True:
+            if movement.goes_on(self.interval):
+                self.tell(WATCHDOG=1)
+            await anyio.sleep(max(AT_LEAST, self.interval / 2))
+
+
+class Movement:
+    """Whether a line does what it is to do: exchanges go over it, not only the loop round."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._exchanges = -1
+        self._since = bus.now()
+
+    def goes_on(self, patience: float) -> bool:
+        """Tell whether there was an exchange in the last `patience` seconds, or in two periods if those are longer.
+
+        A line has no reason to move while its port is away (it is opened again, and that is told), while nothing is
+        polled, or while every node is down or suspended.
+        """
+        now = self._bus.now()
+        exchanges = self._bus.statistics().exchanges
+        periods = [group.period for group in self._bus.groups if group.points and not group.paused]
+        asked = any(node.health is not Health.DOWN and not node.suspended for node in self._bus.nodes)
+        if exchanges != self._exchanges or not periods or not asked or self._bus.state is LineState.OFFLINE:
+            self._exchanges, self._since = exchanges, now
+        return now - self._since < max(patience, 2 * min(periods, default=0.0))

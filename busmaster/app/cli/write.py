@@ -1,0 +1,153 @@
+"""`busmaster write`: values of one node, or points of a file, acknowledged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import click
+
+from busmaster import Point, ext
+from busmaster.app.cli.arguments import Connection, connected, json_option, node_option
+from busmaster.app.cli.capturing import capturing
+from busmaster.app.cli.ending import until_ended
+from busmaster.app.cli.late import late_nodes
+from busmaster.app.cli.lines import is_line_file, keep, load
+from busmaster.app.cli.output import emit, json_line, note
+from busmaster.app.cli.parsing import Whole, parse_assignment, parsed
+from busmaster.app.cli.protocols import ItemCommand
+from busmaster.app.cli.reaching import owner_of, reach, tell_owner
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.service.authorisation import Wish
+from busmaster.app.service.record import WriteRecord
+from busmaster.app.service.remote import connect
+from busmaster.app.service.values import utc
+from busmaster.errors import InvalidCommand
+from busmaster.ext import Send
+from busmaster.registry import find
+
+Pairs = Sequence[tuple[str, tuple[float, ...]]]
+"""What is written, in its order: items, or points of a file, and their values."""
+
+
+@click.command(short_help="Write values of one node, or of a file's points.", cls=ItemCommand)
+@partial(connected, or_file=True)
+@node_option
+@click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]...")
+@click.option("--verify", is_flag=True, help="Read back and compare.")
+@click.option(
+    "--decimals",
+    type=Whole(min=0),
+    metavar="N",
+    help="How many of the last digits on the line are decimals, where it carries no decimal point: 1 for 1.17=-47.6.",
+)
+@json_option
+def command(
+    connection: Connection,
+    node: int | None,
+    assignments: tuple[str, ...],
+    verify: bool,
+    decimals: int | None,
+    as_json: bool,
+) -> None:
+    """Write to one node on PORT, in the order given, and print `ITEM ok` for each.
+
+    Several values go to ITEM and those after it. All values are checked before the first is sent; the first that
+    fails ends it, with those before it written.
+
+    With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit. The file's limits
+    hold, and its outputs keep a record of each write, or of why it was refused. Where another busmaster owns the line,
+    its limits hold, and its outputs keep the record.
+    """
+    pairs = [parsed(parse_assignment, text) for text in assignments]
+    if not is_line_file(connection.port):
+        if decimals is not None and not find(connection.protocol).takes_decimals:
+            raise click.UsageError(f"{connection.protocol} carries the decimal point itself: leave --decimals out")
+        until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
+        return
+    file = load(connection.port)
+    if (owner := owner_of(file.port)) is not None:
+        if connection.capture is not None:
+            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+        tell_owner(owner)
+        until_ended(write_points_through, ConfiguredLine(file, outputs=False), owner.address, pairs, verify, as_json)
+        return
+    with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:
+        until_ended(write_points, ConfiguredLine(file, outputs=False, tap=recorder), pairs, verify, as_json)
+
+
+async def write(
+    connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool, decimals: int | None
+) -> None:
+    """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
+    bus = reach(connection)
+    handle = connection.open_handle(bus, address)
+    if decimals is not None:
+        items = (name for item, values in pairs for name in ext.run_items(handle, item.partition(":")[0], len(values)))
+        with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
+        handle = replace(connection, options=with_decimals).open_handle(bus, address)
+    prepared = [(item, ext.prepare_write(handle, item, values, verify=verify)) for item, values in pairs]
+    async with bus, late_nodes(bus):
+        for item, sends in prepared:
+            for send in sends:
+                await send()
+            tell(item, as_json, node=connection.node_number(address), item=item)
+
+
+async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json: bool) -> None:
+    """Write the pairs to points of a line, as `write` does, and have its outputs keep a record of each."""
+    audit = line.audit(note)  # first: nothing is written of which no record can be kept
+    records: list[WriteRecord] = []
+    line.authorisation.record = records.append
+    try:
+        prepared = [prepare(line, name, values, verify) for name, values in pairs]
+        async with line.bus, late_nodes(line.bus, in_file=True):
+            for wish, send in prepared:
+                await pass_on(line, wish, send)
+                tell(wish.name, as_json, point=wish.name)
+    finally:
+        await keep(audit, records)
+
+
+async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs, verify: bool, as_json: bool) -> None:
+    """Write the pairs to points of a line that another program owns, which holds its limits and keeps the record."""
+    remote = connect(address)
+    prepared = [(name, line.prepare_write(name, values, bus=remote, verify=verify)) for name, values in pairs]
+    async with remote, late_nodes(remote, in_file=True):
+        for name, send in prepared:
+            await send()
+            tell(name, as_json, point=name)
+
+
+def tell(name: str, as_json: bool, **fields: Any) -> None:
+    """Print that what is called so has been written, as a line or as JSON with these fields."""
+    emit(json_line(**fields, ok=True, time=utc(time.time())) if as_json else f"{name} ok")
+
+
+async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
+    """Write one point, of which a record is kept."""
+    with line.authorisation.begin(wish):
+        await send()
+
+
+def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> Wish:
+    """Return what a person wants to have written; without a point, to what is none of the line."""
+    value = values[0] if len(values) == 1 else tuple(values)
+    return Wish(interface="command line", by="busmaster write", name=name, point=point, value=value)
+
+
+def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> tuple[Wish, Send]:
+    """Return what a person wants, and what writes it.
+
+    Raises InvalidCommand, of which a record is kept, for what may not be written, and for no point of the line.
+    """
+    wish = wish_of(name, values)
+    try:
+        wish = wish_of(name, values, line.point(name))
+        return wish, line.prepare_write(name, values, verify=verify)
+    except InvalidCommand as error:
+        line.authorisation.refuse(wish, str(error))
+        raise

@@ -1,0 +1,247 @@
+"""Whether other programs may use the line of a file, who, and how they come: `[service]`."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from busmaster.app.config.keys import REQUIRED, Key, names_of
+from busmaster.app.config.names import NODE_NAME
+from busmaster.app.config.recording import read_mode
+from busmaster.app.config.table import Table
+from busmaster.app.service.permission import digest_of
+from busmaster.app.service.rights import RIGHTS, Role
+from busmaster.app.service.tcp import check_listening
+from busmaster.bounds import LONGEST_FILE, SHORTEST_TOKEN
+from busmaster.errors import InvalidCommand
+from busmaster.ext import LEAST_SHARE, MOST_SHARE, check_regular, host_and_port
+
+K = TypeVar("K")
+
+MODE = 0o600
+ROLES = tuple(role.value for role in Role)
+KEYS = (
+    Key("enabled", "flag", "Whether other programs may come at all.", "true"),
+    Key("group", "text", "The group of this machine whose members may come to the socket, beside this user."),
+    Key(
+        "mode",
+        "mode",
+        "The mode of the socket: 0660 where there is a `group`.",
+        f'"{MODE:04o}"',
+    ),
+    Key(
+        "share",
+        "number",
+        "The share of line time of each program, where the owner's is 1, as long as both wait.",
+        "1",
+        least=LEAST_SHARE,
+        most=MOST_SHARE,
+    ),
+    Key(
+        "listen",
+        "text",
+        "Where programs may come by TCP too, as HOST:PORT; beyond this machine only with `token_file`.",
+    ),
+    Key("token_file", "text", "The file of the tokens that who comes by TCP shows: a name and its token a line."),
+    Key("users", "table", "A table for each user of this machine that has a role: `[service.users.NAME]`."),
+    Key("groups", "table", "A table for each group of this machine that has a role: `[service.groups.NAME]`."),
+    Key("tokens", "table", "A table for each token that has a role: `[service.tokens.NAME]`."),
+)
+"""Of `[service]`."""
+ROLE_KEYS = (
+    Key(
+        "role",
+        "text",
+        "What a program may do: `write` may read too, and `admin` may use line time as the owner does.",
+        REQUIRED,
+        choices=ROLES,
+    ),
+    Key(
+        "allow_writes",
+        "texts",
+        "The points that a writer may write, as groups name points; `*` is any part of a node's name, and behind the "
+        "slash all of the node. Left out: all of the line.",
+    ),
+)
+"""Of each of its users, groups and tokens."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoleSection:
+    """What a user, a group or a token may do. `only`: the points that may be written, as the file has them, if not all
+    may.
+    """
+
+    who: str
+    role: Role
+    only: tuple[str, ...] | None
+    table: Table = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSection:
+    """What `[service]` says: whether a socket is served, its mode, and the number of its group, if it is given one.
+
+    `listen` is where programs may come by TCP, None for nowhere; the tokens that they show are in `token_file`. Roles
+    are by the numbers of users and groups, and by the names of tokens; they may change while the line runs.
+    `share` weighs the line time of each program, where the owner's is 1.
+    """
+
+    enabled: bool
+    mode: int
+    group: int | None
+    share: float
+    listen: tuple[str, int] | None
+    token_file: str | None
+    users: Mapping[int, RoleSection] = field(compare=False)
+    groups: Mapping[int, RoleSection] = field(compare=False)
+    tokens: Mapping[str, RoleSection] = field(compare=False)
+    table: Table = field(compare=False, repr=False)
+
+    def secrets(self) -> dict[str, bytes]:
+        """Read the tokens, and return the digest of each by its name.
+
+        Raises FileError, naming the line and no token, for a file that cannot be read, that others may read, or that
+        has not all tokens of which the section speaks.
+        """
+        if self.token_file is None:
+            return {}
+        with self.table.at("token_file"):
+            secrets = read_tokens(self.token_file)
+        for name, role in self.tokens.items():
+            if name not in secrets:
+                raise role.table.error(f"there is no token {name!r} in {self.token_file}")
+        return secrets
+
+
+def read_service(table: Table) -> ServiceSection:
+    """Read `[service]`. Raises FileError, naming line and key, for what is wrong in it."""
+    table.only(*names_of(KEYS))
+    group = table.text("group", None)
+    mode = read_mode(table, "mode") if "mode" in table else MODE if group is None else 0o660
+    token_file = table.text("token_file", None)
+    listen = None
+    with table.part():
+        if "listen" in table:
+            with table.at("listen"):
+                listen = host_and_port(table.text("listen"))
+                check_listening(listen, tokens=token_file is not None)
+        elif token_file is not None:
+            raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
+    share = table.number("share", 1.0)
+    if not LEAST_SHARE <= share <= MOST_SHARE:
+        raise table.error(f"must be {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share:g}", "share")
+    return ServiceSection(
+        enabled=table.flag("enabled", True),
+        mode=mode,
+        group=None if group is None else _group(table, "group", group),
+        share=share,
+        listen=listen,
+        token_file=token_file,
+        users=_roles(table, "users", lambda each: (_user(each), _role(each, "user"))),
+        groups=_roles(table, "groups", lambda each: (_group(each, None, each.name), _of_group(each, mode))),
+        tokens=_roles(table, "tokens", lambda each: (_token(each, token_file), _role(each, "token"))),
+        table=table,
+    )
+
+
+def _roles(table: Table, key: str, read: Callable[[Table], tuple[K, RoleSection]]) -> dict[K, RoleSection]:
+    """Read `[service.users]`, say, and return the role of each of them."""
+    roles: dict[K, RoleSection] = {}
+    for each in table.tables(key):
+        with each.part():
+            name, roles[name] = read(each)
+    return roles
+
+
+def _role(table: Table, kind: str) -> RoleSection:
+    table.only(*names_of(ROLE_KEYS))
+    role = Role(table.choice("role", ROLES))
+    only = table.texts("allow_writes", None)
+    if only is not None and not (RIGHTS[role].writes and only):
+        raise table.error(
+            'names what a role = "write" or "admin" may write: leave it out for all of the line', "allow_writes"
+        )
+    return RoleSection(f"{kind} {table.name}", role, only, table)
+
+
+def _of_group(table: Table, mode: int) -> RoleSection:
+    if not mode & 0o066:
+        raise table.error(f"no group comes to a socket of mode {mode:04o}: say whose it is, as group = {table.name!r}")
+    return _role(table, "group")
+
+
+def _user(table: Table) -> int:
+    try:
+        return pwd.getpwnam(table.name).pw_uid
+    except KeyError:
+        raise table.error(f"there is no user {table.name!r} on this machine") from None
+
+
+def _group(table: Table, key: str | None, group: str) -> int:
+    try:
+        return grp.getgrnam(group).gr_gid
+    except KeyError:
+        way = () if key is None else (key,)
+        raise table.error(f"there is no group {group!r} on this machine", *way) from None
+
+
+def _token(table: Table, token_file: str | None) -> str:
+    if token_file is None:
+        raise table.error("a token is written in a file of its own: say which, as token_file")
+    return table.name
+
+
+def read_tokens(path: str) -> dict[str, bytes]:
+    """Return the digest of each token of a file by its name. Raises InvalidCommand, naming no token."""
+    secrets = dict(_tokens(path))
+    if not secrets:
+        raise InvalidCommand(f"there are no tokens in {path}: a line is a name and its token")
+    return secrets
+
+
+def _tokens(path: str) -> Iterator[tuple[str, bytes]]:
+    """Yield the names and digests of a file of tokens. Raises InvalidCommand."""
+    known: set[str] = set()
+    for number, line in enumerate(_private_text(path).splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        name = words[0]
+        if len(words) != 2 or not NODE_NAME.fullmatch(name):
+            raise InvalidCommand(f"{path}:{number}: a line is a name and its token")
+        if len(words[1]) < SHORTEST_TOKEN:
+            raise InvalidCommand(
+                f"{path}:{number}: the token of {name} has less than {SHORTEST_TOKEN} characters: "
+                "make one with openssl rand -hex 32"
+            )
+        if name in known:
+            raise InvalidCommand(f"{path}:{number}: there are two tokens {name!r}")
+        known.add(name)
+        yield name, digest_of(words[1])
+
+
+def _private_text(path: str) -> str:
+    """Return what is in a file. Raises InvalidCommand where others may read it, or write it."""
+    try:
+        with open(path, "rb", opener=_without_waiting) as file:
+            found = os.fstat(file.fileno())
+            check_regular(found, path)
+            # A group may read it: so may that of a credential that systemd hands over.
+            if found.st_mode & 0o027 or found.st_uid not in (0, os.getuid()):
+                raise InvalidCommand(f"others may read {path}, or change it: chmod 600 {path}, as its only user")
+            if found.st_size > LONGEST_FILE:
+                raise InvalidCommand(f"{path} has more than {LONGEST_FILE} bytes: this is not a list of tokens")
+            return file.read(LONGEST_FILE).decode()
+    except OSError as error:
+        raise InvalidCommand(f"{path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InvalidCommand(f"{path} is no text") from None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)

@@ -1,0 +1,115 @@
+"""Device templates: the points of one kind of drive, written once and named by each node that is such a drive.
+
+    [nodes.drive4-7]
+    protocol = "microflex"
+    address = "4-7"
+    template = "microflex"                       # shipped; or a file of one's own: "templates/ours.toml"
+
+    [nodes.drive4-7.points]
+    speed_reference = { minimum = 0, maximum = 80 }   # what the template says of it holds beside that
+
+A template is a file with the protocols that it is for, and points as a node has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from busmaster.app.config.keys import REQUIRED, Key, names_of
+from busmaster.app.config.point_section import PointSection, read_point
+from busmaster.app.config.source import FileError, Source
+from busmaster.app.config.table import Table
+from busmaster.ext import guess
+from busmaster.registry import NodeKind, kinds
+
+FOLDERS = Path(__file__).parents[2] / "protocols"
+SUFFIX = ".toml"
+KEYS = (
+    Key("title", "text", "What it is a template of, for people."),
+    Key("protocol", "texts", "The protocol of the nodes that it is for, or several.", REQUIRED),
+    Key("points", "table", "A table for each point, as `[nodes.NAME.points]` has them."),
+)
+"""Of a template's file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Template:
+    """What a template says of each of its points. Without a name it is none."""
+
+    name: str
+    points: Mapping[str, Table]
+
+
+@cache
+def shipped() -> tuple[str, ...]:
+    """Return the names of the templates that come with the package: the TOML files of the protocols' folders."""
+    return tuple(sorted(_shipped()))
+
+
+def shipped_file(name: str) -> Path:
+    """Return the file of a template that comes with the package."""
+    return _shipped()[name]
+
+
+@cache
+def _shipped() -> Mapping[str, Path]:
+    return {path.stem: path for path in FOLDERS.glob(f"*/*{SUFFIX}")}
+
+
+def read_template(node: Table, kind: NodeKind) -> Template:
+    """Read the template that a node's section names, if it names one.
+
+    Raises FileError, naming the file and the line, for a template that there is not, is for others, or is wrong.
+    """
+    if "template" not in node:
+        return Template("", {})
+    name = node.text("template")
+    top = Table(_source(node, name))
+    top.only(*names_of(KEYS))
+    protocols = top.texts("protocol")
+    for protocol in protocols:
+        if protocol not in kinds():
+            raise top.error(f"no such protocol {protocol!r}{guess(protocol, kinds())}", "protocol")
+    if kind.name not in protocols:
+        raise node.error(f"{name} is for nodes of {' and '.join(protocols)}, not of {kind.name}", "template")
+    template = Template(name, {point.name: point for point in top.tables("points")})
+    for point in template.points.values():
+        read_point(point, kind)  # what is wrong in the template is said with its own line
+    return template
+
+
+def _source(node: Table, name: str) -> Source:
+    if name in _shipped():
+        return Source.read(shipped_file(name))
+    if not name.endswith(SUFFIX):
+        others = f": there are {', '.join(shipped())}; a file of one's own ends in {SUFFIX}"
+        raise node.error(f"no such template {name!r}{guess(name, shipped()) or others}", "template")
+    path = node.source.beside(name)
+    try:
+        return Source.read(path)
+    except FileError:
+        raise
+    except OSError as error:
+        raise node.error(f"the template {path} cannot be read: {error.strerror or error}", "template") from None
+
+
+def read_points(node: Table, kind: NodeKind) -> dict[str, PointSection]:
+    """Read the points of a node's section: those of its template, and its own.
+
+    Of a point that both name, each key is as the node has it, and else as the template has it. Raises FileError,
+    naming file, line and key, for what is wrong in either.
+    """
+    template = read_template(node, kind)
+    points = {name: read_point(point, kind, template.name) for name, point in template.points.items()}
+    for own in node.tables("points"):
+        with own.part():
+            given = template.points.get(own.name)
+            if given is None:
+                points[own.name] = read_point(own, kind)
+            else:
+                both = Table(own.source, own.key, {**given.data, **own.data})
+                points[own.name] = read_point(both, kind, template.name)
+    return points

@@ -1,0 +1,287 @@
+"""The course of an examination: the port, its driver, the line while nobody is asked, and then the nodes."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeAlias
+
+import anyio.to_thread
+
+from busmaster import Endpoint, LineSettings, SerialPort, TcpPort, Timings
+from busmaster.app.diagnostics import adapters, diagnosis, uart
+from busmaster.app.diagnostics.adapters import Finding
+from busmaster.app.diagnostics.diagnosis import Record
+from busmaster.app.diagnostics.probing import Outcome, Prober, Wire, opened
+from busmaster.errors import LineDown
+from busmaster.ext import Mark, Profile, Tap
+from busmaster.registry import find
+
+OPENING = 0.05
+"""Seconds in which opening a port may make noise."""
+LISTENING = 0.5
+ECHOING = 0.1
+HARMLESS = bytes.fromhex("00 55 00")
+"""Begins no frame of any protocol, and is no acknowledgement: nobody answers."""
+PROBES = 24
+"""How often a node that lives is asked again."""
+SILENT_PROBES = 3
+"""How often one that was named is asked before it is said to be silent."""
+TOLERANCE = 0.02
+"""By how much the two ends of a line may differ in their rates: together less than half a bit in ten."""
+STRANGERS = 4
+"""How many nodes are asked at each setting that is tried."""
+RATES = (9600, 19200, 38400, 57600, 115200, 4800, 2400)
+FRAMINGS = ((8, "N"), (7, "E"), (8, "E"))
+
+Tell = Callable[[Finding], None]
+
+
+class Progress(Protocol):
+    """Is told of each step of a course whose number of steps is known."""
+
+    def advance(self) -> None: ...
+
+
+class Unseen:
+    """Shows nobody how far it is."""
+
+    def advance(self) -> None:
+        pass
+
+
+Course: TypeAlias = Callable[[str, int], AbstractContextManager[Progress]]
+"""Shows how far a course of so many steps is, for as long as it is entered."""
+
+
+def unseen(_label: str, _steps: int) -> AbstractContextManager[Progress]:
+    """Show nothing."""
+    return nullcontext(Unseen())
+
+
+@dataclass(frozen=True, slots=True)
+class Patient:
+    """What is examined. Without a protocol no node is asked.
+
+    `named`: the user said which nodes there are. `progress` shows how far each course is; nothing does by default.
+    """
+
+    endpoint: Endpoint
+    protocol: str | None = None
+    timings: Timings | None = None
+    addresses: tuple[int, ...] = ()
+    named: bool = False
+    progress: Course = unseen
+
+    @property
+    def profile(self) -> Profile:
+        assert self.protocol is not None
+        return find(self.protocol).profile
+
+    def crowd(self, addresses: Sequence[int]) -> str:
+        """Return how nodes that do not answer are spoken of."""
+        if len(addresses) == 1:
+            return self.profile.label(addresses[0])
+        if len(addresses) > 2 * STRANGERS:
+            return f"any of {len(addresses)} addresses"
+        return f"nodes {', '.join(str(address) for address in addresses)}"
+
+
+async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
+    """Tell all findings, in this order; one that makes the rest pointless is the last."""
+    where = patient.endpoint
+    if isinstance(where, SerialPort):
+        inspect = functools.partial(adapters.inspect, where.path, low_latency=where.low_latency)
+        found = await anyio.to_thread.run_sync(inspect)
+        for finding in found:
+            tell(finding)
+        if not all(finding.ok for finding in found if finding.topic in ("port", "permission", "holders")):
+            return
+    if isinstance(where, TcpPort):
+        what = "the adapter checks do not apply to a TCP port"
+        advice = "check the server's own: line settings, and bytes passed on at once (ser2net: chardelay: false)"
+        tell(Finding("adapter", True, what, advice))
+    try:
+        async with opened(where, tap) as wire:
+            for finding in opening(patient, wire):
+                tell(finding)
+            if isinstance(where, SerialPort) and where.low_latency:
+                for finding in await anyio.to_thread.run_sync(_opened_latency, wire):
+                    tell(finding)
+            await examine_line(patient, wire, tell)
+    except LineDown as error:
+        tell(Finding("port", False, error.what, error.hint))
+
+
+def _opened_latency(wire: Wire) -> list[Finding]:
+    assert wire.transport is not None
+    return list(adapters.opened_latency(wire.transport.get_extra_info("serial").port))
+
+
+def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
+    """Say what can be said of an open port."""
+    where = patient.endpoint
+    assert wire.transport is not None
+    profile = None if patient.protocol is None else patient.profile
+    advice = "" if profile is None or where.settings is None else profile.wrong_rate(where.settings.baudrate)
+    if where.settings is None or isinstance(where, TcpPort):
+        yield Finding("open", True, "it opens", advice)
+        return
+    if profile is not None and where.settings != profile.line:
+        advice = advice or f"{profile.title} usually has {diagnosis.speed(profile.line)}"
+    yield Finding("open", True, f"it opens at {diagnosis.speed(where.settings)}", advice)
+    device = wire.transport.get_extra_info("serial")
+    if device is not None:
+        yield from rate(device.fileno(), where.settings.baudrate)
+        yield from driver(device.fileno(), where.low_latency if isinstance(where, SerialPort) else None)
+
+
+def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
+    """Say whether the UART can make the baud rate, where its driver tells."""
+    made = adapters.made_rate(descriptor, baudrate)
+    if made is not None and abs(made / baudrate - 1) > TOLERANCE:
+        what = f"its UART makes {made:.0f} baud of {baudrate}, {made / baudrate - 1:+.1%}"
+        yield Finding(
+            "rate", False, what, "use a rate that it can make, or another adapter: both ends may differ by 2%"
+        )
+
+
+def driver(descriptor: int, wanted: bool | None = None) -> Iterator[Finding]:
+    """Say what the driver of an open serial port does. `wanted` is the low-latency flag that it was opened with."""
+    match adapters.low_latency(descriptor):
+        case None:
+            yield Finding("driver", True, "it has no low-latency flag")
+        case True:
+            yield Finding("driver", True, "its low-latency flag is set")
+        case False if wanted:
+            yield Finding("driver", True, "its low-latency flag is not set, though low_latency=1 asked for it")
+        case False:
+            advice = "?low_latency=1 may bring replies sooner" if wanted is None else ""
+            yield Finding("driver", True, "its low-latency flag is not set", advice)
+    match adapters.rs485_mode(descriptor):
+        case None:
+            yield Finding("rs485", True, "the driver has no RS-485 mode: the adapter switches by itself, or is RS-232")
+        case True:
+            yield Finding("rs485", True, "the driver switches the transmitter (RS-485 mode)")
+        case False:
+            yield Finding(
+                "rs485",
+                True,
+                "the driver's RS-485 mode is off",
+                "if nothing is answered and this is a bare transceiver that needs RTS, add ?rs485=1 (rs485=True in "
+                "Python); a driver may know the mode and still refuse it",
+            )
+
+
+async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
+    """Tell what is found on an open line; what makes the rest pointless is the last."""
+    where = patient.endpoint
+    assert wire.port is not None
+    await wire.hear_all(OPENING)
+    wire.port.reset()
+    wire.marked.clear()
+    heard = await wire.hear_all(LISTENING)
+    talk = diagnosis.unexpected(heard, patient.protocol)
+    tell(talk)
+    # Another master, or what may be one, must not be disturbed. Noise is no reason not to ask.
+    if heard and (patient.protocol is None or diagnosis.spoken(heard, patient.protocol)):
+        return
+    settings = where.settings
+    byte_time = 0.0 if settings is None else settings.byte_time
+    wire.say(HARMLESS)
+    heard = await wire.hear_all(ECHOING + len(HARMLESS) * byte_time + where.receive_latency)
+    tell(diagnosis.echo(HARMLESS, heard, where.echo))
+    if patient.protocol is None:
+        tell(Finding("nodes", True, "no node was asked", "say which --protocol they speak, and perhaps --nodes"))
+        return
+    profile = patient.profile
+    timings = profile.timings if patient.timings is None else patient.timings
+    byte_time = (profile.line if settings is None else settings).byte_time
+    prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
+    records = await ask_all(patient, prober)
+    for finding in uart.findings(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
+        tell(finding)
+    if any(record.lives for record in records):
+        for finding in diagnosis.nodes(records, timings.read):
+            tell(finding)
+    else:
+        tell(diagnosis.nobody(patient.crowd(patient.addresses), profile, settings))
+    if not any(record.answers for record in records):
+        await try_settings(patient, wire, prober, tell)
+
+
+async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
+    """Ask every address once, and those that live again and again. The silent are left out, unless they were named."""
+    records = []
+    label = patient.profile.label
+    with patient.progress("asking", len(patient.addresses)) as bar:
+        for address in patient.addresses:
+            probes = [await prober.ask(address, alone=True)]
+            while patient.named and probes[-1].outcome is Outcome.SILENT and len(probes) < SILENT_PROBES:
+                probes.append(await prober.ask(address, alone=True))
+            record = Record(address, label(address), probes)
+            if record.lives or patient.named:
+                records.append(record)
+            bar.advance()
+    living = [record for record in records if record.lives]
+    with patient.progress("measuring", len(living) * PROBES) as bar:
+        for record in living:
+            for left in reversed(range(PROBES)):
+                # The last one waits out the maximum reply delay, so that nothing of this node is left for the next.
+                record.probes.append(await prober.ask(record.address, alone=not left))
+                bar.advance()
+    return records
+
+
+async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell) -> None:
+    """Try, as nobody answers, whether somebody would at another rate or framing. The port is left as it was."""
+    settings = patient.endpoint.settings
+    if not wire.tunable or settings is None:
+        return
+    if not wire.paced:
+        tell(Finding("settings", True, "a pseudo-terminal has no baud rate: no other was tried"))
+        return
+    asked = patient.addresses[:STRANGERS]
+    candidates = other_settings(settings)
+    patience = patient.profile.timings.read.window
+    try:
+        with patient.progress("trying rates", len(candidates)) as bar:
+            for candidate in candidates:
+                found = await answers_at(candidate, wire, prober, asked, patience)
+                bar.advance()
+                if found is not None:
+                    break
+    finally:
+        with anyio.CancelScope(shield=True), contextlib.suppress(LineDown):
+            await wire.tune(settings)
+    tell(diagnosis.other_rate(found, candidate, patient.crowd(asked), len(candidates)))
+
+
+async def answers_at(
+    settings: LineSettings, wire: Wire, prober: Prober, asked: Sequence[int], patience: float
+) -> int | None:
+    """Return the first node that answers with these settings; None too where the port does not take them."""
+    try:
+        await wire.tune(settings)
+    except LineDown:
+        return None
+    prober.byte_time = settings.byte_time
+    for address in asked:
+        if (await prober.ask(address, patience=patience)).outcome is Outcome.ANSWERED:
+            return address
+    return None
+
+
+def other_settings(settings: LineSettings) -> list[LineSettings]:
+    """Return other rates with this framing first, then other framings."""
+    own = (settings.bytesize, settings.parity)
+    framings = [own, *(framing for framing in FRAMINGS if framing != own)]
+    tried = (
+        replace(settings, baudrate=rate, bytesize=bits, parity=parity)
+        for bits, parity in framings
+        for rate in (settings.baudrate, *RATES)
+    )
+    return [candidate for candidate in dict.fromkeys(tried) if candidate != settings]

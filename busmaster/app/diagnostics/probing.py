@@ -1,0 +1,296 @@
+"""Asking nodes with the raw bytes in sight: what the arbiter discards while it resynchronises is what a doctor wants to
+see.
+
+One request at a time and nobody else on the port, so no arbiter is needed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+import anyio
+
+from busmaster import Endpoint, LineSettings, Timings
+from busmaster.app.service.values import value_text
+from busmaster.errors import LineDown, Refused, cause_text
+from busmaster.ext import (
+    QUIET,
+    Attempt,
+    Command,
+    Driver,
+    Echo,
+    Exchange,
+    FrameError,
+    Mark,
+    OpenPort,
+    Profile,
+    Tap,
+    Verdict,
+    clock_of,
+    is_paced,
+    open_port,
+)
+
+BABBLE = 1.0
+"""Seconds after which a line that does not fall silent is left alone."""
+MUCH = 16384
+"""Bytes after which it is as well: more than comes in that time at any usual rate."""
+
+
+class Wire(asyncio.Protocol):
+    """An open port: bytes go out, and come in with the time at which they came, in seconds of `clock`."""
+
+    def __init__(self, endpoint: Endpoint, tap: Tap | None) -> None:
+        self.clock = clock_of(asyncio.get_running_loop())
+        self.latency = endpoint.receive_latency
+        self.paced = False
+        self.transport: asyncio.Transport | None = None
+        self.port: OpenPort | None = None
+        self.marked: Counter[Mark] = Counter()
+        self.closed = anyio.Event()
+        self.attempt: Attempt | None = None
+        """What is asked now, for the tap."""
+        self._tap = tap
+        self._cause: Exception | None = None
+        self._chunks: deque[tuple[float, bytes]] = deque()
+        self._arrived = anyio.Event()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self.port = open_port(transport)
+
+    def byte_marked(self, byte: bytes, mark: Mark) -> None:
+        """Hear what is damaged all the same: whoever looks for what is wrong wants to see it."""
+        self.marked[mark] += 1
+        self.data_received(byte)
+
+    def data_received(self, data: bytes) -> None:
+        now = self.clock()
+        if self._tap is not None:
+            self._tap.received(now, data, self.attempt)
+        self._chunks.append((now, data))
+        self._arrived.set()
+
+    def connection_lost(self, cause: Exception | None) -> None:
+        self._cause = cause
+        self.closed.set()
+        self._arrived.set()
+
+    def say(self, data: bytes) -> float:
+        """Send `data`, and return when it was handed to the port. Raises LineDown if that is gone."""
+        if self.transport is None or self.closed.is_set():
+            raise self._loss()
+        self.transport.write(data)
+        now = self.clock()
+        if self._tap is not None:
+            self._tap.transmitted(now, data, self.attempt)
+        return now
+
+    @property
+    def tunable(self) -> bool:
+        """Return whether the port can be set to other rates: a serial server's cannot, from here."""
+        return hasattr(self.transport, "tune")
+
+    async def tune(self, settings: LineSettings) -> None:
+        """Set the open port to another rate and framing. Raises LineDown where it does not take them."""
+        await self.transport.tune(settings)  # type: ignore[union-attr]  # of a tunable one, which is open
+
+    def attempted(self, attempt: Attempt) -> None:
+        """Tell the tap that this is over."""
+        self.attempt = None
+        if self._tap is not None:
+            self._tap.attempted(attempt)
+
+    async def hear(self, until: float) -> tuple[float, bytes] | None:
+        """Return the next bytes and their time; None if none came by `until`. Raises LineDown if the port is lost."""
+        while not self._chunks:
+            if self.closed.is_set():
+                raise self._loss()
+            left = until - self.clock()
+            if left <= 0:
+                return None
+            self._arrived = anyio.Event()
+            with anyio.move_on_after(left):
+                await self._arrived.wait()
+        return self._chunks.popleft()
+
+    async def hear_all(self, within: float, quiet: float = QUIET) -> bytes:
+        """Return what begins to come `within` so many seconds, up to a silence of `quiet` seconds.
+
+        Of what does not fall silent, it hears BABBLE seconds or MUCH.
+        """
+        heard = b""
+        until = self.clock() + within
+        end = until + BABBLE
+        while len(heard) < MUCH and (chunk := await self.hear(min(until, end))) is not None:
+            heard += chunk[1]
+            until = chunk[0] + quiet
+        return heard
+
+    def _loss(self) -> LineDown:
+        return LineDown(cause_text(self._cause, "it was closed by the other end"), hint="start again when it is back")
+
+
+@asynccontextmanager
+async def opened(endpoint: Endpoint, tap: Tap | None = None) -> AsyncIterator[Wire]:
+    """Open the port until the end of the block. Raises LineDown."""
+    wire = Wire(endpoint, tap)
+    transport = await endpoint.open(lambda: wire)
+    wire.paced = is_paced(endpoint, transport)
+    try:
+        yield wire
+    finally:
+        transport.close()
+        with anyio.CancelScope(shield=True):
+            await wire.closed.wait()
+
+
+class Outcome(enum.Enum):
+    """What came of a request. A refusal is an answer."""
+
+    ANSWERED = "answered"
+    SILENT = "silent"
+    GARBLED = "garbled"
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """One request and what was heard of it, without an echo.
+
+    `start`: seconds from the request's end on the wire to the first byte, None if there was none. `text` is the command
+    and its value or refusal, or what was wrong. `raw` is all that came, and `again` what of it came after the reply, to
+    which nobody was entitled. `hint` is what to try, where the reader knows that.
+    """
+
+    outcome: Outcome
+    start: float | None = None
+    text: str = ""
+    raw: bytes = b""
+    again: bytes = b""
+    refused: bool = False
+    hint: str | None = None
+
+
+class Prober:
+    """Asks a protocol's cheapest read. `byte_time` in seconds; `echo`: what is sent is received too."""
+
+    def __init__(self, wire: Wire, profile: Profile, timings: Timings, byte_time: float, echo: bool) -> None:
+        self._wire = wire
+        self._profile = profile
+        self._timings = timings
+        self.byte_time = byte_time
+        self._echo = Echo(echo)
+        self._numbers = count(1)
+
+    async def ask(self, address: int, *, patience: float | None = None, alone: bool = False) -> Probe:
+        """Ask a node with its probe. `patience`: seconds to wait for the first byte, the maximum reply delay by
+        default.
+
+        Raises LineDown. `alone`: whatever still comes within the maximum reply delay is this node's doing, and not left
+        for the next request.
+        """
+        profile, wire = self._profile, self._wire
+        command = profile.probe
+        hearing = _Hearing(command, command.open(address, self._timings))
+        attempt = Attempt(
+            profile.name, address, command, self._timings, transaction=next(self._numbers), purpose="probe"
+        )
+        self._echo.forget()
+        wire.attempt = attempt
+        hearing.asked = self._say(hearing.driver.exchange.request)
+        wait = hearing.driver.timing.max_reply_delay if patience is None else patience
+        until = hearing.asked + wait + wire.latency
+        while (chunk := await wire.hear(until)) is not None:
+            data = self._echo.strip(chunk[1])
+            if data is None:
+                hearing.collide(chunk[1])
+            elif data:
+                until = hearing.take(chunk[0], data, self._say) + wire.latency
+            if hearing.driver.ending is not None:
+                break
+        attempt.end(*hearing.verdict(), wire.clock())
+        wire.attempted(attempt)
+        rest = b""
+        if hearing.start is not None:
+            rest = await wire.hear_all(wait if alone else max(QUIET, hearing.driver.timing.inter_byte_timeout))
+        return hearing.probe(self._echo.strip(rest) or b"")
+
+    def _say(self, data: bytes) -> float:
+        """Send `data`, and return when it will have left: at once, where nobody knows how long it takes."""
+        self._echo.sent(data)
+        return self._wire.say(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
+
+
+class _Hearing:
+    """What an exchange makes of the bytes that come. `asked`: when its request had left."""
+
+    def __init__(self, command: Command[Any], exchange: Exchange[Any]) -> None:
+        self.driver = Driver(exchange)
+        self.asked = 0.0
+        self.start: float | None = None
+        self._command = command
+        self._raw = b""
+        self._collided = False
+
+    def take(self, now: float, data: bytes, say: Callable[[bytes], float]) -> float:
+        """Take the next bytes, and return until when to wait for more."""
+        driver = self.driver
+        self._hear(now, data)
+        driver.said.clear()
+        driver.feed(data)
+        for send in driver.said:
+            now = say(send)
+        # else the node would be left with something unacknowledged
+        if driver.ending is not None and driver.ending.send:
+            say(driver.ending.send)
+        return now + (driver.timing.inter_byte_timeout if driver.begun else driver.timing.max_reply_delay)
+
+    def collide(self, data: bytes) -> None:
+        """Take it that this came in place of the echo."""
+        self._hear(self.asked, data)
+        self._collided = True
+        self.driver.fail(FrameError("what came back differs from what was sent: a collision"))
+
+    def verdict(self) -> tuple[Verdict, Any]:
+        """Return how it ended, and the value or what was wrong. Raises what a bug of the protocol raised."""
+        ending = self.driver.ending
+        if ending is None:
+            return (Verdict.NO_REPLY, "no reply") if self.start is None else (Verdict.GARBLED, "cut short")
+        match ending.error:
+            case None:
+                return Verdict.OK, ending.value
+            case Refused() as refusal:
+                return Verdict.REFUSED, refusal.what
+            case FrameError() as error:
+                return (Verdict.SPOILT if self._collided else Verdict.GARBLED), error.what
+            case bug:
+                raise bug
+
+    def probe(self, rest: bytes) -> Probe:
+        """Return what came of the probe; `rest` came after all was over."""
+        verdict, result = self.verdict()
+        if self.start is None:
+            return Probe(Outcome.SILENT)
+        if verdict not in (Verdict.OK, Verdict.REFUSED):
+            error = None if self.driver.ending is None else self.driver.ending.error
+            hint = error.hint if isinstance(error, FrameError) else None
+            return Probe(Outcome.GARBLED, self.start, result, self._raw + rest, hint=hint)
+        # a refusal is a reply: a device without this item is as healthy as any
+        text = value_text(result) if verdict is Verdict.OK else f"{result}; the device does not have this item"
+        left_over = b"" if self.driver.ending is None else self.driver.ending.rest
+        told = f"{self._command}: {text}"
+        raw = self._raw + rest
+        return Probe(Outcome.ANSWERED, self.start, told, raw, left_over + rest, verdict is Verdict.REFUSED)
+
+    def _hear(self, now: float, data: bytes) -> None:
+        if self.start is None:
+            self.start = now - self.asked
+        self._raw += data

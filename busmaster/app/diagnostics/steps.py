@@ -1,0 +1,127 @@
+"""What is tried on an unknown line, in which order, and how long that takes at most. Nothing is opened here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+
+from busmaster import LineSettings
+from busmaster.errors import InvalidCommand
+from busmaster.ext import Profile
+from busmaster.registry import NodeKind, protocols
+
+USUAL = range(1, 9)
+"""The nodes that are asked unless others are named."""
+LISTENING = 3.0
+"""Seconds of silence after which nobody else is taken to talk there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Ask some nodes of one kind, the line set so. `settings` None: as it is, which cannot be changed from here.
+
+    `rest` are the kind's other addresses: they are asked too if a node of its protocol has replied.
+    """
+
+    settings: LineSettings | None
+    kind: NodeKind
+    addresses: tuple[int, ...]
+    rest: tuple[int, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        """Return how long `addresses` take if no node replies."""
+        return self.seconds_for(self.addresses)
+
+    def seconds_for(self, some: Iterable[int]) -> float:
+        """Return how long these addresses take if no node replies."""
+        profile = self.kind.profile
+        byte_time = (self.settings or profile.line).byte_time
+        requests = (profile.probe.open(address, profile.timings).request for address in some)
+        return sum(profile.timings.read.window + len(request) * byte_time for request in requests)
+
+
+def usual_kinds() -> list[NodeKind]:
+    """Return the kinds of nodes that are tried unless some are named: of each protocol those whose probes differ."""
+    found: list[NodeKind] = []
+    for protocol in protocols():
+        for kind in protocol.kinds:
+            if not any(other.protocol is protocol and other.profile.probe == kind.profile.probe for other in found):
+                found.append(kind)
+    return found
+
+
+def steps(kinds: Iterable[NodeKind], nodes: Sequence[int] | None, allowed: LineSettings | int | None) -> list[Step]:
+    """Return what to try, the likeliest settings of each kind of node first.
+
+    `nodes`: those to ask of each kind that has such addresses. `allowed`: these settings alone, or this baud rate
+    alone, whether a protocol's document has it or not. Raises InvalidCommand where nothing is left to try.
+    """
+    asked = [(kind, addresses(kind.profile, nodes), rest(kind.profile, nodes)) for kind in kinds]
+    rounds = zip_longest(*(_settings(kind.profile, allowed) for kind, _, _ in asked))
+    found = [
+        Step(settings, kind, some, others)
+        for settings_of_round in rounds
+        for settings, (kind, some, others) in zip(settings_of_round, asked, strict=True)
+        if settings is not None and some
+    ]
+    if not found:
+        raise InvalidCommand("no protocol has these nodes: nothing is left to try")
+    return found
+
+
+def untuned_steps(kinds: Iterable[NodeKind], nodes: Sequence[int] | None) -> list[Step]:
+    """Return what to try on a port whose rate and framing are set elsewhere. Raises InvalidCommand for nothing."""
+    found = [Step(None, kind, addresses(kind.profile, nodes), rest(kind.profile, nodes)) for kind in kinds]
+    found = [step for step in found if step.addresses]
+    if not found:
+        raise InvalidCommand("no protocol has these nodes: nothing is left to try")
+    return found
+
+
+def seconds(tried: Iterable[Step]) -> float:
+    """Return how long all of them take where nobody answers, with the listening before."""
+    return LISTENING + sum(step.seconds for step in tried)
+
+
+def addresses(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
+    """Return which nodes are asked in a protocol: of those that are named the ones that it has, else the usual ones.
+
+    Where the usual ones do not exist in it, they are as many from its first on. Where it has no addresses, it is the
+    one node that there is, whatever is named.
+    """
+    if not profile.addressed:
+        return (profile.addresses[0],)
+    if nodes is not None:
+        return tuple(node for node in nodes if node in profile.addresses)
+    usual = tuple(node for node in USUAL if node in profile.addresses)
+    return usual or tuple(profile.addresses[: len(USUAL)])
+
+
+def rest(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
+    """Return the addresses that are asked after a node has replied: the others, unless the user named some."""
+    if nodes is not None:
+        return ()
+    asked = addresses(profile, nodes)
+    return tuple(address for address in profile.addresses if address not in asked)
+
+
+def ranges(some: Iterable[int]) -> str:
+    """Return addresses as text: "0, 9-255"."""
+    parts: list[tuple[int, int]] = []
+    for address in sorted(some):
+        if parts and address == parts[-1][1] + 1:
+            parts[-1] = (parts[-1][0], address)
+        else:
+            parts.append((address, address))
+    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in parts)
+
+
+def _settings(profile: Profile, allowed: LineSettings | int | None) -> Iterator[LineSettings]:
+    if isinstance(allowed, LineSettings):
+        return iter((allowed,))
+    known = (profile.line, *profile.other_lines)
+    if allowed is None:
+        return iter(known)
+    return iter(dict.fromkeys(replace(settings, baudrate=allowed) for settings in known))

@@ -1,0 +1,138 @@
+"""All pages that look at one line: each picture is put into words once, and a page that is slow sees fewer of them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from busmaster.app.interfaces.following import Following, Lost
+from busmaster.app.service.messages import encoded
+from busmaster.app.service.remote_exchanges import RemoteExchanges
+from busmaster.errors import BusError
+
+MOST_EXCHANGES = 50
+"""Messages of exchanges that one page has not taken; of more, the oldest are dropped."""
+PAST_VALUES = 60
+"""Of a point, that a page is told at first, for its trend."""
+PAST_POINTS = 500
+"""Points of which it is."""
+
+Key = tuple[str, int]
+"""What a message replaces: the one before of the same method and part."""
+
+
+class Seat:
+    """One page: what it has not been told yet."""
+
+    def __init__(self) -> None:
+        self.wants_exchanges = False
+        self._latest: dict[Key, str] = {}
+        self._count = 0
+        self._something = asyncio.Event()
+
+    def put(self, key: Key, text: str) -> None:
+        """Have it told, instead of what was said under this key before and was not taken yet."""
+        self._latest.pop(key, None)  # a key that stays has its old place, before what it may depend on
+        self._latest[key] = text
+        self._something.set()
+
+    def put_exchanges(self, text: str) -> None:
+        """Have it told what passed on the line."""
+        self._count += 1
+        self._latest.pop(("exchanges", self._count - MOST_EXCHANGES), None)
+        self.put(("exchanges", self._count), text)
+
+    async def take(self) -> list[str]:
+        """Return what is to be said, once there is something."""
+        await self._something.wait()
+        self._something.clear()
+        texts, self._latest = list(self._latest.values()), {}
+        return texts
+
+
+class Audience:
+    """The pages of one line. Exchanges are asked for only while a page wants them."""
+
+    def __init__(self, line: Following) -> None:
+        self._line = line
+        self._seats: set[Seat] = set()
+        self._said: dict[Key, str] = {}
+        """What a page that comes now is told first."""
+        self._set = 0
+        self._exchanges: RemoteExchanges | None = None
+        self._asking: asyncio.Task[None] | None = None
+        line.on_picture(self._hear)
+        line.on_state(self._changed)
+
+    def join(self) -> Seat:
+        """Return a seat, which is told all that is known."""
+        seat = Seat()
+        self._seats.add(seat)
+        seat.put(("state", 0), self._state())
+        for key, text in self._said.items():
+            seat.put(key, text)
+        seat.put(("past", 0), self._past())
+        return seat
+
+    def leave(self, seat: Seat) -> None:
+        """Tell this page no more."""
+        self._seats.discard(seat)
+        self.look_at_exchanges()
+
+    def look_at_exchanges(self) -> None:
+        """Begin or end to be told what passes on the line, as the pages want it."""
+        wanted = any(seat.wants_exchanges for seat in self._seats) and self._line.is_connected
+        if wanted and self._exchanges is None and self._asking is None:
+            self._asking = asyncio.ensure_future(self._ask())
+        elif not wanted and self._exchanges is not None:
+            self._exchanges.close()
+            self._exchanges = None
+
+    async def _ask(self) -> None:
+        try:
+            self._exchanges = await self._line.remote.exchanges(self._hear_exchanges)
+        except BusError:
+            pass  # the owner has gone: it is asked again when it is back
+        finally:
+            self._asking = None
+        self.look_at_exchanges()  # the pages may have gone meanwhile
+
+    def _hear(self, method: str, said: Mapping[str, Any]) -> None:
+        if said.get("set", 0) > self._set:
+            self._set = said["set"]
+            self._said = {key: text for key, text in self._said.items() if key[0] not in ("rows", "values")}
+        key = method, said.get("first", 0)
+        self._said[key] = text = encoded({"method": method, "body": said})
+        for seat in self._seats:
+            seat.put(key, text)
+
+    def _hear_exchanges(self, said: Mapping[str, Any]) -> None:
+        text = encoded({"method": "exchanges", "body": said})
+        for seat in self._seats:
+            if seat.wants_exchanges:
+                seat.put_exchanges(text)
+
+    def _changed(self) -> None:
+        if not self._line.is_connected:  # what is said next is of another owner, perhaps
+            self._set = 0
+            self._exchanges = None
+        for seat in self._seats:
+            seat.put(("state", 0), self._state())
+        self.look_at_exchanges()
+
+    def _state(self) -> str:
+        state = self._line.state
+        body = {"connected": not isinstance(state, Lost), "why": "", "read_only": self._line.read_only}
+        if isinstance(state, Lost):
+            body["why"] = state.why
+        else:
+            body["name"] = state.about["name"]
+        return encoded({"method": "state", "body": body})
+
+    def _past(self) -> str:
+        rows = self._line.picture.rows[:PAST_POINTS]
+        past = [list(map(list, list(row.past)[-PAST_VALUES:])) for row in rows]
+        # in a failure the values that are told have none: a page that comes then shows these
+        last = [[row.value, row.asked] for row in self._line.picture.rows]
+        return encoded({"method": "past", "body": {"set": self._set, "past": past, "last": last}})

@@ -1,0 +1,221 @@
+"""What all interfaces share: one line that another program owns, followed for good, whoever of the two comes and goes.
+
+An interface makes one `Following` and runs its `follow` beside what it serves. It looks at `picture`, is called at each
+change, and writes by `write`. How another interface is made of it: docs/interfaces.md.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from busmaster.app.service.messages import value_of
+from busmaster.app.service.picture import Picture
+from busmaster.app.service.remote import RemoteBus, connect
+from busmaster.app.service.remote_overview import RemoteOverview
+from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
+
+FIRST_PAUSE = 0.25
+"""Seconds before it is tried again to connect; each time twice as long, up to `LONGEST_PAUSE`."""
+LONGEST_PAUSE = 2.0
+
+Hear = Callable[[str, Mapping[str, Any]], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """The line is followed: what its owner says of it (`hello` in docs/service.md)."""
+
+    about: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The line's owner is not there: why, and what to try."""
+
+    why: str
+    since: float = field(default_factory=time.time, compare=False)
+    """In seconds since 1970."""
+
+
+class Following:
+    """A line that another program owns. `follow` connects, and connects again whenever that ends, until cancelled.
+
+    `address` is asked anew each time: the owner may come back at another. It returns what `connect` takes, and raises
+    BusError or InvalidCommand where no line is to be found. `read_only`: nothing is written, whatever the owner allows.
+    `picture` is what is known of the line; while the owner is away it is what was known last, and `state` a `Lost`.
+    `clean` makes of what is said what the picture takes, as `Picture` has it.
+
+    All is of one event loop. Times are of the line's clock, in seconds; `wall_time` makes them times of day.
+    """
+
+    def __init__(
+        self,
+        address: Callable[[], str],
+        *,
+        token: str | None = None,
+        read_only: bool = False,
+        clean: Callable[[Any], Any] = value_of,
+    ) -> None:
+        self._clean = clean
+        self.picture = Picture(clean)
+        self.state: Connected | Lost = Lost("it was not connected yet")
+        self._address = address
+        self._token = token
+        self._read_only = read_only
+        self._listeners: list[Hear] = []
+        self._watchers: list[Callable[[], None]] = []
+        self._touch_listeners: list[Callable[[Mapping[str, Any]], None]] = []
+        self._remote: RemoteBus | None = None
+        self._overview: RemoteOverview | None = None
+
+    # what an interface is told
+
+    def on_picture(self, hear: Hear) -> Callable[[], None]:
+        """Have `hear` told what the owner says, after `picture` has taken it; return what ends that.
+
+        It is called with the messages of an overview: `rows`, `values`, `groups`, `nodes`, and `frame` behind those.
+        It must not block; what it raises ends the connection.
+        """
+        self._listeners.append(hear)
+        return lambda: self._listeners.remove(hear)
+
+    def on_state(self, watch: Callable[[], None]) -> Callable[[], None]:
+        """Have `watch` called when `state` has changed; return what ends that. It must not block, nor raise."""
+        self._watchers.append(watch)
+        return lambda: self._watchers.remove(watch)
+
+    def on_touched(self, hear: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
+        """Have `hear` told which values a write has made stale, after `picture` has taken it; return what ends that.
+
+        It is told before the write is confirmed. `Touches` takes the message. It must not block, nor raise.
+        """
+        self._touch_listeners.append(hear)
+        return lambda: self._touch_listeners.remove(hear)
+
+    @property
+    def is_connected(self) -> bool:
+        """Return whether the line's owner is there, and `picture` is of now."""
+        return isinstance(self.state, Connected)
+
+    @property
+    def read_only(self) -> bool:
+        """Return whether nothing can be written: by this interface's settings, its role, or the owner's."""
+        frame = self.picture.frame
+        by_role = isinstance(self.state, Connected) and bool(self.state.about["read_only"])
+        return self._read_only or by_role or (frame is not None and frame.read_only)
+
+    def wall_time(self, moment: float) -> float:
+        """Return a time of the line's clock as seconds since 1970, by this machine's time of day.
+
+        Raises LineDown while the owner is away.
+        """
+        return time.time() - (self.remote.now() - moment)
+
+    # what an interface asks
+
+    @property
+    def remote(self) -> RemoteBus:
+        """Return the line's bus, for all else that a client may do. Raises LineDown while the owner is away."""
+        if self._remote is None:
+            raise self._away(LineDown)
+        return self._remote
+
+    @property
+    def overview(self) -> RemoteOverview:
+        """Return what is seen of the line, and may be done there. Raises LineDown while the owner is away."""
+        if self._overview is None:
+            raise self._away(LineDown)
+        return self._overview
+
+    async def details(self, group: str, key: str) -> Mapping[str, Any]:
+        """Return what there is to know of a point: limits, last exchange (`details` in docs/service.md).
+
+        Raises LineDown while the owner is away, and InvalidCommand for a point that is gone.
+        """
+        return await self.overview.details(group, key)
+
+    async def pause(self, group: str, paused: bool) -> None:
+        """Have a poll group rest, or go on, for all who use the line. Raises as `details`."""
+        await self.overview.pause(group, paused)
+
+    async def demand(self, group: str) -> None:
+        """Have a poll group read now. Raises as `details`."""
+        await self.overview.demand(group)
+
+    async def suspend(self, protocol: str, address: int, for_: float) -> None:
+        """Let a node rest for so many seconds, 0 for no longer, for all who use the line. Raises as `details`."""
+        await self.overview.suspend(protocol, address, for_)
+
+    async def write(self, group: str, key: str, value: Any) -> None:
+        """Write a point of a poll group, through the owner's authorisation: its roles, limits and record hold.
+
+        Raises InvalidCommand if that, or this interface, does not allow it, NotStarted while the owner is away, and
+        what `Point.write` raises; WriteUnconfirmed if the owner goes meanwhile. Nothing is written later, or again.
+        """
+        if self._read_only:
+            raise InvalidCommand(f"{key} was not written: this interface is read-only")
+        if self._overview is None:
+            raise self._away(NotStarted)
+        await self._overview.write(group, key, value)
+
+    # following
+
+    async def follow(self, *, patient: bool = True) -> None:
+        """Follow the line until cancelled. Raises nothing of the line: what ends a connection is in `state`. If it is
+        not `patient`, what keeps the first connection from being made is raised all the same.
+        """
+        pause = FIRST_PAUSE
+        while True:
+            try:
+                # a thread, since it looks into folders and may ask for a host's address
+                address = await asyncio.to_thread(self._address)
+                async with connect(address, token=self._token) as remote:
+                    pause, patient = FIRST_PAUSE, True
+                    await self._stay(remote)
+            except (BusError, InvalidCommand) as error:
+                if not patient:
+                    raise
+                self._change(Lost(str(error)))
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE)
+
+    async def _stay(self, remote: RemoteBus) -> None:
+        """Take in what is said until the connection ends."""
+        self.picture = Picture(self._clean)
+        try:
+            self._remote = remote
+            self._change(Connected(remote.about))
+            remote.on_access.append(lambda: self._change(Connected(remote.about)))
+            remote.on_touched.append(self._hear_touched)
+            self._overview = await remote.overview(self._hear)
+            await self._overview.over()
+        finally:
+            self._remote = self._overview = None
+
+    def _hear(self, method: str, said: Mapping[str, Any]) -> None:
+        self.picture.hear(method, said)
+        for hear in list(self._listeners):
+            hear(method, said)
+
+    def _hear_touched(self, said: Mapping[str, Any]) -> None:
+        self.picture.hear("touched", said)
+        for hear in list(self._touch_listeners):
+            hear(said)
+
+    def _change(self, state: Connected | Lost) -> None:
+        if isinstance(state, Lost):
+            if isinstance(self.state, Lost):  # one loss, though another reason is known now
+                state = replace(state, since=self.state.since)
+            self.picture.lose(state.why)
+        if state != self.state:
+            self.state = state
+            for watch in list(self._watchers):
+                watch()
+
+    def _away(self, kind: type[BusError]) -> BusError:
+        why = self.state.why if isinstance(self.state, Lost) else "its program is being connected"
+        return kind(f"the program that owns the line is not there: {why}", hint="")

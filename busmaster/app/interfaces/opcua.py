@@ -1,0 +1,458 @@
+"""A line as an OPC UA server: its nodes as objects, its points as variables, with status and time."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.crypto.permission_rules import User
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from busmaster import Snapshot
+from busmaster.app.interfaces.failed_logins import FailedLogins
+from busmaster.app.interfaces.following import Following
+from busmaster.app.interfaces.opcua_access import Rules, guard
+from busmaster.app.interfaces.opcua_connections import OpcuaServer
+from busmaster.app.interfaces.opcua_health import Health
+from busmaster.app.interfaces.opcua_space import Space, Variable
+from busmaster.app.interfaces.opcua_terms import (
+    AMBIGUOUS,
+    CODES,
+    GOOD,
+    is_beyond,
+    range_of,
+    status_of_sample,
+    status_of_write,
+    type_of,
+)
+from busmaster.app.service.picture import Row
+from busmaster.app.service.record import cut
+from busmaster.app.service.remote import RemoteBus
+from busmaster.app.service.touches import Touches
+from busmaster.bounds import MOST_SHOWN_POINTS
+from busmaster.errors import BusError, InvalidCommand, LineDown
+from busmaster.ext import read_file
+
+OLD_AFTER = 3
+"""Periods after which a value that none has followed is uncertain; not before `LEAST_AGE`."""
+LEAST_AGE = 1.0
+LOOK_EVERY = 0.25
+"""Seconds between two looks for values that are old."""
+ASK_AGAIN = 5.0
+"""Seconds after which a poll group is asked for again that its owner tells no more."""
+LISTEN_AFTER = 2.0
+"""Seconds after which clients are accepted although the points of the line are not known yet."""
+AT_ONCE = 50
+"""Values that are put before clients have their turn."""
+URI = "urn:busmaster:opcua"
+PRODUCT_URI = "urn:busmaster"
+BUILT = datetime.fromtimestamp(0, UTC)
+"""A version has no date of its build."""
+NOT_WRITABLE: int = CODES.BadNotWritable
+NO_SUCH_WRITE: int = CODES.BadWriteNotSupported
+ACCESS_DENIED: int = CODES.BadUserAccessDenied
+OUT_OF_RANGE: int = CODES.BadOutOfRange
+TYPE_MISMATCH: int = CODES.BadTypeMismatch
+Identity = tuple[str, int, str]
+"""Protocol and address of a node, and item of a point."""
+
+
+@dataclass(slots=True)
+class Shown:
+    """A point that clients see. `read` is when its last value was, by the clock of the line."""
+
+    row: Row
+    variable: Variable
+    writable: bool = False
+    labelled: bool = False
+    """Whether its values have names, by which it can be written."""
+    read: float = -inf
+    asked: float = -inf
+    """When it was asked for."""
+
+
+class LineServer:
+    """Shows a line that another program owns to OPC UA clients, and hands on what they write.
+
+    `tell` is called with a line for each write: who asked for it, and what became of it.
+    """
+
+    def __init__(self, server: Server, line: Following, rules: Rules, tell: Callable[[str], None]) -> None:
+        self._line = line
+        self._rules = rules
+        self._tell = tell
+        self._space = Space(server)
+        self._health = Health(self._space, line)
+        self._points: dict[Identity, Shown] = {}
+        self._by_id: dict[ua.NodeId, Shown] = {}
+        self._keys: dict[str, Identity] = {}
+        self._remote: RemoteBus | None = None
+        """The connection that is shown."""
+        self._groups: dict[str, asyncio.Task[None]] = {}
+        self._heard: dict[str, float] = {}
+        """When the last cycle of each group ended, by the clock of the line."""
+        self._touches = Touches()
+        self._changed = asyncio.Event()
+        self.has_points = asyncio.Event()
+        """Set when clients can find the points of the line."""
+        self._new_rows = True
+        self._is_touched = False
+        """Whether a write was reported whose values are not ambiguous yet."""
+
+    async def run(self) -> None:
+        """Show the line until cancelled."""
+        await self._space.begin()
+        end_picture = self._line.on_picture(self._hear)
+        end_state = self._line.on_state(self._changed.set)
+        end_touched = self._line.on_touched(self._hear_touched)
+        try:
+            while True:
+                await self._show()
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(LOOK_EVERY):
+                        await self._changed.wait()
+                self._changed.clear()
+        finally:
+            end_picture()
+            end_state()
+            end_touched()
+            await self._leave_groups(set())
+
+    def _hear(self, method: str, said: Mapping[str, Any]) -> None:
+        if method == "rows":
+            self._new_rows = True
+        if method == "frame":
+            self._changed.set()
+
+    def _hear_touched(self, said: Mapping[str, Any]) -> None:
+        self._touches.note(said)
+        self._is_touched = True
+        self._changed.set()
+
+    # what is shown
+
+    async def _show(self) -> None:
+        """Bring what clients see up to what is known of the line."""
+        remote = None
+        if self._line.is_connected:
+            with suppress(LineDown):  # it is being left
+                remote = self._line.remote
+        if remote is not self._remote:  # what was known is of the connection before
+            self._remote = remote
+            self._touches = Touches()
+            self._new_rows = True
+            await self._leave_groups(set())
+            await self._put_bad(CODES.BadOutOfService)
+        try:
+            if remote is not None:
+                await self._show_points(remote)
+                await self._health.show_objects()
+        except (BusError, InvalidCommand) as error:  # the line's program goes away at this moment, and says so next
+            logging.getLogger("busmaster.opcua").info("%s", error)
+            self._new_rows = True
+        await self._health.show()
+
+    async def _show_points(self, remote: RemoteBus) -> None:
+        picture, frame = self._line.picture, self._line.picture.frame
+        rows = picture.rows
+        if self._new_rows and frame is not None and len(rows) == frame.points:
+            self._new_rows = False
+            await self._take_rows(remote, rows)
+            self.has_points.set()
+        if frame is not None and frame.state == "offline":
+            await self._put_bad(CODES.BadNoCommunication, frame.now)
+        await self._doubt_touched()
+        await self._doubt_old(remote.now())
+
+    async def _take_rows(self, remote: RemoteBus, rows: list[Row]) -> None:
+        """Show these points, and no others; of a point in two groups, the values of the first."""
+        wanted: dict[Identity, Row] = {}
+        for row in rows:
+            wanted.setdefault((row.protocol, row.address, row.item), row)
+        for identity, row in wanted.items():
+            await self._take_row(identity, row)
+        for identity, shown in self._points.items():
+            if identity not in wanted and shown.variable.status != CODES.BadConfigurationError:
+                await shown.variable.put(None, CODES.BadConfigurationError, time.time())
+        names = {row.group for row in wanted.values()}
+        await self._leave_groups(names)
+        for name in names - self._groups.keys():
+            self._heard[name] = remote.now()
+            self._groups[name] = asyncio.ensure_future(self._follow_group(remote, name))
+
+    async def _take_row(self, identity: Identity, row: Row) -> None:
+        details = await self._line.details(row.group, row.key)
+        shown = self._points.get(identity)
+        if shown is None:
+            if len(self._points) >= MOST_SHOWN_POINTS:
+                return
+            key = self._key_of(row, identity)
+            node = await self._health.node(row.protocol, row.address, row.node)
+            variable = await self._space.point(key, row.item, node, f"{row.name} ({details['command']})")
+            shown = self._points[identity] = self._by_id[variable.place] = Shown(row, variable)
+        shown.row = row
+        named = self._keys[row.key] == identity  # what has the name of another would be written there
+        shown.writable = named and row.writable and self._rules.may_be_written(row.key)
+        shown.labelled = bool(details["labels"])
+        await shown.variable.describe(unit=row.unit, range_=range_of(details, row.item), writable=shown.writable)
+
+    def _key_of(self, row: Row, identity: Identity) -> str:
+        """Return what a point is found by: its key, unless another has that, for two protocols may share an address."""
+        holder = self._keys.setdefault(row.key, identity)
+        return row.key if holder == identity else f"{row.protocol}:{row.key}"
+
+    # values
+
+    async def _follow_group(self, remote: RemoteBus, name: str) -> None:
+        """Put what each cycle of a group brings, for as long as the line has it."""
+        while True:
+            with suppress(BusError, InvalidCommand):  # that no cycles come shows in the values' age
+                group = await remote.group(name)
+                try:
+                    async for snapshot in group:
+                        await self._take(name, snapshot)
+                        self._health.dropped[name] = group.dropped
+                finally:
+                    group.close()
+            await asyncio.sleep(ASK_AGAIN)
+
+    async def _take(self, name: str, snapshot: Snapshot) -> None:
+        self._heard[name] = snapshot.finished
+        taken: set[Identity] = set()
+        for count, (point, sample) in enumerate(snapshot.items(), 1):
+            identity = point.node.profile.name, point.node.address, point.item
+            shown = self._points.get(identity)
+            if shown is None or shown.row.group != name or identity in taken:
+                continue
+            taken.add(identity)
+            shown.read = sample.finished
+            shown.asked = sample.finished if sample.started is None else sample.started
+            status = status_of_sample(sample)
+            if status == GOOD and self._touches.is_stale(*identity, shown.asked):
+                status = AMBIGUOUS  # it was read before a write that was reported first
+            try:
+                await shown.variable.put(sample.value, status, sample.wall)
+            except (TypeError, OverflowError):
+                await shown.variable.put(None, CODES.BadDataEncodingUnsupported, sample.wall)
+            if count % AT_ONCE == 0:
+                await asyncio.sleep(0)
+
+    async def _put_bad(self, status: int, since: float = inf) -> None:
+        """Take from the points the values that were read before this time of the line."""
+        for shown in list(self._points.values()):
+            if shown.read <= since and shown.variable.status not in (status, CODES.BadConfigurationError):
+                await shown.variable.put(None, status, time.time())
+
+    async def _doubt_touched(self) -> None:
+        """Have values ambiguous that were read before a write to what they read."""
+        if not self._is_touched:
+            return
+        self._is_touched = False
+        for identity, shown in list(self._points.items()):
+            if self._touches.is_stale(*identity, shown.asked):
+                await shown.variable.doubt()
+
+    async def _doubt_old(self, now: float) -> None:
+        """Have values ambiguous that no cycle has followed: their group rests, or the line's program stands still."""
+        periods = {group.name: max(group.period, group.achieved) for group in self._line.picture.groups}
+        old = {
+            name
+            for name, heard in self._heard.items()
+            if now - heard > max(LEAST_AGE, OLD_AFTER * periods.get(name, 0.0))
+        }
+        if old:
+            for shown in list(self._points.values()):
+                if shown.row.group in old:
+                    await shown.variable.doubt()
+
+    async def _leave_groups(self, wanted: set[str]) -> None:
+        """Follow no groups but these."""
+        for name in self._groups.keys() - wanted:
+            task = self._groups.pop(name)
+            self._heard.pop(name, None)
+            task.cancel()
+            await asyncio.wait([task])
+
+    # writing
+
+    async def write(self, wanted: ua.WriteValue, user: User) -> int:
+        """Write what a client wants, through the owner's authorisation, and return the status of that.
+
+        It is Good only for a write that the line's program has confirmed. BadTimeout is of one that may have been
+        carried out; nothing has come of any other.
+        """
+        shown = self._by_id.get(wanted.NodeId)
+        if shown is None or wanted.AttributeId != ua.AttributeIds.Value:
+            return NOT_WRITABLE
+        told, row = wanted.Value, shown.row
+        is_stamped = told.SourceTimestamp is not None or told.ServerTimestamp is not None
+        if wanted.IndexRange or is_stamped or (told.StatusCode is not None and told.StatusCode.value != GOOD):
+            return NO_SUCH_WRITE  # the time of a value is that of its reply
+        if not shown.writable or self._line.read_only:
+            return NOT_WRITABLE
+        who = f"user {user.name}" if user.name else "an anonymous user"
+        if refusal := self._rules.refusal(user):
+            self._tell(f"{who}: {row.key} was not written: {refusal}")
+            return ACCESS_DENIED
+        value = _converted(told.Value, shown.variable.kind, shown.labelled)
+        if value is None:
+            return TYPE_MISMATCH
+        said = cut(str(value))
+        try:
+            await self._line.write(row.group, row.key, value)
+        except (BusError, InvalidCommand) as error:
+            self._tell(f"{who}: {row.key} = {said}: {cut(str(error))}")
+            await self._doubt_touched()
+            if isinstance(error, InvalidCommand) and await self._is_beyond_limits(row, value):
+                return OUT_OF_RANGE
+            return status_of_write(error)
+        await self._doubt_touched()  # before the client is told, so that it never reads the old value as good
+        self._tell(f"{who}: {row.key} = {said}: written")
+        return status_of_write(None)
+
+    async def _is_beyond_limits(self, row: Row, value: Any) -> bool:
+        """Return whether a value that was refused is outside of what the line's owner lets be written."""
+        try:
+            details = await self._line.details(row.group, row.key)
+        except (BusError, InvalidCommand):
+            return False
+        return is_beyond(details, row.item, value)
+
+
+def _value(variant: ua.Variant | None) -> Any:
+    value = None if variant is None else variant.Value
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _converted(variant: ua.Variant | None, kind: ua.VariantType | None, labelled: bool) -> Any:
+    """Return a written value as one of the type of its variable, or None where that would change it.
+
+    Many clients have one numeric type, or write a coil as 0 or 1. A point with labels takes their names too.
+    """
+    value = _value(variant)
+    if isinstance(value, str):
+        return value if labelled or kind in (None, ua.VariantType.String) else None
+    try:
+        written = type_of(value)
+    except TypeError:
+        return None
+    if kind is None or written is kind:
+        return value
+    values = value if isinstance(value, tuple) else (value,)
+    numbers = ua.VariantType.Int64, ua.VariantType.Double
+    converted: tuple[Any, ...]
+    if kind is ua.VariantType.Boolean and written in numbers and set(values) <= {0, 1}:
+        converted = tuple(map(bool, values))
+    elif kind is ua.VariantType.Int64 and written is ua.VariantType.Double and all(map(float.is_integer, values)):
+        converted = tuple(map(int, values))
+    elif kind is ua.VariantType.Double and written is ua.VariantType.Int64 and values == tuple(map(float, values)):
+        converted = tuple(map(float, values))
+    else:
+        return None
+    return converted if isinstance(value, tuple) else converted[0]
+
+
+def _format_of(path: str) -> str:
+    return "pem" if b"-----BEGIN" in Path(path).read_bytes() else "der"
+
+
+async def load_certificate(server: Server, certificate: str, key: str) -> None:
+    """Give a server its certificate and key. Raises OSError, and InvalidCommand for files that are something else."""
+    try:
+        # by what is in the file: the library goes by the end of its name, and takes server.key for DER
+        await server.load_certificate(certificate, _format_of(certificate))
+        await server.load_private_key(key, format=_format_of(key))
+    except (ValueError, TypeError) as error:
+        raise InvalidCommand(f"{certificate} and {key} are no certificate and its key: {error}") from None
+    with suppress(x509.ExtensionNotFound):  # clients hold the name that it says against the server's
+        names = server.iserver.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        for uri in names.get_values_for_type(x509.UniformResourceIdentifier)[:1]:
+            await server.set_application_uri(uri)
+
+
+@asynccontextmanager
+async def serving(
+    line: Following,
+    rules: Rules,
+    listen: tuple[str, int],
+    tell: Callable[[str], None],
+    *,
+    certificate: tuple[str, str] | None = None,
+) -> AsyncIterator[str]:
+    """Serve a line by OPC UA, and follow it, within `async with`; its value is where clients find it.
+
+    `certificate` names the files of the server's certificate and its key (PEM or DER): with them all that is said is
+    signed or encrypted. Raises OSError if it cannot listen there, InvalidCommand for files that are something else.
+    """
+    server = OpcuaServer()
+    await server.init()
+    server.set_server_name("busmaster")
+    server.product_uri, server.manufacturer_name = PRODUCT_URI, "busmaster"
+    server.application_type = ua.ApplicationType.Server
+    await server.set_build_info(PRODUCT_URI, "busmaster", "busmaster", version("busmaster"), "0", BUILT)
+    await server.set_application_uri(URI)
+    if certificate is not None:
+        await load_certificate(server, *certificate)
+    shown = LineServer(server, line, rules, tell)
+    guard(server, rules, shown.write, FailedLogins("opcua", line, tell).note)
+    host, port = listen
+    server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{port}/")
+    server.socket_address = listen
+    await server.start()
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            running = [tasks.create_task(shown.run()), tasks.create_task(line.follow())]
+            # A client that comes back after this program was restarted subscribes once: what it does not find then,
+            # it never has again.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LISTEN_AFTER):
+                    await shown.has_points.wait()
+            await server.acceptor.listen()
+            yield f"opc.tcp://{host}:{server.acceptor.port}/"
+            for task in running:
+                task.cancel()
+    finally:
+        await server.stop()
+
+
+async def serve(
+    line: Following,
+    rules: Rules,
+    listen: tuple[str, int],
+    opened: Callable[[str], None],
+    tell: Callable[[str], None],
+    certificate: tuple[str, str] | None,
+) -> None:
+    """Serve a line by OPC UA until cancelled. `opened` is told where clients find it; the rest is as in `serving`."""
+    async with serving(line, rules, listen, tell, certificate=certificate) as url:
+        opened(url)
+        await asyncio.Event().wait()
+
+
+def read_trusted(folder: str) -> frozenset[bytes]:
+    """Return the certificates (DER) of the clients that are trusted: those of the files of a folder, PEM or DER.
+
+    Raises OSError, and InvalidCommand for a file that is none, or a folder without one.
+    """
+    found = set()
+    for path in sorted(Path(folder).iterdir()):
+        text = read_file(path)
+        try:
+            load = x509.load_pem_x509_certificate if b"-----BEGIN" in text else x509.load_der_x509_certificate
+            found.add(load(text).public_bytes(Encoding.DER))
+        except ValueError:
+            raise InvalidCommand(f"{path} is no certificate: {folder} is for those of trusted clients") from None
+    if not found:
+        raise InvalidCommand(f"there is no certificate in {folder}: nobody could come")
+    return frozenset(found)

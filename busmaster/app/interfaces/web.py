@@ -1,0 +1,354 @@
+"""A page for the operator and a REST API over one line, in a process of its own. What it serves is in openapi.json."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import asdict
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from busmaster.app.interfaces.audience import Audience, Seat
+from busmaster.app.interfaces.connections import Crowd
+from busmaster.app.interfaces.failed_logins import FailedLogins
+from busmaster.app.interfaces.following import Following, Lost
+from busmaster.app.interfaces.guard import Guard, Guarded
+from busmaster.app.service.messages import encoded
+from busmaster.app.service.picture import Row
+from busmaster.app.service.record import cut
+from busmaster.app.service.refusals import Logins, wait_text
+from busmaster.app.service.tcp import HostPort, listening
+from busmaster.bounds import LONGEST_COMMAND, LONGEST_PAGE_MESSAGE, MOST_PAGES
+from busmaster.errors import (
+    BacklogFull,
+    BusClosed,
+    BusError,
+    InvalidCommand,
+    LineDown,
+    NoReply,
+    NotStarted,
+    Refused,
+)
+
+PAGE = Path(__file__).parent / "page"
+CLOSE_WITHIN = 1
+"""Seconds in which pages are let go at the end."""
+STATUS: tuple[tuple[type[Exception], int], ...] = (
+    (InvalidCommand, 400),
+    (Refused, 409),
+    (BacklogFull, 503),
+    (NotStarted, 503),
+    (LineDown, 503),
+    (BusClosed, 503),
+    (NoReply, 504),
+    (BusError, 502),
+)
+"""What an error is in HTTP: the first that fits. Its class and its sentence are in the answer."""
+
+Told = Callable[[str], None]
+
+
+class Api:
+    """What is answered. `tell` is told, in a sentence, of each write that somebody asked for."""
+
+    def __init__(self, line: Following, guard: Guard, tell: Told) -> None:
+        self._line = line
+        self._guard = guard
+        self._tell = tell
+        self._logins = Logins(FailedLogins("web", line, tell).note, time.monotonic)
+        self._audience = Audience(line)
+        self._pages = 0
+
+    async def line(self, _: Request) -> Response:
+        """Answer what the line does."""
+        state, frame = self._line.state, self._line.picture.frame
+        lost = isinstance(state, Lost)
+        why, since = "", None
+        if isinstance(state, Lost):
+            why, since = state.why, state.since
+        elif frame is not None and frame.since is not None:
+            why, since = frame.why, self._wall(frame.since)
+        said: dict[str, Any] = {
+            "connected": not lost,
+            "why": why,
+            "since": since,
+            "read_only": not self._may_be_written(),
+            "wants_token": self._guard.wants_token,
+            "frame": None,
+        }
+        if frame is not None:
+            left_out = ("events", "why", "since")
+            said["frame"] = {name: value for name, value in asdict(frame).items() if name not in left_out}
+        return _json(said)
+
+    async def nodes(self, _: Request) -> Response:
+        """Answer health and counts of all nodes."""
+        return _json([_as_in_the_file(asdict(node)) for node in self._line.picture.nodes.values()])
+
+    async def groups(self, _: Request) -> Response:
+        """Answer all poll groups."""
+        return _json([asdict(group) for group in self._line.picture.groups])
+
+    async def events(self, _: Request) -> Response:
+        """Answer what has happened last, each with its time of day."""
+        frame = self._line.picture.frame
+        events = frame.events if frame is not None else ()
+        return _json([{"time": self._wall(when), "text": text} for when, text in events])
+
+    async def points(self, _: Request) -> Response:
+        """Answer all points with their last values."""
+        return _json([self._point(row) for row in self._line.picture.rows])
+
+    async def point(self, request: Request) -> Response:
+        """Answer one point, with what there is to know of it."""
+        row = self._row(request)
+        details = await self._line.details(row.group, row.key)
+        past = [[self._wall(when), value] for when, value in row.past]
+        return _json({**self._point(row), "past": past, "details": details})
+
+    async def write(self, request: Request) -> Response:
+        """Write one point. The body is JSON, and says so: what a form of another site sends never is."""
+        by = self._guard.writer(request.headers)
+        client = request.client.host if request.client is not None else "?"
+        if self._guard.wants_token and "authorization" in request.headers:
+            wait = self._logins.judge(client, by)
+            if wait:
+                raise HTTPException(429, wait_text(wait), {"retry-after": str(ceil(wait))})
+        if by is None:
+            raise HTTPException(401 if self._guard.wants_token else 403, self._why_not())
+        row, value = self._row(request), await _value(request)
+        who = f"{f'token {by}' if by else 'a page'} from {client}"
+        asked = f"{row.key} = {cut(repr(value))}, asked by {who}"
+        try:
+            await self._line.write(row.group, row.key, value)
+        except (BusError, InvalidCommand) as error:
+            self._tell(f"{asked}: {cut(str(error))}")
+            raise
+        self._tell(f"{asked}: written")
+        return _json({"written": value})
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Tell a page all that changes, until it leaves."""
+        if self._pages >= MOST_PAGES:
+            await socket.close(1013, "too many pages look already")
+            return
+        await socket.accept()
+        seat = self._audience.join()
+        self._pages += 1
+        telling = asyncio.ensure_future(_tell(socket, seat))
+        try:
+            await self._listen(socket, seat)
+        except (WebSocketDisconnect, RuntimeError):  # RuntimeError: it went while it was told something
+            pass
+        finally:
+            self._pages -= 1
+            self._audience.leave(seat)
+            telling.cancel()
+            await asyncio.wait([telling])
+
+    async def _listen(self, socket: WebSocket, seat: Seat) -> None:
+        """Hear whether the page wants the exchanges: {"exchanges": true}."""
+        while True:
+            text = await socket.receive_text()
+            if text not in WISHES:
+                await socket.close(1008, "a page says whether it wants exchanges, and nothing else")
+                return
+            seat.wants_exchanges = WISHES[text]
+            self._audience.look_at_exchanges()
+
+    # inside
+
+    def _may_be_written(self) -> bool:
+        return self._guard.lets_write and not self._line.read_only
+
+    def _why_not(self) -> str:
+        if self._guard.wants_token:
+            return "a token that is known here is needed to write"
+        return "nobody writes from the network without a token: start with --token-file"
+
+    def _wall(self, moment: float) -> float | None:
+        """Return a time of the line as seconds since 1970, None while its owner, who has that clock, is away."""
+        try:
+            return self._line.wall_time(moment)
+        except LineDown:
+            return None
+
+    def _row(self, request: Request) -> Row:
+        group, key = request.path_params["group"], request.path_params["key"]
+        if (
+            self._line.picture.frame is None
+        ):  # who asks as the interface opens is not to think that there is no such point
+            state = self._line.state
+            why = state.why if isinstance(state, Lost) else "its program was found only now"
+            raise LineDown(f"the points of the line are not known yet: {why}", hint="ask again in a moment")
+        for row in self._line.picture.rows:
+            if (row.group, row.key) == (group, key):
+                return row
+        raise HTTPException(404, f"there is no point {key!r} in a poll group {group!r}")
+
+    def _point(self, row: Row) -> dict[str, Any]:
+        named = (
+            "group",
+            "key",
+            "node",
+            "protocol",
+            "kind",
+            "address",
+            "item",
+            "unit",
+            "precision",
+            "writable",
+            "value",
+        )
+        said = {name: getattr(row, name) for name in (*named, "quality", "error", "alarm")}
+        return _as_in_the_file(said) | {"time": None if row.asked is None else self._wall(row.asked)}
+
+
+def _as_in_the_file(said: dict[str, Any]) -> dict[str, Any]:
+    """Return what is said of a node or a point with its protocol as LINE.toml has it: `microflex`, not `hcp2`."""
+    kind = said.pop("kind")
+    return said | {"protocol": kind or said["protocol"]}
+
+
+WISHES = {'{"exchanges":true}': True, '{"exchanges":false}': False}
+
+
+async def _tell(socket: WebSocket, seat: Seat) -> None:
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            for text in await seat.take():
+                await socket.send_text(text)
+
+
+async def _value(request: Request) -> float | str:
+    """Return what is to be written. Raises HTTPException for a body that does not say it."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        raise HTTPException(415, 'the body is JSON: {"value": NUMBER}, as application/json')
+    body = b""
+    try:
+        async for part in request.stream():
+            body += part
+            if len(body) > LONGEST_COMMAND:
+                raise HTTPException(413, f"the body has {LONGEST_COMMAND} bytes at most")
+    except ClientDisconnect:
+        raise HTTPException(400, "the connection ended before the body did") from None
+    try:
+        said = json.loads(body)
+    except (ValueError, RecursionError):
+        said = None
+    match said:
+        case {"value": bool() | int() | float() | str() as value, **rest} if not rest:
+            return value
+    raise HTTPException(400, 'the body is {"value": NUMBER}, {"value": true}, {"value": false} or {"value": "TEXT"}')
+
+
+def application(line: Following, guard: Guard, tell: Told = lambda _: None) -> Guarded:
+    """Return the ASGI application that shows a line. `tell` is told of each write that somebody asked for."""
+    api = Api(line, guard, tell)
+    one = "/api/points/{group}/{key:path}"
+    routes = [
+        Route("/", _page, methods=["GET"]),
+        Route("/openapi.json", _schema, methods=["GET"]),
+        Route("/api/line", api.line, methods=["GET"]),
+        Route("/api/nodes", api.nodes, methods=["GET"]),
+        Route("/api/groups", api.groups, methods=["GET"]),
+        Route("/api/events", api.events, methods=["GET"]),
+        Route("/api/points", api.points, methods=["GET"]),
+        Route(one, api.point, methods=["GET"]),
+        Route(one, api.write, methods=["PUT"]),
+        WebSocketRoute("/api/stream", api.stream),
+        Mount("/page", StaticFiles(directory=PAGE)),
+    ]
+    handlers: Mapping[Any, Any] = {BusError: _explain, InvalidCommand: _explain, HTTPException: _explain_http}
+    return Guarded(Starlette(routes=routes, exception_handlers=handlers), guard)
+
+
+@contextlib.asynccontextmanager
+async def serving(application: Any, listen: HostPort, tell: Told = lambda _: None) -> AsyncIterator[str]:
+    """Serve an application at an address, and yield its URL. `tell` is told of connections that are closed.
+
+    Raises InvalidCommand where nothing can listen there.
+    """
+    opened = await asyncio.to_thread(listening, listen)
+    with opened:
+        config = uvicorn.Config(
+            application,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            proxy_headers=False,
+            server_header=False,
+            timeout_graceful_shutdown=CLOSE_WITHIN,
+            **Crowd(tell).protocols(),
+            ws_max_size=LONGEST_PAGE_MESSAGE,
+            ws_per_message_deflate=False,  # it takes as long as all else that is done for a page
+        )
+        server = _Server(config)
+        task = asyncio.ensure_future(server.serve(sockets=[opened]))
+        host, port = opened.getsockname()[:2]
+        try:
+            yield f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+        finally:
+            server.should_exit = True
+            await task
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves the signals to its command."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Any:
+        yield
+
+
+async def serve(
+    line: Following,
+    listen: HostPort,
+    secrets: Mapping[str, bytes],
+    hosts: Sequence[str],
+    opened: Told,
+    tell: Told = lambda _: None,
+) -> None:
+    """Follow a line and serve its page until cancelled. `opened` is told the page's URL, `hosts` are further names of
+    it.
+
+    Raises InvalidCommand where nothing can listen there.
+    """
+    async with serving(application(line, Guard(listen, secrets, hosts), tell), listen, tell) as url:
+        opened(url)
+        await line.follow()
+
+
+async def _page(_: Request) -> Response:
+    return FileResponse(PAGE / "index.html")
+
+
+async def _schema(_: Request) -> Response:
+    return FileResponse(PAGE / "openapi.json", media_type="application/json")
+
+
+async def _explain(_: Request, error: Exception) -> Response:
+    status = next(status for kind, status in STATUS if isinstance(error, kind))
+    return _json({"error": type(error).__name__, "what": str(error)}, status)
+
+
+async def _explain_http(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return _json({"error": "NotServed", "what": error.detail}, error.status_code, error.headers)
+
+
+def _json(said: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    return Response(encoded(said), status, headers, media_type="application/json")

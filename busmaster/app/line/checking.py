@@ -1,0 +1,151 @@
+"""Whether a LINE.toml is right: all its problems at once. No port and no output is opened.
+
+The problems are those of `load` and `ConfiguredLine`, which `busmaster run` uses: there is no second set of rules.
+Where `run` stops at the first problem, `check` has the source collect them, and reads on. What cannot be known because
+of another problem, such as a point of a node that could not be read, is not reported.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from busmaster.app.config.emulated import emulated_line
+from busmaster.app.config.names import expanded, listed
+from busmaster.app.config.sections import LineFile, read
+from busmaster.app.config.source import FileError, Key, Source
+from busmaster.app.line.configured_line import ConfiguredLine
+from busmaster.app.outputs.settings import MqttSettings
+from busmaster.errors import InvalidCommand
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What is wrong with a file, in the order of its lines, and what `busmaster run` would do all the same."""
+
+    problems: tuple[FileError, ...]
+    warnings: tuple[str, ...]
+
+
+def check(path: str | os.PathLike[str]) -> Report:
+    """Return the problems of a LINE.toml, each with file, line and key, and warnings.
+
+    Raises OSError if it cannot be read. Files that it names are read too: templates, symbols, tokens, certificates.
+    """
+    try:
+        source = Source.read(path)
+    except FileError as error:
+        return Report((error,), ())
+    source.problems = {}
+    with warnings.catch_warnings(record=True) as noticed:
+        warnings.simplefilter("always")
+        file, line = _made(source)
+    problems = list(_told(source, line))
+    known = [str(one.message) for one in noticed if issubclass(one.category, UserWarning)]
+    if file is not None and line is not None and not problems:
+        known += _doubts(file, line)
+    return Report(tuple(problems), tuple(dict.fromkeys(known)))
+
+
+def _made(source: Source) -> tuple[LineFile | None, ConfiguredLine | None]:
+    """Read a file and make a line of it, as `run` does up to the opening of the port."""
+    try:
+        file = read(source)
+        line = ConfiguredLine(file)
+        with file.service.table.part():
+            if file.service.enabled:
+                file.service.secrets()
+        for kind, settings in file.outputs.items():
+            if isinstance(settings, MqttSettings):
+                table = file.table.table("outputs").table(kind)
+                with table.part(), table.at("password_file"):
+                    settings.password()
+                with table.part(), table.at("ca_file"):
+                    settings.tls_context()
+    except FileError as error:  # one that leaves nothing to read on with
+        source.keep((), error)
+        return None, None
+    return file, line
+
+
+def _told(source: Source, line: ConfiguredLine | None) -> Iterator[FileError]:
+    """Yield the problems that do not only follow from others, by their place in the file."""
+    assert source.problems is not None
+    unknown = _unread_nodes(source, line)
+    found = [error for part in source.problems for error in source.problems[part]]
+    for error in sorted(found, key=lambda error: (error.file != source.name, error.line)):
+        if not any(_names(text, unknown) for text in _texts(source, error.way)):
+            yield error
+
+
+def _unread_nodes(source: Source, line: ConfiguredLine | None) -> set[str]:
+    """Return the names of the nodes of which something could not be read: what others say of them is not known."""
+    nodes = source.data.get("nodes")
+    unknown: set[str] = set()
+    for section in nodes if isinstance(nodes, dict) else ():
+        with suppress(InvalidCommand):
+            names = set(expanded(section))
+            unread = any(part[:2] == ("nodes", section) for part in source.unread)
+            unknown |= names if unread or line is None else names - set(line.nodes)
+    return unknown
+
+
+def _texts(source: Source, way: Key) -> Iterator[str]:
+    """Yield the names that stand where a problem is, outside of [nodes]: in the value, or as its key."""
+    if not way or way[0] in ("nodes", "protocols"):
+        return
+    yield str(way[-1])
+    value: object = source.data
+    for step in way:
+        if not isinstance(value, dict | list):
+            return
+        try:
+            value = value[step]  # type: ignore[index]  # a number leads into a list, a name into a table
+        except (KeyError, IndexError, TypeError):
+            return
+    if isinstance(value, str):
+        yield value
+
+
+def _names(text: str, nodes: set[str]) -> bool:
+    """Return whether a text such as "drive4-7/speed", "drive*/speed" or "drive4" names one of the nodes."""
+    with suppress(InvalidCommand):
+        for part in listed(text.partition("/")[0]):
+            if any(fnmatchcase(node, part) for node in nodes) or not nodes.isdisjoint(expanded(part)):
+                return True
+    return False
+
+
+def _doubts(file: LineFile, line: ConfiguredLine) -> Iterator[str]:
+    """Yield what `run` would not refuse, and what is probably not meant."""
+    if not line.file.groups:
+        yield "nothing is polled: the file has no [groups.NAME]"
+    elif not line.plan().fits:
+        yield "cycles will be missed: busmaster plan shows which, and what would fit"
+    try:
+        emulated_line(file)
+    except InvalidCommand as error:
+        yield f"busmaster emulate refuses it: {error}"
+    for kind, settings in file.outputs.items():
+        for key in ("path", "spill"):
+            path = getattr(settings, key, None)
+            if path is not None and (why := _not_writable(time.strftime(path) if key == "path" else path)):
+                yield f"outputs.{kind}.{key}: {why}"
+    if file.learned is not None and (why := _not_writable(file.learned)):
+        yield f"learned: {why}"
+
+
+def _not_writable(path: str) -> str:
+    """Return why this user cannot write a file, "" if it can. That is no problem: `run` may run as another user."""
+    where = Path(path)
+    if where.is_dir():
+        return f"{where} is a folder"
+    while not where.exists() and where != where.parent:
+        where = where.parent
+    return "" if os.access(where, os.W_OK) else f"{where} cannot be written by this user"

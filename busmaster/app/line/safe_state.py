@@ -1,0 +1,181 @@
+"""The safe state of a line: writes that are sent urgently, and verified, when the program leaves the line.
+
+A write may arrive more than once: it is repeated until it reads back as written, or until the time is over. Hence each
+write of a safe state must be repeatable and readable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import anyio
+
+from busmaster import Bus, Node, Priority, ext
+from busmaster.app.config.points import NamedPoint
+from busmaster.app.service.authorisation import Authorisation, Wish, outcome_of
+from busmaster.app.service.permission import Permission
+from busmaster.app.service.record import Outcome
+from busmaster.bounds import LONGEST_SAFE_STATE
+from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
+from busmaster.ext import Command, Handle, Send
+
+LOOK_AGAIN = 0.05
+"""Seconds from a failure to the next try at the same node."""
+
+
+@dataclass(frozen=True, slots=True)
+class SafeWrite:
+    """One write of the safe state: a point, and the value that it is left at."""
+
+    point: NamedPoint
+    value: float
+    node: Node
+    command: Command[None]
+    prepare: Callable[[float], Send]
+    """Makes what writes it and reads it back, in so many seconds."""
+
+    @classmethod
+    def of(cls, point: NamedPoint, handle: Handle, value: float, *, repeatable: bool) -> SafeWrite:
+        """Check and make one write of the safe state.
+
+        Raises InvalidCommand for what cannot be sent, may not be repeated, or cannot be read back.
+        """
+        if not point.writable:
+            raise InvalidCommand(f"{point.key} is read-only")
+        if point.encode is None:
+            raise InvalidCommand(f"{point.key} is a run of values: write them one by one, each is verified")
+        command = point.encode(value)
+        if not (repeatable or command.idempotent):
+            raise InvalidCommand(
+                f"{point.key} may not be repeated as far as its protocol knows: if writing it twice harms nobody, "
+                f'say so: repeatable = ["{point.key}"]'
+            )
+        node = Node.of(point)
+        if node.address == node.profile.broadcast:
+            raise InvalidCommand(f"{point.key} is for all nodes: nobody confirms it; write each node's own")
+        item, number = point.source.item, point.unscaled(value)
+
+        def prepare(within: float) -> Send:
+            [send] = ext.prepare_write(
+                handle,
+                item,
+                [number],
+                priority=Priority.URGENT,
+                idempotent=True,  # its protocol has said so, or `repeatable`
+                verify=True,
+                safe=True,
+                finish_within=within,
+            )
+            return send
+
+        prepare(LONGEST_SAFE_STATE)  # what would be refused at the end is refused when the file is read
+        return cls(point, value, node, command, prepare)
+
+
+@dataclass(frozen=True, slots=True)
+class SafeState:
+    """The writes of one file, and the seconds in which all of them are to be confirmed."""
+
+    within: float
+    writes: Sequence[SafeWrite]
+
+    def __bool__(self) -> bool:
+        return bool(self.writes)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Return the value of each point, by its name."""
+        return {write.point.key: write.value for write in self.writes}
+
+    def refusal(self, permission: Permission) -> str:
+        """Return why somebody may not have it sent, "" if he may."""
+        return next(
+            (why for write in self.writes if (why := permission.refusal(write.node, write.command))),
+            "",
+        )
+
+    async def enter(self, authorisation: Authorisation, by: str, *, leaving: bool = True) -> dict[str, BusError | None]:
+        """Send all, urgently, read them back, and return by point why it was not confirmed, None if it was.
+
+        From now on the bus takes no other write; unless the line is not left (`leaving`): then it does so afterwards,
+        and what waited, or was decided before, is not sent. Nodes are served at the same time, each in the file's
+        order; what fails is tried again until the time is over. `by` says for the record who wants it.
+        """
+        if not self.writes:
+            return {}
+        take_writes_again = ext.take_only_safe_writes(authorisation.bus)
+        try:
+            for write in self.writes:
+                write.node.note_stop()
+            return await self._send(authorisation, by)
+        finally:
+            if not leaving:
+                take_writes_again()
+
+    async def _send(self, authorisation: Authorisation, by: str) -> dict[str, BusError | None]:
+        bus = authorisation.bus
+        deadline = bus.now() + self.within
+        by_node: dict[Node, list[Leaving]] = {}
+        for write in self.writes:
+            by_node.setdefault(write.node, []).append(Leaving(write, authorisation, by))
+        leaving = [one for ones in by_node.values() for one in ones]
+        try:
+            with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
+                async with anyio.create_task_group() as tasks:
+                    for node, ones in by_node.items():
+                        node.suspend(0.0)  # also one that somebody has suspended
+                        tasks.start_soon(_leave, bus, ones, deadline)
+        finally:
+            for one in leaving:
+                one.end()
+        outcomes = {one.write.point.key: one.error for one in leaving}
+        return {write.point.key: outcomes[write.point.key] for write in self.writes}  # in the file's order
+
+
+class Leaving:
+    """One write of the safe state on its way. `error` is why it is not confirmed yet, None once it is."""
+
+    def __init__(self, write: SafeWrite, authorisation: Authorisation, by: str) -> None:
+        self.write = write
+        self.error: BusError | None = NotStarted("not sent in time", node=write.node)
+        key = write.point.key
+        self._passage = authorisation.begin(
+            Wish(interface="safe", by=by, name=key, point=write.point, value=write.value)
+        )
+
+    async def try_once(self, within: float) -> bool:
+        """Write it and read it back, and return whether it is over: confirmed, or nothing can be sent any more."""
+        try:
+            await self.write.prepare(within)()
+        except BusError as error:
+            # one that was sent before may have arrived, whatever keeps this one from being sent
+            if not (self._was_sent and outcome_of(error)[0] is Outcome.NOT_STARTED):
+                self.error = error
+            return isinstance(error, BusClosed)
+        self.error = None
+        self.end()
+        return True
+
+    def end(self) -> None:
+        """Keep the record of it, once."""
+        if self._passage.record is None:
+            self._passage.end(self.error)
+
+    @property
+    def _was_sent(self) -> bool:
+        return outcome_of(self.error)[0] is not Outcome.NOT_STARTED
+
+
+async def _leave(bus: Bus, leaving: Sequence[Leaving], deadline: float) -> None:
+    """Write what is left of one node's, round by round: one that fails does not keep the others from being sent."""
+    waiting = list(leaving)
+    while waiting and bus.now() < deadline:
+        left = []
+        for one in waiting:
+            within = deadline - bus.now()
+            if within <= 0 or not await one.try_once(within):
+                left.append(one)
+        waiting = left
+        if waiting:
+            await anyio.sleep(min(LOOK_AGAIN, max(0.0, deadline - bus.now())))

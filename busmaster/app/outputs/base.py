@@ -1,0 +1,268 @@
+"""What every output is: something that is offered what has passed on a line, and deals with it in its own thread.
+
+Theory of operation. `offer` runs on the loop that owns the line: it appends to a queue and returns. The thread looks
+into the queue every TICK, so that it is never woken by the line, takes what is there piece by piece, and lets go of
+the interpreter after each piece. What it holds is bounded: when it cannot get rid of it, the oldest is dropped.
+
+Each count has one writer, the loop or the thread, so that they are exact without a lock:
+`offered` + `found` = `written` + `dropped` + `lost` + `spilled` + what waits in memory.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, TypeAlias
+
+from busmaster import Snapshot
+from busmaster.app.outputs.settings import Settings
+from busmaster.app.service.record import WriteRecord
+from busmaster.errors import InvalidCommand
+
+TICK = 0.05
+PAUSE = 0.0002
+"""Seconds for which the thread lets go of the interpreter after each cycle that it has formatted."""
+BATCH = 2_000
+"""Values that are written at once."""
+FIRST_RETRY, LAST_RETRY = 0.5, 10.0
+"""Seconds from a failure to the next try: doubled each time."""
+ERROR_NUMBER = re.compile(r"^\[Errno -?\d+\] ")
+
+
+class Happening(NamedTuple):
+    """An event, as a sentence. `node` is its label, "" for the line as a whole; `time` is in seconds since 1970."""
+
+    time: float
+    node: str
+    text: str
+
+
+Item: TypeAlias = Snapshot | Happening | WriteRecord
+Kept: TypeAlias = Callable[[str], object]
+
+
+def size_of(item: Item) -> int:
+    """Return how many values an item holds; an event, or a write, counts as one."""
+    return len(item.samples) if isinstance(item, Snapshot) else 1
+
+
+@dataclass(frozen=True, slots=True)
+class OutputStatistics:
+    """Counts of values and events; of answers where it only answers (`what`: "answered").
+
+    `error` is why it is down, "" while it is not. `spilled` is how many of those that wait do so on disk, where they
+    survive the end of the process. `suppressed` counts the values that were not news by the meaning of their points:
+    they were never to be written.
+    """
+
+    kind: str
+    what: str
+    written: int
+    dropped: int
+    waiting: int
+    error: str
+    spilled: int = 0
+    suppressed: int = 0
+
+
+def reason(error: BaseException) -> str:
+    """Return on one line what went wrong."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(ERROR_NUMBER.sub("", text).split()) or type(error).__name__
+
+
+def check_folder(path: str) -> None:
+    """Raise InvalidCommand where no file can ever be made: that is better said before anything starts.
+
+    Folders whose names hold fields of a date are made when their time comes.
+    """
+    folder = os.path.dirname(path)
+    while "%" in folder:
+        folder = os.path.dirname(folder)
+    if folder and not os.path.isdir(folder):
+        raise InvalidCommand(f"{path}: there is no folder {folder}")
+
+
+def check_extra(package: str, extra: str) -> None:
+    """Raise InvalidCommand, saying what to install, where the package of an extra is not there."""
+    if importlib.util.find_spec(package) is None:
+        raise InvalidCommand(
+            f"this output needs {package}, which the extra named {extra} brings: pip install 'busmaster[{extra}]'"
+        )
+
+
+class Output(ABC):
+    """One output. `say` is called from any thread with what happens to the output."""
+
+    what: ClassVar[str] = "written"
+    finds_outdated: ClassVar[bool] = False
+    """It finds out by itself which values a write has made stale."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: Settings,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.kind = kind
+        self.groups = settings.groups
+        self._destination = settings.destination
+        self.error = ""
+        self.offered = self.dropped = self.written = 0
+        self.suppressed = 0
+        self.spilled = self.lost = 0
+        """Values that wait on disk, and those that the thread had to drop from there."""
+        self.found = 0
+        """Values that were on disk when it began: of an earlier process, or of the output that this one replaces."""
+        self._capacity = settings.buffer
+        self.is_strict = getattr(settings, "audit", "") == "strict"
+        """Whether a write is acknowledged only after this output has made its audit entry durable."""
+        self._promised: dict[int, tuple[WriteRecord, Kept]] = {}
+        """Audit entries whose durability is awaited, by their identity: loop and thread share it without a lock."""
+        self._say = say
+        self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: what they do with it is atomic
+        self._stop = threading.Event()
+        self._reopen = threading.Event()
+        self._retry = FIRST_RETRY
+        # A daemon: one that hangs on a disk or a network must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
+
+    # on the loop that owns the line
+
+    def start(self) -> None:
+        """Start the output's thread."""
+        self._thread.start()
+
+    def offer(self, item: Item) -> None:
+        """Hand it an item without ever waiting. The oldest are dropped where the output does not keep up."""
+        self._waiting.append(item)
+        self.offered += size_of(item)
+        while self._left() - self.spilled > self._capacity:
+            try:
+                oldest = self._waiting.popleft()
+            except IndexError:
+                break  # the rest is in the thread's hands
+            self.dropped += size_of(oldest)
+            if isinstance(oldest, WriteRecord):
+                self.settle_entry(oldest, f"{self.kind} dropped it, for too much waits")
+
+    def offer_entry(self, entry: WriteRecord, kept: Kept) -> None:
+        """Hand it an audit entry. `kept` is called once, from any thread: with "" when the entry is durable, and with
+        the reason when it never will be."""
+        self._promised[id(entry)] = entry, kept
+        self.offer(entry)
+
+    def settle_entry(self, entry: WriteRecord, why_not: str = "") -> None:
+        """Report to whom it concerns that an audit entry is durable, or why it never will be."""
+        _, kept = self._promised.pop(id(entry), (None, None))
+        if kept is not None:
+            kept(why_not)
+
+    def miss(self, values: int) -> None:
+        """Count so many values as lost before they could be offered."""
+        self.offered += values
+        self.dropped += values
+
+    def suppress(self, values: int) -> None:
+        """Count so many values that are not offered, as they are no news."""
+        self.suppressed += values
+
+    def reopen(self) -> None:
+        """Have it let go of the file that is open, if there is one, and open it anew: it may have been moved away."""
+        self._reopen.set()
+
+    def succeed(self, before: Output) -> None:
+        """Count on from the output that this one replaces, which is closed. Call this before the new one is started.
+
+        What waits on disk is not counted on: it is found there.
+        """
+        self.offered += before.offered + before.found - before.spilled
+        self.dropped += before.dropped
+        self.written += before.written
+        self.suppressed += before.suppressed
+        self.lost += before.lost
+
+    def statistics(self) -> OutputStatistics:
+        """Return the counts of this output, and why it is down."""
+        dropped = self.dropped + self.lost
+        return OutputStatistics(
+            self.kind, self.what, self.written, dropped, self._left(), self.error, self.spilled, self.suppressed
+        )
+
+    def _left(self) -> int:
+        """Return how many values wait, in memory and on disk."""
+        return self.offered + self.found - self.written - self.dropped - self.lost
+
+    # off the loop
+
+    def close_interface(self) -> None:  # noqa: B027  nothing to do where there is no interface
+        """Take in nothing from outside any more, and answer what has come. Most take in nothing at all."""
+
+    def close(self, within: float) -> None:
+        """Let it write what waits, for so many seconds; what is left, and not on disk, is dropped.
+
+        Nothing may be offered any more.
+        """
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(within)
+        self.dropped += self._left() - self.spilled
+        for entry, _ in list(self._promised.values()):
+            self.settle_entry(entry, f"{self.kind} ended before it was written")
+
+    # on the thread
+
+    @abstractmethod
+    def work(self) -> None:
+        """Take what is offered until it is stopped, then the rest. It is called again, later, if it raises."""
+
+    def take(self) -> Item | None:
+        """Take the oldest item that waits; None if none does."""
+        try:
+            return self._waiting.popleft()
+        except IndexError:
+            return None
+
+    def up(self) -> None:
+        """Note that the output works, and say so if it was down."""
+        self._retry = FIRST_RETRY
+        if self.error:
+            self.error = ""
+            self._say(f"{self.kind} is up again")
+
+    def down(self, error: BaseException) -> None:
+        """Note why the output does not work, and say so where that is new."""
+        text = reason(error)
+        if self._destination not in text:  # most errors of a library name neither a file nor a host
+            text = f"{self._destination}: {text}"
+        if text != self.error:
+            self.error = text
+            self._say(f"{self.kind} is down: {text}")
+
+    def rest(self, seconds: float) -> None:
+        """Wait for the next try, or until it is stopped."""
+        self._stop.wait(seconds)
+
+    def _run(self) -> None:
+        """Work until stopped. Whatever goes wrong is told and tried again: it must not end the thread."""
+        while True:
+            last = self._stop.is_set()  # before the try: one that is stopped in the midst of a failing try gets another
+            try:
+                self.work()
+                return
+            except Exception as error:
+                self.down(error)
+            if last:
+                return
+            self.rest(self._retry)
+            self._retry = min(2 * self._retry, LAST_RETRY)

@@ -1,0 +1,136 @@
+"""Outputs that write batch by batch: files and databases."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
+
+from busmaster import Point, Sample, Snapshot
+from busmaster.app.outputs.base import BATCH, PAUSE, TICK, Item, size_of
+from busmaster.app.outputs.settings import SpillingSettings
+from busmaster.app.outputs.spilling import SpillingOutput
+from busmaster.app.outputs.spool import Record
+from busmaster.app.service.record import WriteRecord
+
+Formatted = TypeVar("Formatted")
+
+PIECE = 100
+"""Values of one cycle after which the thread lets go of the interpreter too."""
+SPILLED_AT_ONCE = 200
+"""Cycles that are written at once from where they waited on disk."""
+
+
+class BatchOutput(SpillingOutput, Generic[Formatted]):
+    """An output that writes batch by batch: all of a batch, or nothing of it."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: SpillingSettings,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        super().__init__(kind, settings, say)
+        self._batch: list[Formatted] = []
+        self._sizes: list[int] = []
+        """How many values each of the batch holds."""
+        self._entries: list[WriteRecord] = []
+        """The audit entries in the batch."""
+
+    @abstractmethod
+    def format(self, item: Item) -> Formatted | None:
+        """Return the item as it is written; None for what is not written here."""
+
+    @abstractmethod
+    def commit(self, batch: list[Formatted]) -> None:
+        """Write the batch whole. It raises, having written nothing, where that fails."""
+
+    @abstractmethod
+    def pack(self, formatted: Formatted) -> str:
+        """Return what was formatted as text, as it is kept on disk."""
+
+    @abstractmethod
+    def unpack(self, text: str) -> Formatted:
+        """Return what `pack` made a text of."""
+
+    @abstractmethod
+    def shut(self) -> None:
+        """Let go of what `commit` opened. It never raises."""
+
+    def work(self) -> None:
+        """Write batch by batch until it is stopped, then the rest."""
+        self.open_spool()
+        try:
+            stopped = False
+            while not stopped:
+                # before the queue is emptied, so that what was offered until then is written
+                stopped = self._stop.wait(TICK)
+                if self._reopen.is_set():
+                    self._reopen.clear()
+                    self.shut()
+                self._write_spilled()
+                while not self.spilled and self.hold(BATCH):
+                    self.commit(self._batch)
+                    self.written += self.let_go()
+                    self.up()
+        finally:
+            self.shut()
+
+    def _write_spilled(self) -> None:
+        """Write all that is on disk. When all is to end the rest stays there."""
+        while self._spool is not None and self.spilled and not self._stop.is_set():
+            up_to, records = self._spool.oldest(SPILLED_AT_ONCE)
+            self.commit([self.unpack(record.content) for record in records])
+            self.forwarded(up_to, records)
+            self.up()
+            time.sleep(PAUSE)
+
+    def hold(self, most: int) -> bool:
+        """Format what waits, up to a batch, and return whether there is one."""
+        size = sum(self._sizes)
+        while size < most and (item := self.take()) is not None:
+            formatted = self.format(item)
+            if formatted is None:
+                self.written += size_of(item)  # what is not written here, as events in CSV, is no loss
+            else:
+                self._batch.append(formatted)
+                self._sizes.append(size_of(item))
+                if isinstance(item, WriteRecord):
+                    self._entries.append(item)
+                size += size_of(item)
+            if not self._stop.is_set():
+                time.sleep(PAUSE)
+        return bool(self._batch)
+
+    def records(self) -> Iterator[Record]:
+        """Yield the batch as it is kept on disk."""
+        for formatted, values in zip(self._batch, self._sizes, strict=True):
+            yield Record(self.pack(formatted), values)
+            if not self._stop.is_set():
+                time.sleep(PAUSE)
+
+    def let_go(self) -> int:
+        """Forget the batch, which is written or spilled, and return how many values were in it."""
+        size = sum(self._sizes)
+        entries, self._entries = self._entries, []
+        self._batch, self._sizes = [], []
+        for entry in entries:
+            self.settle_entry(entry)
+        return size
+
+    @property
+    def must_sync(self) -> bool:
+        """Return whether the batch must survive a loss of power once it is written."""
+        return self.is_strict and bool(self._entries)
+
+    def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample[Any]]]:
+        """Yield the points and samples of a cycle.
+
+        The thread lets go of the interpreter after each PIECE, so that a cycle of hundreds of points keeps the line's
+        loop no longer than one of a few.
+        """
+        for number, item in enumerate(snapshot.samples.items(), 1):
+            yield item
+            if number % PIECE == 0 and not self._stop.is_set():
+                time.sleep(PAUSE)

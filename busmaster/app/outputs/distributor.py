@@ -1,0 +1,280 @@
+"""All outputs of a line: what is polled and what happens is handed to each of them, and none can hold it up."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import anyio
+
+from busmaster import Bus, Point, Snapshot, ext
+from busmaster.app.outputs.base import Happening, Output, OutputStatistics
+from busmaster.app.outputs.exceptions import News
+from busmaster.app.outputs.files import CsvOutput, JsonlOutput
+from busmaster.app.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
+from busmaster.app.outputs.sqlite import SqliteOutput
+from busmaster.app.service.authorisation import Authorisation
+from busmaster.app.service.record import WriteRecord
+from busmaster.app.service.values import event_text, micros
+from busmaster.bounds import AUDIT_WITHIN
+from busmaster.events import AlarmChanged, BusEvent, MaxReplyDelayRaised, NodeChanged, RepliesLate, Stream
+from busmaster.ext import Outdated
+
+WAITING = 256
+"""Cycles of a group that may wait for a loop that is busy with other things."""
+FAREWELL = 5.0
+"""Seconds in which the outputs write what they still hold, when the line is closed."""
+
+
+class Source(Protocol):
+    """Where cycles come from: a poll group, or what is heard of one."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def points(self) -> tuple[Point[Any], ...]: ...
+
+    def subscribe(self, buffer: int, /, *, changes: bool = False) -> Stream[Snapshot]: ...
+
+
+class Wanted(NamedTuple):
+    """What one output is told. `commands`: the points, by their key, that it lets others write."""
+
+    settings: Settings
+    commands: Mapping[str, Point[Any]]
+
+    def same(self, other: Wanted | None) -> bool:
+        """Return whether the other is the same output: points that are equal may have another scale."""
+        return (
+            other is not None
+            and self.settings == other.settings
+            and self.commands.keys() == other.commands.keys()
+            and all(point is other.commands[key] for key, point in self.commands.items())
+        )
+
+
+class Distributor:
+    """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
+
+    `authorisation` is what the commands pass that they take in. One that is not `in_charge` of the line says nothing of
+    its state: another process may be. One that is not of a line that `asks` says only that it listens, and what it
+    hears.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        tell: Callable[[str], None] = lambda _: None,
+        *,
+        authorisation: Authorisation | None = None,
+        in_charge: bool = True,
+        asks: bool = True,
+    ) -> None:
+        self.tell = tell
+        self.authorisation = authorisation or Authorisation(bus)
+        self._in_charge = in_charge
+        self._asks = asks
+        self._bus = bus
+        self._outputs: list[Output] = []
+        self._feeding: dict[Source, asyncio.Task[None]] = {}
+        self._news: dict[Source, News] = {}
+        self._watching: asyncio.Task[None] | None = None
+        self._wanted: dict[str, Wanted] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def add(self, kind: str, settings: Settings, *, commands: Mapping[str, Point[Any]] | None = None) -> None:
+        """Add one more output.
+
+        `commands` are the points that it lets others write. Raises InvalidCommand if an extra is missing.
+        """
+        self._wanted[kind] = wanted = Wanted(settings, commands or {})
+        self._outputs.append(self._make(kind, *wanted))
+
+    def start(self, groups: Iterable[Source]) -> None:
+        """Start the outputs and feed them from these groups, from now on, until `close`."""
+        self._loop = asyncio.get_running_loop()
+        for output in self._outputs:
+            output.start()
+        self._take_in(groups)
+
+    async def replace(self, wanted: Mapping[str, Wanted], groups: Iterable[Source]) -> None:
+        """Run these outputs, and feed them from these groups, from now on.
+
+        One that is wanted as it was is reopened, and goes on with what it holds. Another is closed, within FAREWELL
+        seconds, and what comes meanwhile waits for its successor. Raises InvalidCommand, having changed nothing, if an
+        extra is missing.
+        """
+        # Made before anything is changed: an extra may be missing.
+        fresh = {kind: self._make(kind, *one) for kind, one in wanted.items() if not one.same(self._wanted.get(kind))}
+        kept = [output for output in self._outputs if output.kind in wanted and output.kind not in fresh]
+        leaving = {output.kind: output for output in self._outputs if output not in kept}
+        self._outputs = [*kept, *fresh.values()]
+        self._wanted = dict(wanted)
+        for output in kept:
+            output.reopen()
+        self._take_in(groups)
+        for news in self._news.values():
+            news.forget()  # what is made or opened anew knows nothing yet
+        with anyio.CancelScope(shield=True):
+            await close_all(leaving.values())
+        for kind, output in fresh.items():
+            if kind in leaving:
+                output.succeed(leaving.pop(kind))
+            output.start()
+        for kind, output in leaving.items():
+            counts = output.statistics()
+            on_disk = f", {counts.spilled} kept on disk" if counts.spilled else ""
+            self.tell(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
+
+    def record(self, write: WriteRecord) -> asyncio.Future[str] | None:
+        """Hand an audit entry to all of them.
+
+        For a write that succeeded, and outputs with `audit = "strict"`, return what becomes done when all of these have
+        the entry on the disk, or with the reason why one of them has not; else None.
+        """
+        waits = write.ok and any(output.is_strict for output in self._outputs)
+        durable: asyncio.Future[str] | None = asyncio.get_running_loop().create_future() if waits else None
+        missing = {output.kind for output in self._outputs if output.is_strict}
+        for output in self._outputs:
+            if durable is not None and output.is_strict:
+                output.offer_entry(write, partial(self._kept, durable, missing, output.kind))
+            else:
+                output.offer(write)
+        if durable is not None:
+            timer = durable.get_loop().call_later(AUDIT_WITHIN, self._not_kept, durable, missing)
+            durable.add_done_callback(lambda _: timer.cancel())
+        return durable
+
+    def _kept(self, durable: asyncio.Future[str], missing: set[str], kind: str, why_not: str) -> None:
+        """Hear from any thread that an output has an entry on the disk, or why it will never have it."""
+
+        def note() -> None:
+            missing.discard(kind)
+            if not durable.done() and (why_not or not missing):
+                durable.set_result(why_not)
+
+        try:
+            durable.get_loop().call_soon_threadsafe(note)
+        except RuntimeError:
+            pass  # the loop is closed
+
+    def _not_kept(self, durable: asyncio.Future[str], missing: set[str]) -> None:
+        """Wait no longer for these outputs."""
+        if not durable.done():
+            down = [f"{output.kind} is down: {output.error}" for output in self._outputs if output.error]
+            slow = f"{' and '.join(sorted(missing))} did not write it within {AUDIT_WITHIN:g} s"
+            durable.set_result("; ".join([slow, *(text for text in down if text.split()[0] in missing)]))
+
+    async def close(self) -> None:
+        """Close the outputs, once the bus is closed.
+
+        What was polled is still handed on, and written within FAREWELL seconds.
+        """
+        with anyio.CancelScope(shield=True):
+            # They end with the bus's streams. Cancelled, they would leave behind what was polled last.
+            await asyncio.gather(*self._feeding.values(), return_exceptions=True)
+            if self._watching is not None:
+                self._watching.cancel()
+                await asyncio.gather(self._watching, return_exceptions=True)
+            await close_all(self._outputs)
+        self._feeding.clear()
+        self._watching = None
+
+    def statistics(self) -> tuple[OutputStatistics, ...]:
+        """Return the counts of each output."""
+        return tuple(output.statistics() for output in self._outputs)
+
+    def _take_in(self, groups: Iterable[Source]) -> None:
+        """Feed the outputs in tasks of their own: a task group would tie entering and leaving the line to one task."""
+        if not self._outputs:
+            return
+        for group in groups:
+            if group not in self._feeding:
+                self._feeding[group] = task = asyncio.ensure_future(
+                    self._feed(group.subscribe(WAITING, changes=True), group)
+                )
+                task.add_done_callback(partial(self._fed, group))
+        if self._watching is None:
+            self._watching = asyncio.ensure_future(self._watch())
+
+    def _fed(self, group: Source, _: asyncio.Task[None]) -> None:
+        self._feeding.pop(group, None)
+        self._news.pop(group, None)
+
+    async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
+        lost = 0
+        news = self._news[group] = News(ext.line_of(self._bus).is_outdated)
+        async for snapshot in cycles:
+            told = news.of(snapshot)
+            for output in self._outputs:
+                if isinstance(snapshot, Outdated) and output.finds_outdated:
+                    continue
+                if not output.groups or group.name in output.groups:
+                    output.suppress(len(snapshot) - len(told))
+                    if told:
+                        output.offer(told)
+                    # cycles for which the loop was too busy count as well
+                    output.miss((cycles.dropped - lost) * len(group.points))
+            lost = cycles.dropped
+
+    async def _watch(self) -> None:
+        async for event in self._bus.events():
+            text = event_text(event)
+            if text:
+                for output in self._outputs:
+                    output.offer(Happening(micros(self._bus.wall_time()), label_of(event), text))
+
+    def _say(self, text: str) -> None:
+        """Hand a text from any thread to the loop; when that is gone nobody listens any more."""
+        if self._loop is not None:
+            try:
+                self._loop.call_soon_threadsafe(self.tell, text)
+            except RuntimeError:
+                pass
+
+    def _make(self, kind: str, settings: Settings, commands: Mapping[str, Point[Any]]) -> Output:
+        match settings:
+            case FileSettings():
+                return (CsvOutput if kind == "csv" else JsonlOutput)(kind, settings, self._say)
+            case SqliteSettings():
+                return SqliteOutput(kind, settings, self._say)
+            case MqttSettings():
+                from busmaster.app.outputs.mqtt import MqttOutput
+
+                return MqttOutput(
+                    kind,
+                    settings,
+                    self._bus,
+                    self._say,
+                    commands=commands,
+                    authorisation=self.authorisation,
+                    in_charge=self._in_charge,
+                    asks=self._asks,
+                )
+            case MetricsSettings():
+                from busmaster.app.outputs.metrics import MetricsOutput
+
+                return MetricsOutput(kind, settings, self._bus, self._say, self.statistics, self.authorisation.refusals)
+            case _:
+                raise AssertionError(settings)
+
+
+async def close_all(outputs: Collection[Output]) -> None:
+    """Close them, their interfaces first: what was answered there is on record in all of them."""
+    # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
+    await asyncio.gather(*(asyncio.to_thread(output.close_interface) for output in outputs))
+    await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in outputs))
+
+
+def label_of(event: BusEvent) -> str:
+    """Return the label of the node that an event is of, "" for one of the line."""
+    match event:
+        case NodeChanged() | MaxReplyDelayRaised() | RepliesLate():
+            return event.node.label
+        case AlarmChanged():
+            return event.point.node.label
+        case _:
+            return ""

@@ -1,0 +1,130 @@
+"""Store and forward: what waits while an output is down may go to disk, and is there again after a restart.
+
+Theory of operation. While it is down, and when it is to end, the thread moves what waits in memory to its spool. What
+is on disk is older than all that is in memory, so it is delivered first, and what comes meanwhile goes behind it. It
+is forgotten on disk once it was delivered: after a crash in between it is delivered twice, never not at all.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+
+from busmaster.app.outputs.base import BATCH, Output, check_folder
+from busmaster.app.outputs.settings import SpillingSettings
+from busmaster.app.outputs.spool import Record, Spool
+from busmaster.errors import InvalidCommand
+
+SPILL_EVERY = 0.2
+"""Seconds between two movings of what waits to disk, while the output is down."""
+
+
+class SpillingOutput(Output):
+    """An output with a spool, if its settings name one. All of it is on the output's thread."""
+
+    def __init__(self, kind: str, settings: SpillingSettings, say: Callable[[str], None] = lambda _: None) -> None:
+        super().__init__(kind, settings, say)
+        self._mode = settings.mode
+        self._spill = settings.spill
+        self._most_spilled = settings.spill_values
+        self._spool: Spool | None = None
+        self._spool_error = ""
+        if self._spill is not None:
+            check_folder(self._spill)
+
+    @abstractmethod
+    def hold(self, most: int) -> bool:
+        """Take what waits in hand, up to so many values, and return whether there is anything.
+
+        What could not be delivered is still in hand, and comes first.
+        """
+
+    @abstractmethod
+    def records(self) -> Iterable[Record]:
+        """Return what is in hand, as it is kept on disk."""
+
+    @abstractmethod
+    def let_go(self) -> int:
+        """Empty the hand, and return how many values were in it."""
+
+    def succeed(self, before: Output) -> None:
+        super().succeed(before)
+        if isinstance(before, SpillingOutput) and before.spilled and before._spill != self._spill:
+            self._say(f"{self.kind}: {before.spilled} values stay in {before._spill}, which it does not use any more")
+
+    def open_spool(self) -> None:
+        """Open the spool, and count what it holds. An output begins its work with this.
+
+        A spool that cannot be opened is told. Raises InvalidCommand where there may be something in it: newer values
+        must not overtake that.
+        """
+        if self._spill is None or self._spool is not None:
+            return
+        try:
+            self._spool = Spool(
+                self._spill,
+                self._most_spilled,
+                self.kind,
+                lambda text: self._say(f"{self.kind}: {text}"),
+                mode=self._mode,
+                strict=self.is_strict,
+            )
+        except InvalidCommand as error:
+            if os.path.isfile(self._spill) and os.path.getsize(self._spill):
+                raise
+            self._tell_once(str(error))
+        else:
+            self.spilled = self._spool.values  # first: the line's loop must never take it for more in memory
+            self.found += self._spool.values
+
+    def put_by(self) -> None:
+        """Move what waits from memory to disk. What the disk does not take stays where it is, which is told once."""
+        if self._spill is None:
+            return
+        try:
+            self.open_spool()
+        except InvalidCommand:
+            return  # which keeps the output down, and is told as that
+        while self._spool is not None and self.hold(BATCH):
+            try:
+                lost = self._spool.put(self.records())
+            except sqlite3.Error as error:
+                self._tell_once(f"{self._spill}: {error}")
+                return
+            self.lost += lost  # first, for the same reason
+            self.spilled += self.let_go() - lost
+            self._spool_error = ""
+
+    def forwarded(self, up_to: int, records: Iterable[Record]) -> None:
+        """Forget on disk what was delivered from there, and put what came meanwhile behind the rest."""
+        assert self._spool is not None
+        values = sum(record.values for record in records)
+        self._spool.remove(up_to, values)
+        self.written += values
+        self.spilled = self._spool.values
+        if self.spilled:
+            self.put_by()
+
+    def rest(self, seconds: float) -> None:
+        """Wait so many seconds, or until it is stopped. What comes while the output is down goes to disk, if it may."""
+        over = time.monotonic() + seconds
+        while not self._stop.is_set() and time.monotonic() < over:
+            self.put_by()
+            self._stop.wait(min(SPILL_EVERY, seconds))
+
+    def _run(self) -> None:
+        """Work until stopped. What is left in memory then goes to disk, if it may."""
+        try:
+            super()._run()
+        finally:
+            self.put_by()
+            if self._spool is not None:
+                self._spool.close()
+
+    def _tell_once(self, error: str) -> None:
+        if error != self._spool_error:
+            self._spool_error = error
+            self._say(f"{self.kind}: {error}")

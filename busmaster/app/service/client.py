@@ -1,0 +1,453 @@
+"""One program that has come to the line's owner: what it asks is done here, and ends when it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import replace
+from itertools import islice
+from typing import Any
+
+from busmaster import Node, Point, PollGroup, Priority, ext
+from busmaster.app.service.errands import Errand, Writing, errand_of
+from busmaster.app.service.failures import REFUSED, refusal_of, said_error
+from busmaster.app.service.line import ServedLine
+from busmaster.app.service.messages import NO_METHOD, Malformed, answered, check_within, timings_of, written
+from busmaster.app.service.outbox import Outbox
+from busmaster.app.service.overview import said_details
+from busmaster.app.service.peers import Peer
+from busmaster.app.service.permission import Permission
+from busmaster.app.service.refusals import INTERFACES
+from busmaster.app.service.requests import Requests
+from busmaster.app.service.rights import RIGHTS, Rights, Role
+from busmaster.app.service.streams import Broadcast, GroupBroadcast
+from busmaster.app.service.telling import point_of, profile_of, protocol_of, said_statistics
+from busmaster.bounds import (
+    LONGEST_SENDER,
+    MOST_CHECKED,
+    MOST_HOLDS,
+    MOST_NODES,
+    MOST_POLLED,
+    MOST_POLLED_POINTS,
+    MOST_REPORTED,
+    MOST_STREAMS,
+)
+from busmaster.errors import InvalidCommand
+from busmaster.ext import (
+    ORDINARY,
+    Hold,
+    LineClient,
+    NodeRecord,
+    Requester,
+    RequestOptions,
+    checked_priority,
+    seconds,
+    whole_number,
+)
+
+NodeKey = tuple[str, int]
+MOST_FAILED = 1_000_000
+"""Failed logins of one peer in one message."""
+FOR_SAFE_STATE = ("safe", "cancel")
+"""Methods of a program that has a place for the safe state."""
+
+
+def _reads_of(role: Role) -> RequestOptions:
+    return replace(ORDINARY, priority=max(ORDINARY.priority, RIGHTS[role].reads))
+
+
+class Client:
+    """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for.
+
+    `in_safe_place`: it has one of the places for programs that only send the safe state, and nothing else is done for
+    it.
+    """
+
+    def __init__(
+        self, line: ServedLine, peer: Peer, number: int, outbox: Outbox, *, in_safe_place: bool = False
+    ) -> None:
+        self.peer = peer
+        self.in_safe_place = in_safe_place
+        self.dropped: dict[Hashable, int] = {}
+        """Of each stream, how many messages the client was too slow for."""
+        self.outbox = outbox
+        self._line = line
+        self._number = number
+        self._nodes: dict[NodeKey, Node] = {}
+        self._stops: dict[NodeKey, int] = {}
+        """How often each had been told to stop when this client named it: the client counts from there."""
+        self._stopping: set[Node] = set()
+        """Nodes that it tells to stop, of which it may not write all: it counts with the write that follows, if that is
+        let through."""
+        self._refused: dict[NodeKey, str] = {}
+        """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
+        self.requests = Requests(self, line, self._tell_result, self._refuse)
+        """What it has asked of the line."""
+        self._streams: dict[int, Broadcast] = {}
+        self._groups: dict[int, PollGroup] = {}
+        self._role = self.permission.role
+        self.reads = _reads_of(self._role)
+        """The options of its reads that say none."""
+        self.turn = ext.line_of(line.bus).add_client(line.share, self.rights.owner_time, peer.account)
+        """What its requests take turns by, with those of the others."""
+        self._holds: dict[int, Hold | str] = {}
+        """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
+        self._gathered: dict[int, list[Point[Any]]] = {}
+        """Points for poll groups that it will make, by the streams of those."""
+
+    @property
+    def permission(self) -> Permission:
+        """Return what it may do, as it is now."""
+        return self.peer.permission(self._line.authorisation.access)
+
+    @property
+    def rights(self) -> Rights:
+        """Return what its role may have of the line. `tell_access` changes it: it is not found for every request."""
+        return RIGHTS[self._role]
+
+    @property
+    def read_only(self) -> bool:
+        """Return whether nothing that it writes is let through, as it is now."""
+        return self._line.authorisation.read_only or not self.permission.writes
+
+    @property
+    def errands(self) -> tuple[Errand, ...]:
+        """Return what it asked for that is not done yet."""
+        return self.requests.errands
+
+    # what is said to it
+
+    def tell(self, stream: int, method: str, body: str) -> None:
+        """Say something of a stream; it is dropped where the client does not keep up."""
+        self.outbox.put_news(stream, self._news(stream, method, body))
+
+    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+        """Say something of a part of a stream that replaces what was said of it before."""
+        self.outbox.put_latest((stream, method, part), self._news(stream, method, body))
+
+    def _news(self, stream: int, method: str, body: str) -> str:
+        dropped = self.dropped.get(stream, 0)
+        head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
+        return f"{head}{body}}}}}"
+
+    def tell_access(self) -> None:
+        """Have another role hold at once, and say what the program may do now."""
+        role = self.permission.role
+        if role is not self._role:
+            self._role, self.reads = role, _reads_of(role)
+            ext.line_of(self._line.bus).arbiter.change_client(self.turn, self.rights.owner_time)
+        self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
+
+    def tell_stops(self, node: NodeRecord) -> None:
+        """Say how often a node was told to stop, if this client knows it."""
+        key = (node.profile.name, node.address)
+        if key in self._nodes:
+            params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
+            self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
+
+    @property
+    def has_values(self) -> bool:
+        """Return whether it follows anything of the line, and so may hold values that a write makes stale."""
+        return bool(self._streams)
+
+    def tell_touched(self, params: Mapping[str, Any], key: Hashable) -> None:
+        """Say which values a write has made stale; `key` stands for these same values."""
+        self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
+
+    # what it says
+
+    def take(self, said: Mapping[str, Any]) -> None:
+        """Do what a message asks. Raises Malformed for what no client of this version says."""
+        number, method, params = said.get("id"), said.get("method"), said.get("params", {})
+        if not isinstance(method, str) or not isinstance(params, dict):
+            raise Malformed("a message has a method, and its parameters by name")
+        if self.in_safe_place and method not in FOR_SAFE_STATE:
+            raise Malformed("all other places are taken: this program can send the safe state, and nothing else")
+        if number is None:
+            try:
+                self._notified(method, params)
+            except TypeError as error:  # a list for a number
+                raise Malformed(f"{method[:40]}: {error}") from None
+            return
+        if isinstance(number, bool) or not isinstance(number, int):
+            raise Malformed("the id of a request is a whole number")
+        if method in ("request", "write"):
+            self.requests.begin(number, params)
+            return
+        if method == "safe":
+            self.requests.begin_safe(number, params)
+            return
+        self.requests.check_number(number)
+        try:
+            answer = self._answer(method, params)
+        except REFUSED as error:
+            self._refuse(number, refusal_of(method, error))
+        else:
+            self._tell_result(number, answer)
+
+    def _notified(self, method: str, params: Mapping[str, Any]) -> None:
+        match method:
+            case "cancel":
+                self.requests.cancel(params.get("id"))
+            case "end":
+                self._end_stream(params.get("stream", -1))
+            case "hold":
+                self._hold(params)
+            case "release":
+                self._release(params.get("sequence", -1))
+            case "failed_logins":
+                self._take_failed_logins(params.get("interface"), params.get("peers"))
+            case "stop":
+                node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
+                if node is not None and self.permission.covers(node):
+                    node.note_stop()
+                elif node is not None:
+                    self._stopping.add(node)
+
+    def _take_failed_logins(self, interface: object, peers: object) -> None:
+        """Count what an interface in another process reports. What is not a count is ignored."""
+        if interface not in INTERFACES[1:] or not isinstance(peers, dict):
+            return
+        for peer, count in islice(peers.items(), MOST_REPORTED + 1):
+            if type(count) is int and 0 < count <= MOST_FAILED and len(peer) <= LONGEST_SENDER and peer.isprintable():
+                self._line.authorisation.refusals.note_login(str(interface), peer, count)
+
+    def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
+        """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""
+        match method:
+            case "node":
+                return self._name_node(params)
+            case "check":
+                if len(params["commands"]) > MOST_CHECKED:
+                    raise InvalidCommand(f"{MOST_CHECKED} writes are checked at once, and no more")
+                for command in params["commands"]:
+                    errand = errand_of({**params, "command": command}, self, self._line)
+                    if isinstance(errand, Writing):
+                        errand.check()
+                return None
+            case "now":
+                return self._line.bus.now()
+            case "statistics":
+                return said_statistics(self._line.bus.statistics())
+            case "groups":
+                return [{"name": group.name, "period": group.period} for group in self._line.bus.groups]
+            case "subscribe":
+                return self._follow(params, self._line.broadcast_of(self._line.group(params["group"])))
+            case "events":
+                return self._follow(params, self._line.events())
+            case "gather":
+                return self._gather(params)
+            case "poll":
+                return self._poll(params)
+            case "overview":
+                return self._follow(params, self._line.overview())
+            case "exchanges":
+                return self._follow(params, self._line.exchanges())
+            case "details":
+                return said_details(self._line.bus, *self._line.point(params["group"], params["key"]))
+            case "pause" | "demand" | "suspend":
+                return self._steer(method, params)
+        raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
+
+    def _steer(self, method: str, params: Mapping[str, Any]) -> None:
+        """Do what changes how the line is polled, for all who use it: it is told whose wish that was.
+
+        Raises InvalidCommand where he may not write to the nodes that it is about.
+        """
+        if method == "suspend":
+            node = self._line.node(params["protocol"], params["address"])
+            self._check_steering(node)
+            node.suspend(params["for"])
+            did = f"{node.label} is suspended for {params['for']:g} s" if node.suspended else f"{node.label} goes on"
+        else:
+            group = self._line.group(params["group"])
+            if method == "demand":
+                self._line.demand(group, self._role)
+                return
+            self._check_steering(*(point.node for point in group.points))
+            group.pause() if params["paused"] is True else group.resume()
+            did = f"{group.name} {'is paused' if group.paused else 'goes on'}"
+        self._line.journal.note(f"{did}, says {self.peer}")
+
+    def _check_steering(self, *nodes: Requester) -> None:
+        if not all(map(self.permission.reaches, nodes)):
+            raise InvalidCommand(
+                f"{self.permission.who} may not have this rest: that is for who may write to its nodes"
+            )
+
+    # nodes
+
+    def _name_node(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        key = params["protocol"], params["address"]
+        self._refused.pop(key, None)
+        try:
+            sync_reads = params.get("probe"), params.get("sync_reads")
+            node = self.node(*key, params.get("timings"), params.get("retries"), sync_reads)
+        except InvalidCommand as error:
+            if len(self._refused) < MOST_NODES:
+                self._refused[key] = str(error)
+            raise
+        return {"label": node.label, "health": node.health.value}
+
+    def node(
+        self,
+        name: str,
+        address: int,
+        timings: Any = None,
+        retries: int | None = None,
+        sync_reads: tuple[Any, Any] = (None, None),
+    ) -> Node:
+        """Return a node, which this client has until it leaves. Raises InvalidCommand as `Bus.node` does."""
+        if refused := self._refused.get((name, address)):
+            raise InvalidCommand(refused)
+        known = self._nodes.get((name, address))
+        if known is not None and timings is None and retries is None:
+            return known
+        protocol = protocol_of(name)
+        if known is None and len(self._nodes) >= MOST_NODES:
+            raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
+        bus, rights = self._line.bus, self.rights
+        profile = profile_of(protocol, *sync_reads)
+        times = timings_of(timings)
+        if known is None and not ext.has_node(bus, profile, address):
+            if sum(not ext.is_kept(node) for node in self._nodes.values()) >= rights.new_nodes:
+                raise InvalidCommand(
+                    f"{profile.label(address)}: a program with the role {self._role.value} names {rights.new_nodes} "
+                    "nodes at most that the line's owner does not have: add the node to the line's file"
+                )
+            if not rights.own_times:
+                check_within(times, profile, address)
+        node = ext.lend_node(bus, profile, address, timings=times, retries=retries, budgeted=rights.budgeted)
+        if known is not None:
+            ext.give_back(bus, node)  # it was asked for its complaint alone
+        self._nodes[name, address] = node
+        self._stops.setdefault((name, address), node.stops)
+        return node
+
+    def stops_before(self, node: Node) -> int:
+        """Return how often a node had been told to stop when this client named it."""
+        return self._stops[node.profile.name, node.address]
+
+    def takes_stop(self, node: Node) -> bool:
+        """Return whether the write to a node that is begun now is the stop that this client has announced: once."""
+        announced = node in self._stopping
+        self._stopping.discard(node)
+        return announced
+
+    # answers
+
+    def _tell_result(self, number: int, result: Any) -> None:
+        self.outbox.put(answered(number, result))
+
+    def _refuse(self, number: int, error: Exception) -> None:
+        self.outbox.put(written({"id": number, "error": said_error(error)}))
+
+    # sequences
+
+    def client_of(self, sequence: int | None, node: Node) -> LineClient:
+        """Return whose turn a request takes. Raises InvalidCommand for a sequence that this client does not have."""
+        if sequence is None:
+            return self.turn
+        hold = self._holds.get(sequence)
+        if isinstance(hold, str):
+            raise InvalidCommand(hold)
+        if hold is None or hold.node is not ext.record_of(node):
+            raise InvalidCommand(f"{node.label}: no sequence {sequence} was begun for it, of {MOST_HOLDS} at most")
+        return hold
+
+    def _hold(self, params: Mapping[str, Any]) -> None:
+        """Begin a sequence; the requests of one that cannot be begun are told why."""
+        number = params.get("sequence")
+        if isinstance(number, int) and not isinstance(self._holds.get(number), Hold) and len(self._holds) < MOST_HOLDS:
+            try:
+                self._holds[number] = self._begin_hold(params)
+            except InvalidCommand as error:
+                self._holds[number] = str(error)
+            except KeyError as missing:
+                self._holds[number] = f"a sequence is held with protocol, address and max_hold: {missing} is missing"
+
+    def _begin_hold(self, params: Mapping[str, Any]) -> Hold:
+        node = self.node(params["protocol"], params["address"])
+        if not self.permission.reaches(node):  # who may only read keeps nobody waiting so
+            raise InvalidCommand(
+                f"{node.label}: {self.permission.who} may not hold the line for it: who may write to it does"
+            )
+        return ext.hold(node, seconds(params["max_hold"], "max_hold"), self.turn)
+
+    def _release(self, sequence: int) -> None:
+        hold = self._holds.pop(sequence, None)
+        if isinstance(hold, Hold):
+            ext.line_of(self._line.bus).release(hold)
+
+    # streams
+
+    def _follow(self, params: Mapping[str, Any], source: Broadcast) -> dict[str, Any]:
+        stream = whole_number(params["stream"], 0, 2**53, "a stream")
+        if stream in self._streams or len(self._streams) >= MOST_STREAMS:
+            raise InvalidCommand(f"one program has {MOST_STREAMS} streams at most, each with a number of its own")
+        self._streams[stream] = source
+        source.join(self, stream)
+        return {"period": source.group.period} if isinstance(source, GroupBroadcast) else {}
+
+    def _gather(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Keep points for a poll group: a message is too short for as many as one may have."""
+        stream, points = whole_number(params["stream"], 0, 2**53, "a stream"), params.get("points", [])
+        if stream not in self._gathered and len(self._gathered) >= MOST_POLLED:
+            raise InvalidCommand(f"one program has {MOST_POLLED} poll groups at most")
+        known = self._gathered.get(stream, [])
+        if not isinstance(points, list) or len(known) + len(points) > MOST_POLLED_POINTS:
+            raise InvalidCommand(f"a poll group of a program has {MOST_POLLED_POINTS} points at most")
+        read = [point_of(point, self.node) for point in points]
+        if any(point.command.writes for point in read):
+            raise InvalidCommand("a poll group reads: it writes nothing")
+        self._gathered[stream] = known + read
+        return {}
+
+    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        if len(self._groups) >= self.rights.groups:
+            raise InvalidCommand(f"one program has {self.rights.groups} poll groups at most")
+        self._gather(params)
+        read = self._gathered.pop(params["stream"])
+        phase = params.get("phase")
+        group = self._line.bus.poll_group(
+            f"{str(params['name'])[:40]} ({self.peer.short}-{self._number})",
+            period=seconds(params["period"], "a period"),
+            points=read,
+            phase=None if phase is None else seconds(phase, "a phase"),
+            priority=checked_priority(max(self.rights.polls, params.get("priority", Priority.POLL))),
+            client=self.turn,
+        )
+        try:
+            answer = self._follow(params, self._line.broadcast_of(group))
+        except BaseException:
+            group.close()
+            raise
+        self._groups[params["stream"]] = group
+        return answer
+
+    def _end_stream(self, stream: int) -> None:
+        source = self._streams.pop(stream, None)
+        if source is not None:
+            source.leave(self, stream)
+        self._gathered.pop(stream, None)
+        group = self._groups.pop(stream, None)
+        if group is not None:
+            group.close()
+        self.dropped.pop(stream, None)
+
+    # its end
+
+    def release(self) -> None:
+        """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
+        self.requests.end()
+
+    async def leave(self) -> None:
+        """End all that it asked for, and give back its nodes."""
+        for stream in list(self._streams):
+            self._end_stream(stream)
+        await self.requests.give_up()
+        for sequence in list(self._holds):
+            self._release(sequence)
+        ext.line_of(self._line.bus).remove_client(self.turn)
+        for node in self._nodes.values():
+            ext.give_back(self._line.bus, node)
+        self._nodes.clear()

@@ -1,0 +1,395 @@
+"""One request of a client: a command that is built here again, and so checked again, and runs on the line."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol, TypeAlias, cast
+
+from busmaster import Node, Point, ext
+from busmaster.app.service.authorisation import FRESH, NEVER_SENT, Wish, outcome_of
+from busmaster.app.service.line import ServedLine
+from busmaster.app.service.messages import value_of
+from busmaster.app.service.peers import Peer
+from busmaster.app.service.permission import Permission
+from busmaster.app.service.reads import PlainRead
+from busmaster.app.service.rights import Rights
+from busmaster.app.service.telling import protocol_of
+from busmaster.bounds import LONGEST_WAIT
+from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
+from busmaster.ext import (
+    ORDINARY,
+    Changing,
+    Command,
+    CommandOptions,
+    LineClient,
+    NodeRecord,
+    Placed,
+    Request,
+    RequestOptions,
+    seconds,
+)
+
+OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
+"""Of a request, those that a client may say."""
+INTERFACE = "service"
+RAW_COMMAND = "raw command"
+"""What the record of a write names in place of a point, where no poll group has one: its value says the rest."""
+
+
+class Asker(Protocol):
+    """Who asks for it."""
+
+    @property
+    def peer(self) -> Peer: ...
+
+    @property
+    def permission(self) -> Permission: ...
+
+    @property
+    def reads(self) -> RequestOptions:
+        """Return the options of its reads that say none: their class is the highest that its role has for reads, but
+        for URGENT."""
+        ...
+
+    @property
+    def rights(self) -> Rights: ...
+
+    def node(self, name: str, address: int, /) -> Node:
+        """Return a node of the line. Raises InvalidCommand."""
+        ...
+
+    @property
+    def turn(self) -> LineClient:
+        """Return what its requests take turns by, but for those of its sequences."""
+        ...
+
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        """Return whose turn a request takes: the program's, or that of its sequence. Raises InvalidCommand."""
+        ...
+
+    def stops_before(self, node: Node, /) -> int:
+        """Return the stops of a node from which this client counts."""
+        ...
+
+    def takes_stop(self, node: Node, /) -> bool:
+        """Return whether the write that is begun now is a stop of its node, as the client has announced."""
+        ...
+
+    def tell_stops(self, node: NodeRecord, /) -> None:
+        """Say how often a node was told to stop."""
+        ...
+
+
+class Task(NamedTuple):
+    """What is asked for: a command for a node, and what reads what it writes (`touches`); perhaps its point."""
+
+    node: Node
+    command: Command[Any]
+    touches: Command[Any] | None = None
+    value: Any = None
+    """As the record of a write has it."""
+    point: Point[Any] | None = None
+
+    @classmethod
+    def of_node(cls, params: Mapping[str, Any], asker: Asker) -> Task:
+        """Return a command that a client names. Raises InvalidCommand for what the protocol does not have."""
+        node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
+        command, touches = protocol.read_back(params["command"]), params.get("touches")
+        value = str(command) if command.writes else None
+        return cls(node, command, None if touches is None else protocol.read_back(touches), value)
+
+    @classmethod
+    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Task:
+        """Return the write of a value to a point of a poll group.
+
+        Raises InvalidCommand, and keeps a record of it, for what cannot be written.
+        """
+        _, point = line.point(params["group"], params["key"])
+        value = value_of(params["value"])
+        assert isinstance(point.node, Node)
+        try:
+            if isinstance(value, str) and point.meaning.labels:
+                value = point.meaning.number_of(value)
+            return cls(point.node, _encoded(point, value), point.command, value, point)
+        except NEVER_SENT as error:
+            by, permission = str(asker.peer), asker.permission
+            wish = Wish(interface=INTERFACE, by=by, name=point.key, point=point, value=value, permission=permission)
+            refusal = line.authorisation.refusal(wish) or outcome_of(error)[1]
+            line.authorisation.refuse(wish, refusal)
+            raise InvalidCommand(refusal) from None
+
+
+Told: TypeAlias = Callable[["Errand", Any, BaseException | None], object]
+"""Hears the end of an errand: its value, or its error; neither of one that was given up, see there."""
+
+
+class Reading:
+    """A command that writes nothing, for one client. It is told itself what became of it: at once, for the turn of the
+    loop that a future takes is a part of what a program waits beyond what the line takes.
+    """
+
+    __slots__ = ("_over", "_request", "_told", "command", "given_up", "node")
+
+    _told: Told
+
+    def __init__(
+        self,
+        node: Node,
+        command: Command[Any],
+        client: LineClient,
+        stops_seen: int | None = None,
+        options: RequestOptions = ORDINARY,
+    ) -> None:
+        self.node = node
+        self.command = command
+        self.given_up = False
+        self._request = Request(command, options, stops_seen=stops_seen, client=client)
+        self._over = False
+
+    @property
+    def sent(self) -> bool:
+        """Return whether an attempt of it was handed to the line."""
+        return self._request.sent
+
+    def begin(self, told: Told) -> None:
+        """Have it done; `told` hears its end once, perhaps before this returns.
+
+        Raises BusError or InvalidCommand where nothing could be begun.
+        """
+        self._told = told
+        ext.start(self.node, self._request, self)
+
+    def cancel(self) -> None:
+        """Give it up: what is on the wire runs out unheard."""
+        if not self._over:
+            if self._request.transaction is not None:
+                ext.give_up(self.node, self._request.transaction)
+            self._over = self.given_up = True
+            self._told(self, None, None)
+
+    # what the line tells
+
+    def done(self) -> bool:
+        """Return whether nobody waits for it any more."""
+        return self._over
+
+    def set_result(self, value: Any, /) -> None:
+        """Hear what was read."""
+        self._over = True
+        self._told(self, value, None)
+
+    def set_exception(self, error: BaseException, /) -> None:
+        """Hear why nothing was."""
+        self._over = True
+        self._told(self, None, error)
+
+
+class Writing:
+    """A command that writes, with its options, for one client. It passes authorisation."""
+
+    def __init__(
+        self,
+        task: Task,
+        options: CommandOptions,
+        *,
+        line: ServedLine,
+        asker: Asker,
+        client: LineClient,
+        asked: float,
+        stops_seen: int | None,
+        stop: bool,
+    ) -> None:
+        self.node = task.node
+        self.command = task.command
+        self.given_up = False
+        self.doing: asyncio.Task[Any] | None = None
+        """What is done for it, once it is begun."""
+        self._request = Request(task.command, ORDINARY, task.touches, stops_seen, stop, client)
+        self._task = task
+        self._options = options
+        self._line = line
+        self._asker = asker
+        self._asked = asked
+        self._stop = stop
+        self._begun = False
+        self._told: Told
+
+    @property
+    def sent(self) -> bool:
+        """Return whether an attempt of it was handed to the line."""
+        return self._request.sent
+
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if refusal := self._line.authorisation.refusal(wish):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.authorisation.refuse(wish, str(error))
+            raise
+
+    def begin(self, told: Told) -> None:
+        """Have it done; `told` hears its end once."""
+        self._told = told
+        if self._asker.takes_stop(self.node):
+            self._stop_node()
+        self.doing = asyncio.ensure_future(self._write())
+        self.doing.add_done_callback(self._written)
+
+    def cancel(self) -> None:
+        """Give it up: what is on the wire runs out unheard."""
+        if self.doing is not None:
+            self.doing.cancel()
+
+    # inside
+
+    def _stop_node(self) -> None:
+        """Count the stop that this write is, if it may be written; else its program is told how many count."""
+        if self._line.authorisation.refusal(self._wish()):
+            self._asker.tell_stops(ext.record_of(self.node))
+        else:
+            self.node.note_stop()
+
+    def _written(self, writing: asyncio.Task[Any]) -> None:
+        if not self._begun:  # a task that is cancelled before its first step runs nothing of it
+            self._line.authorisation.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
+        self.given_up = writing.cancelled()
+        error = None if self.given_up else writing.exception()
+        self._told(self, None if self.given_up or error is not None else writing.result(), error)
+
+    async def _write(self) -> Any:
+        self._begun = True
+        wish = self._wish()
+        passage = self._line.authorisation.begin(wish)
+        try:
+            if refusal := self._line.authorisation.refusal(wish):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            if (age := self._line.bus.now() - self._asked) > FRESH:
+                raise NotStarted(
+                    f"it came {age:.1f} s after it was asked for",
+                    node=self.node,
+                    command=str(self.command),
+                    hint="see whether the program that asked, or the one that owns the line, stood still meanwhile",
+                )
+            self._request.options = ext.checked_options(
+                self.node, _left(self._options, self._line.bus.now() - self._asked)
+            )
+            value = await ext.run(self.node, self._request)
+        except BaseException as error:
+            passage.end(self._truth(error))
+            raise
+        passage.end(None)
+        if why := await passage.not_durable():
+            hint = "see why that output is down; the value need not be written again"
+            raise WriteUnconfirmed(why, node=self.node, command=str(self.command), hint=hint)
+        return value
+
+    def _truth(self, error: BaseException) -> BaseException:
+        """Return what is kept of a write that ended so: one that was given up may never have been sent."""
+        if isinstance(error, Exception):
+            return error
+        if self.sent:
+            return WriteUnconfirmed("its program gave up before it was answered")
+        return NotStarted("its program gave up before it was sent")
+
+    def _wish(self) -> Wish:
+        """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
+        command, point, value = self.command, self._task.point, self._task.value
+        if point is None and isinstance(command, Changing):
+            changes = command.changes(self.node.profile)
+            point = self._line.named(self.node, changes.keys())
+            if point is not None:
+                value = _value(point, changes, value)
+        point = point or Point(self.node, RAW_COMMAND, command)
+        return Wish(
+            interface=INTERFACE,
+            by=str(self._asker.peer),
+            name=point.key,
+            point=point,
+            value=value,
+            command=command,
+            permission=self._asker.permission,
+        )
+
+
+Errand: TypeAlias = Reading | Writing
+
+
+def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
+    """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
+    if isinstance(said, PlainRead):
+        return Reading(asker.node(said.protocol, said.address), said.command, asker.turn, None, asker.reads)
+    task = Task.of_point(said, asker, line) if "key" in said else Task.of_node(said, asker)
+    node, command = task.node, task.command
+    given = cast("CommandOptions", said.get("options") or {})
+    if not set(given) <= OPTIONS:
+        raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
+    RequestOptions.of(given, node.label)  # checked here, before it may wait
+    _check_waits(given, node)
+    now, stops_seen = line.bus.now(), said.get("stops_seen")
+    stops_seen = None if stops_seen is None else stops_seen + asker.stops_before(node)
+    client = asker.client_of(said.get("sequence"), node)
+    stop = said.get("stop") is True and _check_stop(node, command)
+    asked = min(now, seconds(said.get("requested", now), "requested"))
+    if not command.writes:
+        options = RequestOptions.of(_left(given, now - asked), node.label)
+        options = replace(options, priority=max(options.priority, asker.rights.reads))
+        return Reading(node, command, client, stops_seen, options)
+    return Writing(task, given, line=line, asker=asker, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+
+
+def _check_waits(options: CommandOptions, node: Node) -> None:
+    """Raise InvalidCommand for a request that may wait for longer than a client can mean."""
+    for name in ("start_within", "finish_within"):
+        limit = options.get(name)
+        if isinstance(limit, int | float) and limit > LONGEST_WAIT:
+            raise InvalidCommand(
+                f"{node.label}: {name} is {LONGEST_WAIT:g} s at most, not {limit:g} s: leave it out for no limit"
+            )
+
+
+def _left(options: CommandOptions, age: float) -> CommandOptions:
+    """Return the options of a request, less the seconds since it was asked for."""
+    left: dict[str, Any] = dict(options)
+    for name in ("start_within", "finish_within"):
+        limit = left.get(name)
+        if isinstance(limit, int | float):
+            left[name] = max(0.0, limit - age)
+    return cast("CommandOptions", left)
+
+
+def _encoded(point: Point[Any], value: Any) -> Command[Any]:
+    """Return the write of a value. Raises InvalidCommand for one that cannot be written.
+
+    Where the line carries a number, each codec refuses true and false: a client that means 1 must send 1. Where it
+    carries a whole number, 7.0 means 7: JSON and OPC UA clients have one type for all numbers.
+    """
+    if point.encode is None:
+        raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+    try:
+        return point.encode(value)
+    except InvalidCommand:
+        if isinstance(value, float) and value.is_integer():
+            return point.encode(int(value))
+        raise
+
+
+def _check_stop(node: Node, command: Command[Any]) -> bool:
+    """Return True for what stops. Raises InvalidCommand for what does more: a stop passes whatever the limits."""
+    changes = command.changes(node.profile) if isinstance(command, Changing) else {"": None}
+    if any(value != 0 for value in changes.values()):
+        raise InvalidCommand(f"{node.label}: {command} is no stop, which writes 0 and nothing else: leave out `stop`")
+    return True
+
+
+def _value(point: Point[Any], changes: Mapping[Hashable, Any], otherwise: Any) -> Any:
+    """Return what the point will read after these changes, in its unit."""
+    assert isinstance(point.command, Placed)
+    try:
+        return point.value_of(point.command.shown(changes))
+    except Exception:  # of a decoder; the record then says what was sent
+        return otherwise

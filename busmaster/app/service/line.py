@@ -1,0 +1,137 @@
+"""A served line, as the programs that come to it share it: what is told of it is worked out once for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Hashable
+from functools import partial
+from math import inf, nextafter
+from typing import Any
+
+from busmaster import Bus, Node, Point, PollGroup, ext
+from busmaster.app.service.authorisation import Authorisation
+from busmaster.app.service.exchanges import ExchangesBroadcast
+from busmaster.app.service.overview import Journal, Overview
+from busmaster.app.service.rights import RIGHTS, Role
+from busmaster.app.service.safe import SafeWishes
+from busmaster.app.service.streams import Broadcast, EventBroadcast, GroupBroadcast
+from busmaster.errors import InvalidCommand
+from busmaster.ext import NodeRecord, Placed
+
+MOST_NAMED = 50
+"""Points that one message names as stale."""
+
+
+class ServedLine:
+    """One line with its authorisation. `share` weighs the line time of each program: the owner's own share is 1."""
+
+    def __init__(self, bus: Bus, authorisation: Authorisation, share: float, title: str) -> None:
+        self.bus = bus
+        self.authorisation = authorisation
+        self.share = share
+        self.title = title
+        """What is written over what a person sees of the line."""
+        self.safe_wishes = SafeWishes(authorisation)
+        self.journal = Journal(bus)
+        """What happens from now on, also before it is served."""
+        self._demanded: dict[tuple[str, Role], float] = {}
+        """When a role's programs last had a group polled off its grid."""
+        self._groups: dict[PollGroup, GroupBroadcast] = {}
+        self._events: EventBroadcast | None = None
+        self._overview: Overview | None = None
+        self._exchanges: ExchangesBroadcast | None = None
+        self._points: dict[object, Point[Any]] = {}
+        self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
+
+    def broadcast_of(self, group: PollGroup) -> Broadcast:
+        """Return what tells the cycles of a poll group."""
+        if group not in self._groups:
+            self._groups[group] = GroupBroadcast(group, partial(self._forget_group, group))
+        return self._groups[group]
+
+    def events(self) -> Broadcast:
+        """Return what tells of line and nodes."""
+        if self._events is None:
+            self._events = EventBroadcast(self.bus, self._end_events)
+        return self._events
+
+    def overview(self) -> Broadcast:
+        """Return what tells what a person sees of the line."""
+        if self._overview is None:
+            self._overview = Overview(
+                self.bus, self.authorisation, self.journal, lambda: self.title, self._end_overview
+            )
+        return self._overview
+
+    def exchanges(self) -> Broadcast:
+        """Return what tells what passes on the line."""
+        if self._exchanges is None:
+            self._exchanges = ExchangesBroadcast(self.bus, self._end_exchanges)
+        return self._exchanges
+
+    def group(self, name: str) -> PollGroup:
+        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
+        found = next((group for group in self.bus.groups if group.name == name), None)
+        if found is None:
+            names = ", ".join(group.name for group in self.bus.groups) or "none"
+            raise InvalidCommand(f"no poll group {name!r}; there are: {names}")
+        return found
+
+    def point(self, group: str, key: str) -> tuple[PollGroup, Point[Any]]:
+        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
+        found = self.group(group)
+        for point in found.points:
+            if point.key == key:
+                return found, point
+        raise InvalidCommand(f"poll group {group!r} has no point {key!r}")
+
+    def demand(self, group: PollGroup, role: Role) -> None:
+        """Poll a group now, unless the programs of this role have had that lately: then the next cycle serves."""
+        every, now = RIGHTS[role].demand_every, self.bus.now()
+        if now < self._demanded.get((group.name, role), -inf) + every * group.period:
+            return
+        self._demanded[group.name, role] = now
+        group.demand()
+
+    def node(self, protocol: str, address: int) -> Node:
+        """Return a node that is on the line. Raises InvalidCommand if there is none."""
+        for node in self.bus.nodes:
+            if (node.profile.name, node.address) == (protocol, address):
+                return node
+        raise InvalidCommand(f"there is no node {address} of {protocol} on this line")
+
+    def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
+        """Return the point of a poll group that reads these places of a node."""
+        groups = [(group.name, group.points) for group in self.bus.groups]
+        if groups != self._points_of:
+            self._points_of = groups
+            self._points = {
+                (point.node, frozenset(point.command.places)): point
+                for _, points in groups
+                for point in points
+                if isinstance(point.command, Placed)
+            }
+        return self._points.get((node, frozenset(places)))
+
+    def stale_items(self, record: NodeRecord, when: float) -> list[str] | None:
+        """Return the polled points of a node that the write that ended just now has made stale.
+
+        None stands for all of the node, also where they are too many to be named: to doubt a good value is safe.
+        """
+        before = nextafter(when, -inf)
+        points = {point.item: point for group in self.bus.groups for point in group.points_of(record)}
+        stale = [item for item, point in points.items() if ext.line_of(self.bus).is_stale(point, before)]
+        return stale if len(stale) <= MOST_NAMED else None
+
+    def _forget_group(self, group: PollGroup) -> None:
+        self._groups.pop(group, None)
+        for role in Role:
+            self._demanded.pop((group.name, role), None)
+
+    def _end_events(self) -> None:
+        self._events = None
+
+    def _end_overview(self) -> None:
+        self._overview = None
+
+    def _end_exchanges(self) -> None:
+        self._exchanges = None

@@ -1,0 +1,318 @@
+"""The client's end of a connection: questions and their answers, and what comes unexpected."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections import deque
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from typing import Any
+
+from busmaster.app.service.connection import AskingConnection
+from busmaster.app.service.failures import error_of
+from busmaster.app.service.folder import socket_path
+from busmaster.app.service.messages import VERSIONS, numbered, read, words, written
+from busmaster.bounds import LONGEST_ANSWER
+from busmaster.errors import (
+    Addressed,
+    BusClosed,
+    BusError,
+    LineDown,
+    NoReply,
+    NotStarted,
+    WriteUnconfirmed,
+)
+from busmaster.ext import Command, host_and_port
+
+GRACE = 0.25
+"""Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
+CONNECT_WITHIN = 10.0
+ENDED = "the program that owns the line has ended"
+READ_AT_ONCE = 1 << 16
+TCP = "tcp://"
+GONE = "the connection to the program that owns the line was lost"
+NO_PLACE = "see busmaster status; where no place is free, end a program that uses the line"
+AGAIN = "see whether it runs, and connect again"
+
+
+class Asked:
+    """One question on its way. `writes`: of what it asks for, it must be said whether it may have been sent."""
+
+    __slots__ = ("command", "future", "handed", "node", "number", "writes")
+
+    def __init__(
+        self,
+        number: int,
+        future: asyncio.Future[Any],
+        writes: bool,
+        node: Addressed | None,
+        command: Command[Any] | None,
+        handed: bool = False,
+    ) -> None:
+        self.number = number
+        self.future = future
+        self.writes = writes
+        self.node = node
+        self.command = command
+        self.handed = handed
+        """Whether it was handed to the connection: what was not has certainly not been sent."""
+
+    def fail(self, kind: type[BusError], what: str, hint: str | None = None) -> None:
+        """End it with an error, unless it has ended."""
+        if not self.future.done():
+            self.future.set_exception(kind(what, node=self.node, command=_text(self.command), hint=hint))
+
+    def lost(self, kind: type[BusError], what: str, hint: str) -> None:
+        """End it truthfully, as no answer will come: `kind` is for what changes nothing."""
+        if not self.writes:
+            self.fail(kind, what, hint)
+        elif self.handed:
+            self.fail(WriteUnconfirmed, f"{what}, and the write may have been sent")
+        else:
+            self.fail(NotStarted, what, hint)
+
+
+def _text(command: Command[Any] | None) -> str | None:
+    return None if command is None else str(command)
+
+
+class Link:
+    """One connection to the owner of a line. `on_news` is told, in its order, what comes unexpected."""
+
+    def __init__(
+        self,
+        address: str,
+        token: str | None,
+        on_news: Callable[[str, Mapping[str, Any]], None],
+        on_lost: Callable[[], None],
+        *,
+        safe_only: bool = False,
+    ) -> None:
+        self.address = address
+        self._safe_only = safe_only
+        self._token = token
+        self._on_news = on_news
+        self._on_lost = on_lost
+        self._connection: AskingConnection | None = None
+        self._waiting: deque[tuple[str, Asked | None]] = deque()
+        """What is said once the connection takes it, and with whose question."""
+        self._asked: dict[int, Asked] = {}
+        self._count = 0
+        self._over: tuple[type[BusError], str, str] | None = None
+        self._is_open = False
+
+    async def open(self, program: str) -> dict[str, Any]:
+        """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
+        # A thread, since the host of a serial server may have to be found.
+        where, place = (
+            await asyncio.to_thread(_where, self.address) if is_a_name(self.address) else _where(self.address)
+        )
+        loop = asyncio.get_running_loop()
+        self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
+        params: dict[str, Any] = {"versions": list(VERSIONS), "program": program}
+        if self._safe_only:
+            params["safe_only"] = True
+        self._waiting.appendleft((numbered(words("hello", params), 0), hello))
+        try:
+            async with asyncio.timeout(CONNECT_WITHIN):
+                if place is None:
+                    await loop.create_unix_connection(self._connect, where)
+                else:
+                    await loop.create_connection(self._connect, *place)
+                said: dict[str, Any] = await hello.future
+        except BaseException as error:
+            hello.future.cancel()  # nobody hears any more what becomes of it
+            shut = self._shut(where, error)
+            await self.close()
+            if shut is not None:
+                raise shut from error
+            raise
+        return said
+
+    async def close(self) -> None:
+        """Let go: whoever still waits is told so."""
+        self._end(BusClosed, "the bus was closed", "make a new one: it is opened and closed once")
+        if self._connection is not None:
+            self._connection.close()
+            await self._connection.closed()
+
+    def tell(self, method: str, params: Mapping[str, Any]) -> None:
+        """Say something that is not answered; nothing once the connection is lost."""
+        if self._over is None:
+            text = written({"method": method, "params": params})
+            if not self._passes(text):
+                self._waiting.append((text, None))
+
+    def ask(
+        self, method: str, params: Mapping[str, Any], *, writes: bool = False, node: Addressed | None = None
+    ) -> Asked:
+        """Do what `put` does, for a method and its parameters."""
+        return self.put(words(method, params), writes, node)
+
+    def put(
+        self, question: str, writes: bool, node: Addressed | None = None, command: Command[Any] | None = None
+    ) -> Asked:
+        """Ask something in `words`, after all that was said before; its future has the answer.
+
+        Raises LineDown or BusClosed.
+        """
+        if self._over is not None:
+            self.check(node, command)
+        self._count = number = self._count + 1
+        text = numbered(question, number)
+        handed = self._passes(text)  # what is kept of it is made while the other end is at it already
+        asked = Asked(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
+        self._asked[number] = asked
+        if not handed:
+            self._waiting.append((text, asked))
+        return asked
+
+    def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
+        """Raise LineDown or BusClosed, saying why, once the connection is over."""
+        if self._over is not None:
+            kind, what, hint = self._over
+            raise kind(what, node=node, command=_text(command), hint=hint)
+
+    async def answer(self, asked: Asked, finish_within: float | None = None) -> Any:
+        """Wait for an answer. Cancelling it cancels the request at the line too."""
+        timer = None
+        if finish_within is not None:
+            loop = asyncio.get_running_loop()
+            timer = loop.call_later(finish_within + GRACE, self._overdue, asked)
+        try:
+            return await asked.future
+        except asyncio.CancelledError:
+            self._drop(asked)
+            raise
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    # what the connection tells
+
+    def _connect(self) -> AskingConnection:
+        is_tcp = self.address.startswith(TCP)
+        self._connection = AskingConnection(
+            self, masks=is_tcp, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE
+        )
+        return self._connection
+
+    def opened(self) -> None:
+        """Say what has waited for that: hello comes first."""
+        self._is_open = True
+        self.writable()
+
+    def heard(self, message: str | bytes) -> None:
+        """Give an answer to whom it was asked for, and news to whom they concern."""
+        try:
+            self._take(read(message))
+        except Exception as error:  # whatever is said wrongly
+            what = f"the program that owns the line said what is not understood: {type(error).__name__}: {error}"
+            self._end(LineDown, what, AGAIN)
+            assert self._connection is not None
+            self._connection.close()
+
+    def writable(self) -> None:
+        """Say what waits, as far as the connection takes it."""
+        connection = self._connection
+        assert connection is not None
+        while self._waiting and self._is_open and not connection.full:
+            text, asked = self._waiting.popleft()
+            if asked is not None:
+                if asked.future.done():
+                    continue  # nobody waits for it any more: it is not even said
+                asked.handed = True
+            connection.say(text)
+
+    def lost(self) -> None:
+        """Tell whoever waits that the connection is over."""
+        if self._connection is not None and self._connection.owner_ended:
+            self._end(LineDown, ENDED, "start it, and connect again")
+        self._end(LineDown, GONE, AGAIN)
+
+    # inside
+
+    def _shut(self, where: str, error: BaseException) -> LineDown | None:
+        """Return why nobody let us in, None where it is not the other end's doing."""
+        connection = self._connection
+        status = None if connection is None else connection.status
+        farewell = "" if connection is None else connection.farewell
+        complaint = None if connection is None else connection.complaint
+        if status == HTTPStatus.UNAUTHORIZED:
+            what = f"{where} {'wants a token' if self._token is None else 'does not know this token'}"
+            return LineDown(what, hint="its owner has the tokens in a file, see [service] of LINE.toml")
+        if status == HTTPStatus.SERVICE_UNAVAILABLE:
+            what = f"{where} does not let this program in: {connection.refusal if connection else ''}"
+            return LineDown(what, hint=NO_PLACE)
+        if status == HTTPStatus.TOO_MANY_REQUESTS and connection is not None:
+            return LineDown(
+                f"{where} does not check this token: {connection.refusal}", hint="correct the token, and wait"
+            )
+        if farewell:
+            return LineDown(f"{where} does not let this program in: {farewell}", hint=NO_PLACE)
+        if connection is not None and isinstance(error, TimeoutError):
+            what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
+            return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
+        if complaint is None and isinstance(error, OSError) and not isinstance(error, BusError):
+            complaint = os.strerror(error.errno) if error.errno else str(error) or "it does not answer"
+        if complaint is None:
+            return None
+        return LineDown(f"no program serves {where}: {complaint}", hint="start busmaster run, or see busmaster status")
+
+    def _passes(self, text: str) -> bool:
+        """Say it at once where nothing waits before it; return whether that was so."""
+        connection = self._connection
+        if self._waiting or not self._is_open or connection is None or connection.full:
+            return False
+        connection.say(text)
+        return True
+
+    def _drop(self, asked: Asked) -> None:
+        """Wait for it no longer, and have it cancelled there."""
+        if self._asked.pop(asked.number, None) is not None and asked.handed:
+            self.tell("cancel", {"id": asked.number})
+
+    def _overdue(self, asked: Asked) -> None:
+        what = "its time was over, and the program that owns the line says nothing"
+        asked.lost(NoReply, what, "see whether that program runs")
+        self._drop(asked)
+
+    def _end(self, kind: type[BusError], what: str, hint: str) -> None:
+        if self._over is None:
+            self._over = kind, what, hint
+            for asked in self._asked.values():
+                asked.lost(kind, what, hint)
+            self._asked.clear()
+            self._waiting.clear()
+            self._on_lost()
+
+    def _take(self, said: Mapping[str, Any]) -> None:
+        if "method" in said:
+            self._on_news(said["method"], said["params"])
+            return
+        asked = self._asked.get(said.get("id"))  # type: ignore[arg-type]  # whatever the other end says
+        if asked is None:
+            return
+        # Understood first: whoever asked for what is not understood is told so when the conversation ends for it.
+        error = error_of(said["error"]) if "error" in said else None
+        del self._asked[asked.number]
+        if asked.future.done():
+            return
+        if error is not None:
+            asked.future.set_exception(error)
+        else:
+            asked.future.set_result(said.get("result"))
+
+
+def is_a_name(address: str) -> bool:
+    """Return whether an address is the name of a line or of a port, and not itself a place."""
+    return not address.startswith((TCP, "unix:"))
+
+
+def _where(address: str) -> tuple[str, tuple[str, int] | None]:
+    """Return where that is for messages, and host and port, None of a Unix socket. Raises InvalidCommand."""
+    if not address.startswith(TCP):
+        return socket_path(address), None
+    text = address.removeprefix(TCP).rstrip("/")
+    return text, host_and_port(text)

@@ -1,0 +1,193 @@
+"""What is said between a line's owner and its clients: JSON-RPC 2.0, and the bounds of all of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Set as AbstractSet
+from math import inf, isnan
+from typing import Any
+
+from busmaster import ReplyTiming, Timings
+from busmaster.bounds import LONGEST_REPLY, MOST_PARTS
+from busmaster.errors import InvalidCommand
+from busmaster.ext import Learned, Profile, documented
+
+VERSIONS = (3,)
+"""Versions of the service protocol. A client names those that it knows first; the highest common one holds."""
+
+
+BEFORE_NUMBER = ',"id":'
+PLAIN = frozenset((int, float, bool, str, type(None)))
+"""Kinds of values that are said as they are."""
+
+PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
+    -32700,
+    -32600,
+    -32601,
+    -32602,
+    -32603,
+    -32000,
+)
+
+
+class Malformed(Exception):
+    """This is no message: `code` says of JSON-RPC's errors which."""
+
+    def __init__(self, what: str, code: int = INVALID_REQUEST) -> None:
+        super().__init__(what)
+        self.code = code
+
+
+def written(message: Mapping[str, Any]) -> str:
+    """Return a message as text. Raises TypeError for what cannot be said in it."""
+    return f'{{"jsonrpc":"2.0",{encoded(message)[1:]}'
+
+
+def words(method: str, params: Mapping[str, Any]) -> str:
+    """Return a question as text, up to its number. Raises TypeError for what cannot be said in it."""
+    return written({"method": method, "params": params})[:-1]
+
+
+def numbered(words: str, number: int) -> str:
+    """Return a question as text, with its number: behind the words, which may be the same as before."""
+    return f"{words}{BEFORE_NUMBER}{number}}}"
+
+
+def answered(number: int, result: Any) -> str:
+    """Return the answer to a question as text. Raises TypeError for a result that cannot be said in it."""
+    return f'{{"jsonrpc":"2.0","id":{number},"result":{encoded(result)}}}'
+
+
+def encoded(value: Any) -> str:
+    """Return a value as JSON. Raises TypeError for what it cannot say."""
+    try:
+        return "".join(_encode(value, 0))
+    except ValueError:  # a number that JSON does not have
+        return "".join(_encode(_finite(value), 0))
+
+
+def read(text: str | bytes) -> dict[str, Any]:
+    """Return a message. Raises Malformed for what is none."""
+    if not isinstance(text, str):
+        raise Malformed("a message is text")
+    text = text.strip()
+    try:
+        said, end = _decode(text, 0)
+    except StopIteration as error:
+        raise Malformed(f"this is no JSON: no value begins at {error.value}", PARSE_ERROR) from None
+    except (ValueError, RecursionError) as error:
+        raise Malformed(f"this is no JSON: {error}", PARSE_ERROR) from None
+    if end < len(text):
+        raise Malformed("this is no JSON: there is more behind it", PARSE_ERROR)
+    if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
+        raise Malformed("this is no message of JSON-RPC 2.0")
+    return said
+
+
+def read_request(text: str | bytes) -> dict[str, Any]:
+    """Return a message of a client. Raises Malformed for what is none, or has too many parts."""
+    if isinstance(text, str) and len(text) > MOST_PARTS and sum(map(text.count, ",[{")) > MOST_PARTS:
+        raise Malformed(f"a message has {MOST_PARTS} values at most")
+    return read(text)
+
+
+def value_of(said: Any) -> Any:
+    """Return a value as it was before it was said: a list was a tuple, {"members": [...]} a frozenset."""
+    if isinstance(said, list):
+        return tuple(said) if PLAIN.issuperset(map(type, said)) else tuple(map(value_of, said))
+    if isinstance(said, dict):
+        if set(said) == {"float"}:
+            return float(said["float"])
+        if set(said) == {"members"} and isinstance(said["members"], list):
+            return frozenset(said["members"])
+        return {name: value_of(part) for name, part in said.items()}
+    return said
+
+
+def said_timings(timings: Timings | Learned | None) -> Any:
+    """Return the reply times of a node as they are said."""
+    if isinstance(timings, Learned):
+        return {"learned": said_timings(timings.document)}
+    if timings is None:
+        return None
+    return {step: _said_timing(getattr(timings, step)) for step in ("read", "write", "packet")}
+
+
+def timings_of(said: Any) -> Timings | Learned | None:
+    """Return the reply times that were said. Raises InvalidCommand for what are none."""
+    if said is None:
+        return None
+    try:
+        if set(said) == {"learned"}:
+            document = timings_of(said["learned"])
+            if isinstance(document, Learned):
+                raise TypeError("learned twice")
+            return Learned(document)
+        steps = {step: ReplyTiming(**timing) for step, timing in said.items()}
+        times = Timings(**steps)
+    except (TypeError, KeyError) as error:
+        raise InvalidCommand(f"these are no reply times: {error}") from None
+    for step in steps.values():
+        if (
+            max(step.max_reply_delay, step.inter_byte_timeout, step.driver_release_time, step.silence or 0.0)
+            > LONGEST_REPLY
+        ):
+            raise InvalidCommand(f"a program may have the line wait {LONGEST_REPLY:g} s for a reply, and no longer")
+    return times
+
+
+def check_within(times: Timings | Learned | None, profile: Profile, address: int) -> None:
+    """Raise InvalidCommand for reply times that keep the line for longer than those of the protocol's document.
+
+    The line sends nothing else while it waits for a reply.
+    """
+    times, limits = documented(times), profile.timings
+    for step in () if times is None else ("read", "write", "packet"):
+        for name in ("max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence"):
+            asked, limit = getattr(getattr(times, step), name), getattr(getattr(limits, step), name)
+            if asked is not None and asked > (getattr(limits, step).max_reply_delay if limit is None else limit):
+                raise InvalidCommand(
+                    f"{profile.label(address)}: {name} of {asked:g} s is longer than that of {profile.name}: "
+                    "set it for the node in the line's file, or use a program with the role admin"
+                )
+
+
+def _said_timing(timing: ReplyTiming) -> dict[str, float]:
+    names = ("late_after", "window", "max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence")
+    return {name: value for name in names if (value := getattr(timing, name)) is not None}
+
+
+def _finite(value: Any) -> Any:
+    """Return the same with numbers that JSON does not have as {"float": "inf"}."""
+    if isinstance(value, float) and (isnan(value) or value in (inf, -inf)):
+        return {"float": str(value)}
+    if isinstance(value, dict):
+        return {name: _finite(part) for name, part in value.items()}
+    return list(map(_finite, value)) if isinstance(value, list | tuple) else value
+
+
+def _said_set(value: Any) -> dict[str, list[Any]]:
+    """Return a set (flags that are on) as it is said: JSON has none. Raises TypeError for anything else."""
+    if isinstance(value, AbstractSet):
+        return {"members": sorted(value)}
+    raise TypeError(f"a {type(value).__name__} cannot be said")
+
+
+def _encoder() -> Callable[..., Iterable[str]]:
+    """Return what makes the parts of a value's text, which is not indented: 0. It is made once: Python does so anew for
+    each value, which takes longer than to use it.
+    """
+    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
+    text = json.encoder.encode_basestring_ascii
+    try:
+        make = json.encoder.c_make_encoder  # type: ignore[attr-defined]  # undocumented
+        encode: Callable[..., Iterable[str]] = make(None, usual.default, text, None, ":", ",", False, False, False)
+    except (AttributeError, TypeError):  # another Python
+        return usual.iterencode
+    return encode
+
+
+_decode: Callable[[str, int], tuple[Any, int]] = json.JSONDecoder().scan_once  # type: ignore[attr-defined]  # undocumented
+"""What a text has from a place on, and where that ends: a third of what `loads` takes, which looks for more."""
+_encode = _encoder()

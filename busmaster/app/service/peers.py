@@ -1,0 +1,164 @@
+"""Who is at the other end of a connection: as the kernel says of a Unix socket, as a token says on TCP."""
+
+from __future__ import annotations
+
+import asyncio
+import pwd
+import socket
+import struct
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from busmaster.app.service.permission import Access, Permission
+
+CREDENTIALS = struct.Struct("3i")
+PEER_GROUPS = 59
+"""SO_PEERGROUPS, which Python does not name."""
+MOST_GROUPS = 256
+"""What Python has room for; of a user with more only the first group counts."""
+
+
+class Peer(Protocol):
+    """Whoever has connected; `str` of it is what is on record of him."""
+
+    @property
+    def short(self) -> str:
+        """What his poll groups are called after."""
+        ...
+
+    @property
+    def account(self) -> Hashable:
+        """What is equal for all connections of one user or token, which have one part of the line together."""
+        ...
+
+    def may_stay(self, access: Access, /) -> bool:
+        """Return whether he may still be here, now that other tokens may hold."""
+        ...
+
+    def permission(self, access: Access, /) -> Permission:
+        """Return what he may do."""
+        ...
+
+
+_names: dict[int, str] = {}
+"""What users are called, by their numbers: whom to ask may be a server on a network, which a line does not wait for."""
+_asked: dict[int, asyncio.Task[None]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A process of this machine, which has connected the Unix socket."""
+
+    pid: int
+    uid: int
+    gids: tuple[int, ...]
+    program: str
+
+    @property
+    def user(self) -> str:
+        """Return the user's name; the number of one without a name, and until the name is found."""
+        return _names.get(self.uid, str(self.uid))
+
+    @property
+    def short(self) -> str:
+        return f"{self.program} {self.pid}"
+
+    @property
+    def account(self) -> Hashable:
+        return self.uid
+
+    def may_stay(self, _: Access) -> bool:
+        """Return True: the socket's mode says which processes come."""
+        return True
+
+    def permission(self, access: Access) -> Permission:
+        """Return what its user and groups may do."""
+        return access.of_process(self.uid, self.gids)
+
+    def __str__(self) -> str:
+        return f"{self.user}, {self.program} (process {self.pid})"
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Whoever has connected by TCP, and showed a token; `token` is its name, "" for none."""
+
+    token: str
+    address: str
+    digest: bytes | None = field(default=None, repr=False)
+    """Of the token that was shown: another of the same name does not stand for it."""
+
+    @property
+    def short(self) -> str:
+        return f"{self.token} {self.address}".strip()
+
+    @property
+    def account(self) -> Hashable:
+        return self.token
+
+    def may_stay(self, access: Access) -> bool:
+        """Return whether the token still holds; without one, whether none is needed."""
+        return access.secrets.get(self.token) == self.digest if self.token else not access.secrets
+
+    def permission(self, access: Access) -> Permission:
+        """Return what whoever has the token may do."""
+        return access.of_token(self.token)
+
+    def __str__(self) -> str:
+        return f"{f'token {self.token}' if self.token else 'without a token'}, from {self.address}"
+
+
+def process_of(connected: Any) -> Process:
+    """Return who has connected a Unix socket, and have the user's name found."""
+    pid, uid, gid = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
+    find_name(uid)
+    return Process(pid, uid, (gid, *_more_groups(connected)), program_name(pid))
+
+
+def holder_of(connected: Any, token: str, digest: bytes | None) -> Holder:
+    """Return who has connected by TCP with a token of this name and digest."""
+    host, port, *_ = connected.getpeername()
+    return Holder(token, f"{host}:{port}", digest)
+
+
+def _more_groups(connected: Any) -> tuple[int, ...]:
+    """Return the groups of a process beside its first."""
+    try:
+        said: bytes = connected.getsockopt(socket.SOL_SOCKET, PEER_GROUPS, 4 * MOST_GROUPS)
+    except OSError:  # an older kernel, or more groups than fit
+        return ()
+    return struct.unpack(f"{len(said) // 4}I", said)
+
+
+def find_name(uid: int) -> asyncio.Future[None] | None:
+    """Have the name of a user found, in a thread; return what ends then, or None if it is known."""
+    if uid in _names:
+        return None
+    if uid not in _asked:
+        _asked[uid] = asyncio.ensure_future(_find_name(uid))
+    return _asked[uid]
+
+
+async def _find_name(uid: int) -> None:
+    try:
+        _names[uid] = await asyncio.to_thread(user_name, uid)
+    finally:
+        del _asked[uid]
+
+
+def user_name(uid: int) -> str:
+    """Return a user's name; the number of one without a name. It may take long."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def program_name(pid: int) -> str:
+    """Return what the kernel calls a process's program."""
+    try:
+        with open(f"/proc/{pid}/comm", encoding="utf-8", errors="replace") as file:
+            return file.read().strip()
+    except OSError:
+        return "a program"

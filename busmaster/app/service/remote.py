@@ -1,0 +1,349 @@
+"""A line that another program owns: what a client of it holds in its hands."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from math import inf
+from types import TracebackType
+from typing import Any, TypeVar
+
+from busmaster import Point, Priority, Sample, Timings
+from busmaster.app.service.link import TCP, Link
+from busmaster.app.service.messages import said_timings
+from busmaster.app.service.remote_exchanges import RemoteExchanges
+from busmaster.app.service.remote_group import RemoteGroup
+from busmaster.app.service.remote_node import RemoteNode
+from busmaster.app.service.remote_overview import RemoteOverview
+from busmaster.app.service.safe import outcomes_of
+from busmaster.app.service.sequences import Room
+from busmaster.app.service.telling import (
+    event_of,
+    protocol_of,
+    said_points,
+    said_sync_reads,
+    statistics_of,
+)
+from busmaster.bounds import MOST_CHECKED
+from busmaster.errors import BusClosed, BusError, InvalidCommand
+from busmaster.events import BusEvent, Stream
+from busmaster.ext import Command, Learned, Profile
+from busmaster.statistics import LineStatistics
+
+T = TypeVar("T")
+EVENT_BUFFER = 256
+POINTS_IN_A_MESSAGE = 50
+CLOCK_IS_HEARD = 3
+"""How often, as this program, which is beginning, may be busy elsewhere when it is: its writes would seem old."""
+
+
+def connect(address: str, *, token: str | None = None, safe_only: bool = False) -> RemoteBus:
+    """Return the bus that another program owns, for `async with`, which connects.
+
+    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them; or
+    `tcp://HOST:PORT`, where a `token` that the line's owner knows may be needed. The token goes over the network as it
+    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes. `safe_only`: the program does
+    nothing but `enter_safe_state`, and is admitted also where no other place is free.
+    """
+    return RemoteBus(address, token=token, safe_only=safe_only)
+
+
+class RemoteBus:
+    """A line that another program owns. Use it in `async with`: entering connects, leaving lets go.
+
+    Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
+    program counts for all, limits and the audit log are the owner's. A node that the owner does not have is
+    asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, or none
+    of that name: it may be served later; and InvalidCommand for a write that was prepared before and that the line
+    would not take. A lost connection is not made again: enter a new RemoteBus.
+    """
+
+    def __init__(self, address: str, *, token: str | None = None, safe_only: bool = False) -> None:
+        if token is not None and not address.startswith(TCP):
+            raise InvalidCommand(f"{address} takes no token: it is for tcp://HOST:PORT")
+        if token is not None and not (token.isascii() and token.isprintable() and token.split() == [token]):
+            raise InvalidCommand("a token is of letters, digits and signs, without spaces")
+        self.address = address
+        self._token = token
+        self._safe_only = safe_only
+        self.line = ""
+        """The name of the line's port, once it is entered."""
+        self.about: Mapping[str, Any] = {}
+        """What the owner says of the line: its name, settings and process, and whether this program may only read."""
+        self.on_access: list[Callable[[], None]] = []
+        """Called when `about` says otherwise what this program may do. They must not block, nor raise."""
+        self.on_touched: list[Callable[[Mapping[str, Any]], None]] = []
+        """Told, before a write is confirmed, which values it has made stale: what `touched` says in docs/service.md."""
+        self._link: Link | None = None
+        self._ahead = 0.0
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what it took to hear that."""
+        self._nodes: dict[tuple[str, int], RemoteNode] = {}
+        self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
+        self._told: set[RemoteNode] = set()
+        """Those of them of which the owner knows."""
+        self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
+        self._count = 0
+        self._sequences = 0
+        self.room = Room(self.now)
+        """For what is asked: so much of it is under way at a time."""
+        self._touched: dict[tuple[str, int], float] = {}
+        """When the last write to a node ended."""
+        self._events: list[Stream[BusEvent]] = []
+        self._hears_events = False
+        self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
+        """Writes that are to be checked before the first of them is sent."""
+
+    async def __aenter__(self) -> RemoteBus:
+        if self._link is not None:
+            raise InvalidCommand(f"the bus of {self.address} was entered already: enter it once, and share it")
+        link = Link(self.address, self._token, self._hear, self._lost, safe_only=self._safe_only)
+        self._link = link
+        said = await link.open(sys.argv[0])
+        self.about, self.line = said, said["line"]
+        for known in said["nodes"]:
+            node = self._nodes.get((known["protocol"], known["address"]))
+            if node is not None:
+                node.label = known["label"]
+        for node in self._named:
+            self._name(node)
+        try:
+            if self.address.startswith(TCP) and not self._safe_only:
+                # another machine, perhaps: its clock began at another moment
+                self._ahead = max([await self._hear_clock() for _ in range(CLOCK_IS_HEARD)])
+            for node, commands, stop in self._prepared:
+                for first in range(0, len(commands), MOST_CHECKED):
+                    await self._ask("check", node.said_sync_read(commands[first : first + MOST_CHECKED], stop))
+        except BaseException:
+            await link.close()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Let go: what this program asked for ends, and the line goes on."""
+        await self.link.close()
+
+    @property
+    def link(self) -> Link:
+        """Return the connection. Raises BusClosed before the bus is entered."""
+        if self._link is None:
+            raise BusClosed("the bus is not open")
+        return self._link
+
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence of requests."""
+        self._sequences += 1
+        return self._sequences
+
+    def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
+        """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
+        if self._link is None:
+            raise BusClosed("the bus is not open", node=node, command=str(command))
+        return self._link
+
+    def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
+        """Have these writes checked when the bus is entered, if it is not yet."""
+        if self._link is None:
+            self._prepared.append((node, commands, stop))
+
+    def now(self) -> float:
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
+        return time.monotonic() + self._ahead
+
+    # nodes
+
+    def node(
+        self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
+    ) -> RemoteNode:
+        """Return the node at this address, as `Bus.node` does.
+
+        Raises InvalidCommand for an address that the protocol does not have, and for other timings or retries than this
+        program named first. What the line's owner has against them, the node's requests raise.
+        """
+        profile.check_address(address)
+        node = self._find(profile, address)
+        said = self._named.setdefault(node, (timings, retries))
+        if timings not in (None, said[0]) or retries not in (None, said[1]):
+            raise InvalidCommand(
+                f"{node.label} is in use already, and now asked for with other timings or retries: "
+                "give all handles of an address the same options, or leave them out in all but the first"
+            )
+        if self._link is not None:
+            self._name(node)
+        return node
+
+    def find(self, protocol: str, address: int) -> RemoteNode:
+        """Return a node that the owner speaks of, by the name of its protocol. It is not named for that."""
+        return self._find(protocol_of(protocol).profile, address)
+
+    def _find(self, profile: Profile, address: int) -> RemoteNode:
+        if profile != protocol_of(profile.name).profile:
+            raise InvalidCommand(f"{profile.label(address)}: only the usual {profile.name} is spoken on another's line")
+        key = profile.name, address
+        return self._nodes.get(key) or self._nodes.setdefault(key, RemoteNode(self, profile, address))
+
+    def _name(self, node: RemoteNode) -> None:
+        """Tell the owner that this program uses a node, and how: once."""
+        if node in self._told:
+            return
+        self._told.add(node)
+        timings, retries = self._named[node]
+        params: dict[str, Any] = {"protocol": node.profile.name, "address": node.address}
+        if timings is not None:
+            params["timings"] = said_timings(timings)
+        if retries is not None:
+            params["retries"] = retries
+        params |= said_sync_reads(node.profile)
+        asked = self.link.ask("node", params, node=node)
+
+        def named(future: asyncio.Future[Any]) -> None:
+            if not future.cancelled() and future.exception() is None:
+                node.label = future.result()["label"]
+
+        asked.future.add_done_callback(named)
+
+    # looking
+
+    async def statistics(self) -> LineStatistics:
+        """Return an immutable snapshot of the line's counts, as `Bus.statistics`."""
+        return statistics_of(await self._ask("statistics", {}))
+
+    async def group(self, name: str) -> RemoteGroup:
+        """Return a poll group of the line by its name. Raises InvalidCommand if there is none.
+
+        Its samples are those that the line's owner makes: of bits, the number.
+        """
+        return await self._follow("subscribe", name, (), {"group": name})
+
+    async def poll_group(
+        self,
+        name: str,
+        *,
+        period: float,
+        points: Iterable[Point[Any]],
+        phase: float | None = None,
+        priority: Priority = Priority.POLL,
+    ) -> RemoteGroup:
+        """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
+        params = {"name": name, "period": period, "phase": phase, "priority": priority}
+        return await self._follow("poll", name, tuple(points), params)
+
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
+        whatever program, has ended since it was read."""
+        node, profile = point.node, point.node.profile
+        addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
+        touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
+        groups = [stream for stream in self._streams.values() if isinstance(stream, RemoteGroup)]
+        snapshots = [group.latest for group in groups if group.own and group.latest is not None]
+        samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
+        good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
+        return max(good, key=lambda one: one.finished, default=None)
+
+    async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
+        """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
+
+        `values` is what the caller takes that to be, by the names of the file's points. Raises InvalidCommand, and
+        nothing is sent, if it is something else, or this program may not write all of it.
+        """
+        return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
+
+    def report_failed_logins(self, interface: str, peers: Mapping[str, int]) -> None:
+        """Tell the owner how many logins of each peer failed at an interface that this program serves: web or opcua."""
+        self.link.tell("failed_logins", {"interface": interface, "peers": dict(peers)})
+
+    async def groups(self) -> tuple[str, ...]:
+        """Return the names of the line's poll groups."""
+        return tuple(group["name"] for group in await self._ask("groups", {}))
+
+    def events(self) -> Stream[BusEvent]:
+        """Return a stream of what happens to line and nodes from now on; a node in it is this program's."""
+        stream: Stream[BusEvent] = Stream(self._events, EVENT_BUFFER)
+        if not self._hears_events:
+            self._hears_events = True
+            self.link.ask("events", {"stream": 0})
+        return stream
+
+    async def overview(self, hear: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
+        """Have `hear` told what a person sees of the line, some times a second, as docs/service.md has it."""
+        self._count += 1
+        overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
+        await self._ask("overview", {"stream": self._count})
+        return overview
+
+    async def exchanges(self, hear: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
+        """Have `hear` told what passes on the line, exchange by exchange, as docs/service.md has it."""
+        self._count += 1
+        exchanges = self._streams[self._count] = RemoteExchanges(hear, partial(self.end_stream, self._count))
+        await self._ask("exchanges", {"stream": self._count})
+        return exchanges
+
+    def end_stream(self, number: int) -> None:
+        """Have a stream told no more."""
+        stream = self._streams.pop(number, None)
+        if stream is not None:
+            self.link.tell("end", {"stream": number})
+            stream.end()
+
+    # inside
+
+    async def _hear_clock(self) -> float:
+        """Return by how much the owner's clock is ahead: less by what it took to hear it, never more."""
+        now: float = await self._ask("now", {})
+        return now - time.monotonic()
+
+    async def _ask(self, method: str, params: Mapping[str, Any], *, writes: bool = False) -> Any:
+        asked = self.link.ask(method, params, writes=writes)
+        return await self.link.answer(asked)
+
+    async def _follow(
+        self, method: str, name: str, points: tuple[Point[Any], ...], params: Mapping[str, Any]
+    ) -> RemoteGroup:
+        self._count += 1
+        number = self._count
+        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
+        self._streams[number] = group
+        said = said_points(points)
+        try:
+            while len(said) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
+                del said[:POINTS_IN_A_MESSAGE]
+            if said:
+                params = {**params, "points": said}
+            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
+        except BaseException:
+            self.end_stream(number)
+            raise
+        return group
+
+    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
+        if method == "stops":
+            node = self._nodes.get((params["protocol"], params["address"]))
+            if node is not None:
+                node.stops = params["stops"]
+        elif method == "access":
+            self.about = {**self.about, **params}
+            for tell in self.on_access:
+                tell()
+        elif method == "touched":
+            self._touched[params["protocol"], params["address"]] = params["when"]
+            for told in self.on_touched:
+                told(params)
+        elif method == "event":
+            event = event_of(params["body"], self.find)
+            for stream in self._events:
+                if event is not None:
+                    stream.put(event)
+        elif (listener := self._streams.get(params.get("stream", -1))) is not None:
+            listener.hear(method, params)
+
+    def _lost(self) -> None:
+        for listener in list(self._streams.values()):
+            listener.end()
+        self._streams.clear()  # what is written from now on is not heard of any more
+        for stream in list(self._events):
+            stream.close()

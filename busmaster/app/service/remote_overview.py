@@ -1,0 +1,72 @@
+"""What a person sees of a line that another program owns, and may do there."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from busmaster.app.service.link import Link
+from busmaster.errors import BusError
+
+SOON = 1.0
+"""Seconds within which a write that a person has asked for is to begin: later, it may not be meant any more."""
+
+
+class RemoteOverview:
+    """The pictures of a line: `hear` is given what the line's owner says of it, until `over` says why it ends."""
+
+    def __init__(self, link: Link, now: Callable[[], float], hear: Callable[[str, Mapping[str, Any]], None]) -> None:
+        self._link = link
+        self._now = now
+        self._hear = hear
+        self._ended = asyncio.Event()
+
+    def hear(self, method: str, params: Mapping[str, Any]) -> None:
+        """Take what the line's owner says."""
+        if method == "ended":
+            self.end()
+        else:
+            self._hear(method, params["body"])
+
+    def end(self) -> None:
+        """Wake whoever waits for the end."""
+        self._ended.set()
+
+    async def over(self) -> None:
+        """Wait for the end. Raises LineDown, BusClosed, or another BusError, with its cause."""
+        await self._ended.wait()
+        self._link.check()
+        raise BusError("the program that owns the line shows it no more", hint="see its log")
+
+    async def pause(self, group: str, paused: bool) -> None:
+        """Have a poll group rest, or go on, for all who use the line. Raises InvalidCommand for one that is gone."""
+        await self._ask("pause", {"group": group, "paused": paused})
+
+    async def demand(self, group: str) -> None:
+        """Have a poll group read now. Raises InvalidCommand for one that is gone."""
+        await self._ask("demand", {"group": group})
+
+    async def suspend(self, protocol: str, address: int, for_: float) -> None:
+        """Let a node rest for so many seconds, 0 for no longer, for all who use the line."""
+        await self._ask("suspend", {"protocol": protocol, "address": address, "for": for_})
+
+    async def details(self, group: str, key: str) -> Mapping[str, Any]:
+        """Return what there is to know of one point of a group. Raises InvalidCommand for one that is gone."""
+        said: Mapping[str, Any] = await self._ask("details", {"group": group, "key": key})
+        return said
+
+    async def write(self, group: str, key: str, value: Any) -> None:
+        """Write a point of a group. Raises BusError or InvalidCommand as `Point.write`; the owner's limits hold."""
+        params = {
+            "group": group,
+            "key": key,
+            "value": value,
+            "requested": self._now(),
+            "options": {"start_within": SOON},
+        }
+        asked = self._link.ask("write", params, writes=True)
+        await self._link.answer(asked)
+
+    async def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
+        return await self._link.answer(self._link.ask(method, params))

@@ -1,0 +1,141 @@
+"""What one program has asked of the line that is not answered yet."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from busmaster import Priority
+from busmaster.app.service.errands import Asker, Errand, Writing, errand_of
+from busmaster.app.service.failures import REFUSED, refusal_of
+from busmaster.app.service.line import ServedLine
+from busmaster.app.service.messages import Malformed
+from busmaster.app.service.reads import PlainRead
+from busmaster.bounds import MOST_REQUESTS, MOST_URGENT
+from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
+
+
+class Requests:
+    """Has it done, and told by `answer` or `refuse`, with the number that the program gave it."""
+
+    def __init__(
+        self,
+        asker: Asker,
+        line: ServedLine,
+        answer: Callable[[int, Any], object],
+        refuse: Callable[[int, Exception], object],
+    ) -> None:
+        self._asker = asker
+        self._line = line
+        self._answer = answer
+        self._refuse = refuse
+        self._under_way: dict[int, Errand | None] = {}
+        """What is not answered yet, by its number: None is the safe state, which is being sent."""
+        self._log = logging.getLogger("busmaster.app.service")
+
+    def check_number(self, number: int) -> None:
+        """Raise Malformed for the number of something that is not answered yet."""
+        if number in self._under_way:
+            raise Malformed(f"request {number} is under way already")
+
+    @property
+    def errands(self) -> tuple[Errand, ...]:
+        """Return what is to be done at its nodes."""
+        return tuple(errand for errand in self._under_way.values() if errand is not None)
+
+    @property
+    def sends_safe_state(self) -> bool:
+        """Return whether the safe state is being sent for this program."""
+        return None in self._under_way.values()
+
+    def begin(self, number: int, said: Mapping[str, Any] | PlainRead) -> None:
+        """Have a command carried out. Raises Malformed for the number of something that is not answered yet."""
+        under_way = self._under_way
+        if number in under_way:  # as check_number does: this is done for every request
+            self.check_number(number)
+        try:
+            if len(under_way) >= MOST_REQUESTS:
+                self._check_room(said)
+            under_way[number] = errand = errand_of(said, self._asker, self._line)
+            errand.begin(partial(self._ended, number))
+        except REFUSED as error:
+            under_way.pop(number, None)
+            self._refuse(number, refusal_of("request", error))
+
+    def begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
+        """Have the safe state sent. Raises Malformed for the number of something that is not answered yet."""
+        self.check_number(number)
+        try:
+            self._check_room({})
+            sending = self._line.safe_wishes.begin(params["writes"], self._asker.peer)
+        except REFUSED as error:
+            self._refuse(number, refusal_of("safe", error))
+        else:
+            self._under_way[number] = None
+            sending.add_done_callback(partial(self._safe_sent, number))
+
+    def cancel(self, number: object) -> None:
+        """Give up a command: it is not answered. What is no number of one means nothing."""
+        errand = self._under_way.get(number)  # type: ignore[call-overload]  # whatever a program says
+        if errand is not None:
+            errand.cancel()
+
+    def end(self) -> None:
+        """Tell it truthfully what becomes of all that: the service ends, and the bus perhaps with it."""
+        for number, errand in list(self._under_way.items()):
+            if errand is not None:
+                errand.cancel()
+                self._refuse(number, _untold(errand, BusClosed, "the program that owns the line ends"))
+
+    async def give_up(self) -> None:
+        """Give up all of it, and return when nothing of it is under way. The safe state goes on."""
+        for errand in self.errands:
+            errand.cancel()
+        while doing := [
+            errand.doing for errand in self.errands if isinstance(errand, Writing) and errand.doing is not None
+        ]:
+            await asyncio.wait(doing)
+
+    # inside
+
+    def _check_room(self, said: Mapping[str, Any] | PlainRead) -> None:
+        waiting = len(self._under_way)
+        if waiting >= MOST_REQUESTS and not (_is_urgent(said) and waiting < MOST_REQUESTS + MOST_URGENT):
+            raise BacklogFull(f"{waiting} requests of this program are not answered yet")
+
+    def _ended(self, number: int, errand: Errand, value: Any, error: BaseException | None) -> None:
+        del self._under_way[number]
+        if errand.given_up:
+            return
+        try:
+            if error is not None:
+                raise error
+            self._answer(number, value)
+        except (BusError, InvalidCommand) as refusal:
+            self._refuse(number, refusal)
+        except Exception as bug:  # of a protocol: the client is told, and the line goes on
+            self._log.exception("a request of %s failed", self._asker.peer)
+            what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
+            self._refuse(number, _untold(errand, BusError, what))
+
+    def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
+        del self._under_way[number]
+        error = WriteUnconfirmed("the program that owns the line ends") if sending.cancelled() else sending.exception()
+        if error is None:
+            self._answer(number, sending.result())
+        else:
+            self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
+
+
+def _untold(errand: Errand, kind: type[BusError], what: str) -> BusError:
+    """Return the error for one whose end nobody will tell: `kind`, unless it may have written."""
+    if errand.command.writes and errand.sent:
+        kind = WriteUnconfirmed
+    return kind(what, node=errand.node, command=str(errand.command))
+
+
+def _is_urgent(said: Mapping[str, Any] | PlainRead) -> bool:
+    return isinstance(said, Mapping) and bool(said.get("options", {}).get("priority") == Priority.URGENT)

@@ -1,0 +1,69 @@
+"""The safe state of a line, sent because another program asks for it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from busmaster.app.service.authorisation import Authorisation, SafeWrites
+from busmaster.app.service.failures import bus_error_of, error_data
+from busmaster.app.service.peers import Peer
+from busmaster.errors import BusError, InvalidCommand
+
+
+class SafeWishes:
+    """Sends it: once begun it goes on, also when whoever asked for it has gone."""
+
+    def __init__(self, authorisation: Authorisation) -> None:
+        self._authorisation = authorisation
+        self._sending: asyncio.Task[dict[str, Any]] | None = None
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it is being sent."""
+        return self._sending is not None and not self._sending.done()
+
+    def begin(self, wanted: Mapping[str, Any], peer: Peer) -> asyncio.Task[dict[str, Any]]:
+        """Send the safe state, if that is what somebody expects; the task returns what is said of each point.
+
+        Whoever asks while it is being sent has a part in that. Raises InvalidCommand where he may not, and where he
+        expects something else.
+        """
+        state = self._authorisation.safe_state
+        if state is None or not state.values:
+            raise InvalidCommand("the program that owns this line knows no safe state: end it, then send yours")
+        if dict(wanted) != dict(state.values):
+            raise InvalidCommand(
+                f"the program that owns this line has the safe state {_text(state.values)}, and not {_text(wanted)}: "
+                "have it read the file again"
+            )
+        refusal = (
+            "this line is read-only"
+            if self._authorisation.read_only
+            else state.refusal(peer.permission(self._authorisation.access))
+        )
+        if refusal:
+            raise InvalidCommand(refusal)
+        if self._sending is None or self._sending.done():
+            self._sending = asyncio.ensure_future(self._send(state, str(peer)))
+        return self._sending
+
+    async def close(self) -> None:
+        """End what is being sent: the program that ends sends its own."""
+        if self._sending is not None:
+            self._sending.cancel()
+            await asyncio.wait([self._sending])
+
+    async def _send(self, state: SafeWrites, by: str) -> dict[str, Any]:
+        outcomes = await state.enter(self._authorisation, by, leaving=False)
+        return {name: None if error is None else error_data(error) for name, error in outcomes.items()}
+
+
+def outcomes_of(said: Mapping[str, Any]) -> dict[str, BusError | None]:
+    """Return what became of each point, as it was said."""
+    return {name: None if error is None else bus_error_of(error) for name, error in said.items()}
+
+
+def _text(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in values.items()) or "nothing"

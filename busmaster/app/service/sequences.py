@@ -1,0 +1,134 @@
+"""What a program asks of a line that it does not own: so many requests at a time, some of them in a sequence."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any, Protocol, TypeVar, Unpack
+
+from busmaster.app.service.link import Link
+from busmaster.bounds import MOST_UNDER_WAY
+from busmaster.errors import NotStarted
+from busmaster.ext import Command, CommandOptions, HeldNode, Requester, RequestOptions
+
+T = TypeVar("T")
+
+
+class Room:
+    """Lets so many requests of a program be under way; the others wait here, in their order, as long as they may."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._free = MOST_UNDER_WAY
+        self._waiting: deque[asyncio.Future[None]] = deque()
+        self._now = now
+
+    def take(self) -> bool:
+        """Take room, which is to be given back, if there is some; return whether there was."""
+        if not self._free:
+            return False
+        self._free -= 1
+        return True
+
+    async def wait(self, options: RequestOptions, node: Requester, command: Command[Any]) -> float:
+        """Wait for room, which is to be given back, and return how many seconds that took.
+
+        Raises NotStarted if the time of the request is over before.
+        """
+        began = self._now()
+        limits = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
+        try:
+            async with asyncio.timeout(min(limits, default=None)):
+                await self._given()
+        except TimeoutError:
+            what = f"{MOST_UNDER_WAY} requests of this program are not answered yet, and its time was over"
+            raise NotStarted(what, node=node, command=str(command)) from None
+        return self._now() - began
+
+    def give_back(self) -> None:
+        """Make room for another: for whoever waits longest."""
+        while self._waiting:
+            given = self._waiting.popleft()
+            if not given.done():
+                given.set_result(None)
+                return
+        self._free += 1
+
+    async def _given(self) -> None:
+        given = asyncio.get_running_loop().create_future()
+        self._waiting.append(given)
+        try:
+            await given
+        except asyncio.CancelledError:
+            if given.done() and not given.cancelled():  # it was given in the turn in which nobody wanted it any more
+                self.give_back()
+            raise
+
+
+def shortened(options: RequestOptions, by: float) -> dict[str, float]:
+    """Return what is left of the times of a request that has waited for so many seconds."""
+    times = {"start_within": options.start_within, "finish_within": options.finish_within}
+    return {name: max(0.0, limit - by) for name, limit in times.items() if limit is not None}
+
+
+class AsksInSequence(Requester, Protocol):
+    """A node of a line that another program owns."""
+
+    async def ask(
+        self,
+        command: Command[T],
+        sequence: int,
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+        options: CommandOptions,
+        /,
+    ) -> T:
+        """Run one command within a sequence."""
+        ...
+
+
+class HoldsLine(Protocol):
+    """A line that another program owns."""
+
+    @property
+    def link(self) -> Link: ...
+
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence."""
+        ...
+
+
+@asynccontextmanager
+async def held_remotely(node: AsksInSequence, bus: HoldsLine, longest: float) -> AsyncIterator[Requester]:
+    """Have the owner of a line hold it for one sequence, `longest` seconds at most, and yield the node for it."""
+    sequence, link = bus.new_sequence(), bus.link
+    named = {"sequence": sequence, "protocol": node.profile.name, "address": node.address}
+    link.tell("hold", {**named, "max_hold": longest})
+    try:
+        yield _HeldRemoteNode(node, sequence)
+    finally:
+        link.tell("release", {"sequence": sequence})
+
+
+class _HeldRemoteNode(HeldNode):
+    """A node of a line that another program owns, within one sequence."""
+
+    def __init__(self, asks: AsksInSequence, sequence: int) -> None:
+        super().__init__(asks)
+        self._asks = asks
+        self._sequence = sequence
+
+    async def request(
+        self,
+        command: Command[T],
+        /,
+        *,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Run one command within the sequence, see `HeldNode.request`."""
+        return await self._asks.ask(command, self._sequence, touches, stops_seen, stop, options)

@@ -1,0 +1,143 @@
+"""What happens on the line, told to those clients that asked for it: said once, whoever and how many they are."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncGenerator, Callable
+from typing import Any, Protocol
+
+from busmaster import Bus, Point, PollGroup, Snapshot
+from busmaster.app.service.messages import encoded
+from busmaster.app.service.telling import said_event, said_points, said_sample, said_snapshot
+from busmaster.ext import Outdated, ReadAfterWrite
+
+READERS_IN_A_TURN = 4
+SAMPLES_IN_A_TURN = 50
+"""A tenth or two of a millisecond of a turn of the line's loop is taken for them."""
+
+
+class Reader(Protocol):
+    """A client with a stream."""
+
+    def tell(self, stream: int, method: str, body: str) -> None:
+        """Say something of a stream; it is dropped where the client does not keep up."""
+        ...
+
+    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+        """Say something of a part of a stream that replaces what was said of it before."""
+        ...
+
+
+Place = tuple[Reader, int]
+"""A client, and the number of the stream there."""
+
+
+class Broadcast:
+    """One source and those who read it. It runs while there is one, and then tells its owner by `on_end`."""
+
+    def __init__(self, on_end: Callable[[], None]) -> None:
+        self.readers: list[Place] = []
+        self._on_end = on_end
+        self._task: asyncio.Task[None] | None = None
+
+    def join(self, reader: Reader, stream: int) -> None:
+        """Have this client told, from now on."""
+        self.readers.append((reader, stream))
+        if self._task is None:
+            self._task = asyncio.ensure_future(self._run())
+
+    def leave(self, reader: Reader, stream: int) -> None:
+        """Tell this client no more."""
+        if (reader, stream) in self.readers:
+            self.readers.remove((reader, stream))
+        if not self.readers and self._task is not None:
+            self._task.cancel()
+            self._on_end()
+
+    async def _run(self) -> None:
+        try:
+            await self._tell()
+        except Exception:  # a value that cannot be said, a mistake in an encoder: those who read it are told it ended
+            logging.getLogger("busmaster.app.service").exception("a stream ended")
+        self._on_end()
+        for reader, stream in self.readers:
+            reader.tell_surely(stream, "ended", "{}")
+
+    async def _tell(self) -> None:
+        async with contextlib.aclosing(self._bodies()) as bodies:
+            async for method, body in bodies:
+                for number, (reader, stream) in enumerate(list(self.readers)):
+                    if number and number % READERS_IN_A_TURN == 0:
+                        await asyncio.sleep(0)
+                    if (reader, stream) in self.readers:
+                        reader.tell(stream, method, body)
+
+    def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+        raise NotImplementedError
+
+
+class GroupBroadcast(Broadcast):
+    """The cycles of one poll group."""
+
+    def __init__(self, group: PollGroup, on_end: Callable[[], None]) -> None:
+        super().__init__(on_end)
+        self.group = group
+        self._points: tuple[Point[Any], ...] = group.points
+        self._set = 0
+
+    def join(self, reader: Reader, stream: int) -> None:
+        """Have this client told which points there are, and then of each cycle."""
+        self._tell_points((reader, stream))
+        super().join(reader, stream)
+
+    def _tell_points(self, *places: Place) -> None:
+        body = encoded({"set": self._set, "points": said_points(self._points)})
+        for reader, stream in places:
+            reader.tell_surely(stream, "points", body)
+
+    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+        stream = self.group.subscribe(changes=True)
+        try:
+            async for snapshot in stream:
+                if isinstance(snapshot, Outdated):
+                    continue  # `touched` says so, sooner
+                if isinstance(snapshot, ReadAfterWrite) and self.group.latest is not None:
+                    snapshot = self.group.latest  # the wire has whole cycles: the last one, with the new value
+                points = tuple(snapshot)
+                if points != self._points:
+                    self._points = points
+                    self._set += 1
+                    self._tell_points(*self.readers)
+                yield "snapshot", await self._encoded(snapshot)
+        finally:
+            stream.close()
+
+    async def _encoded(self, snapshot: Snapshot) -> str:
+        """Return a cycle as JSON; of a long one, some samples are encoded in a turn of the loop."""
+        samples = list(snapshot.samples.values())
+        parts = []
+        for begin in range(0, len(samples), SAMPLES_IN_A_TURN):
+            if begin:
+                await asyncio.sleep(0)
+            parts.append(encoded(list(map(said_sample, samples[begin : begin + SAMPLES_IN_A_TURN])))[1:-1])
+        head = encoded({"set": self._set, **said_snapshot(snapshot)})
+        return f'{head[:-1]},"samples":[{",".join(parts)}]}}'
+
+
+class EventBroadcast(Broadcast):
+    """What happens to line and nodes."""
+
+    def __init__(self, bus: Bus, on_end: Callable[[], None]) -> None:
+        super().__init__(on_end)
+        self._bus = bus
+
+    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+        stream = self._bus.events()
+        try:
+            async for event in stream:
+                if said := said_event(event):
+                    yield "event", encoded(said)
+        finally:
+            stream.close()

@@ -1,0 +1,65 @@
+"""Programs that come by TCP: where they are listened for, and what they show."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Sequence
+
+from busmaster.app.service.peers import Holder, holder_of
+from busmaster.app.service.permission import Access
+from busmaster.errors import InvalidCommand
+
+HostPort = tuple[str, int]
+BACKLOG = 64
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host is this machine alone, as it is written."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_listening(listen: HostPort, *, tokens: bool) -> None:
+    """Raise InvalidCommand where whoever is on the network could come without a token."""
+    if not (tokens or is_loopback(listen[0])):
+        raise InvalidCommand(
+            f"{listen[0]} is open to the network: give each program a token, in the file that token_file names, "
+            "or listen at 127.0.0.1"
+        )
+
+
+def listening(listen: HostPort) -> socket.socket:
+    """Open a socket that listens there; port 0 is any free one. A name may take its time. Raises InvalidCommand."""
+    host, port = listen
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        opened = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+    except OSError as error:
+        raise InvalidCommand(f"{host}:{port} cannot be listened at: {error.strerror}") from None
+    opened.setblocking(False)
+    return opened
+
+
+def is_our_name(host: str, listen: HostPort) -> bool:
+    """Return whether a Host header names us: by an address, or as we listen. A page would have another name."""
+    name = host.rpartition("]")[0].lstrip("[") if host.startswith("[") else host.partition(":")[0]
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return name in (listen[0], socket.gethostname())
+    return True
+
+
+def holder(connected: socket.socket, shown: Sequence[str], access: Access) -> Holder | None:
+    """Return who has connected, by the Authorization headers that he shows; None where a token that is known is needed,
+    and he shows none, or something else. None is needed where there are none."""
+    if not shown and not access.secrets:
+        return holder_of(connected, "", None)
+    if len(shown) != 1:
+        return None
+    kind, _, secret = shown[0].partition(" ")
+    name = access.token_name(secret.strip()) if kind.lower() == "bearer" else None
+    return None if name is None else holder_of(connected, name, access.secrets[name])

@@ -1,0 +1,193 @@
+"""One connection of a program to the line's owner, from its first byte to its end, and whose turn it is to be heard."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+from busmaster.app.service.client import Client
+from busmaster.app.service.connection import GOING_AWAY, POLICY, ServedConnection
+from busmaster.app.service.messages import INTERNAL, INVALID_PARAMS, Malformed, read_request, written
+from busmaster.app.service.peers import Peer
+from busmaster.app.service.reads import plain_read_of
+from busmaster.bounds import HELLO_WITHIN, LONGEST_REQUEST
+
+if TYPE_CHECKING:
+    from websockets.http11 import Request
+
+READ_AT_ONCE = 512
+"""Bytes of a connection that are taken in one turn of the line's loop: two or three requests, eighty of the smallest
+frames that there are."""
+
+
+class Reception:
+    """Whose message is taken next: one in a turn of the loop, whoever they are, so that the line goes between; and one
+    of each program before the second of any.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[Visit] = deque()
+        self._taken = False
+        """Whether a message was taken in this turn of the loop."""
+
+    def ask(self, visit: Visit) -> None:
+        """Have a message of this program taken: at once, or when it is its turn."""
+        if self._taken:
+            self._waiting.append(visit)
+            return
+        self._taken = True
+        try:
+            visit.take()
+        finally:  # and not before: what is asked for is not to wait for this
+            asyncio.get_running_loop().call_soon(self._next)
+
+    def _next(self) -> None:
+        self._taken = False
+        if self._waiting:
+            self.ask(self._waiting.popleft())
+
+
+class Host(Protocol):
+    """Who is visited."""
+
+    @property
+    def reception(self) -> Reception: ...
+
+    def delay(self, origin: int | str | None, process: int, /) -> float | None:
+        """Return after how many seconds a connection from there is read; None if it is closed."""
+        ...
+
+    def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
+        """Note who has come; return the HTTP status and words with which one is refused, None if it is not."""
+        ...
+
+    def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
+        """Let a program in by its first message, and answer that. Raises Malformed."""
+        ...
+
+    def send_away(self, visit: Visit, /) -> None:
+        """Count one whose conversation is ended for what it said, or did not say."""
+        ...
+
+    def over(self, visit: Visit, /) -> None:
+        """Do what is to be done when a connection is over."""
+        ...
+
+
+class Visit:
+    """One connection. It is a stranger's until its first message is taken, for which it has HELLO_WITHIN."""
+
+    def __init__(self, host: Host) -> None:
+        self.client: Client | None = None
+        self.peer: Peer
+        """Set before it is opened."""
+        self.connection = ServedConnection(self, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE)
+        self._host = host
+        self._messages: deque[str | bytes] = deque()
+        self._queued = False
+        self._ended = False
+        self._log = logging.getLogger("busmaster.app.service")
+        self._stranger = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
+
+    # what the connection tells
+
+    def delay(self, origin: int | str | None, process: int, /) -> float | None:
+        """Return what its host says."""
+        return self._host.delay(origin, process)
+
+    def refusal(self, request: Request, /) -> tuple[int, str] | None:
+        """Return what its host says."""
+        return self._host.refusal(self, request)
+
+    def opened(self) -> None:
+        """Wait for the first message."""
+
+    def heard(self, message: str | bytes) -> None:
+        """Take a message when it is its turn; until then no more is read."""
+        if self._ended:
+            return
+        self._messages.append(message)
+        self._go_on()
+        if self._messages:
+            self.connection.pause()
+
+    def writable(self) -> None:
+        """Say what waits, and read on where that was waited for."""
+        if self.client is not None:
+            self.client.outbox.flush()
+        self._go_on()
+
+    def lost(self) -> None:
+        """Let go of it."""
+        self._finish()
+        self._host.over(self)
+
+    # what its host calls
+
+    def take(self) -> None:
+        """Take the oldest of its messages: it is its turn."""
+        self._queued = False
+        if self._ended:
+            return
+        try:
+            message = self._messages.popleft()
+            if self.client is None:
+                self.client = self._host.welcome(self, read_request(message))
+                self._stranger.cancel()
+            elif not self.client.in_safe_place and (read := plain_read_of(message)) is not None:
+                self.client.requests.begin(*read)
+            else:
+                self.client.take(read_request(message))
+        except Malformed as error:
+            self._send_away(error)
+        except Exception as bug:  # unheard, it would wait for ever to be read on, and keep its place
+            self._log.exception("a message of %s could not be taken", self.peer)
+            self._send_away(Malformed(f"the program that owns the line failed: {type(bug).__name__}: {bug}", INTERNAL))
+        else:
+            self._go_on()
+
+    def bid_farewell(self) -> None:
+        """End the conversation, as the line's owner ends: behind all that is to be said."""
+        self._end(GOING_AWAY, "the program that owns the line ends")
+
+    # inside
+
+    def _go_on(self) -> None:
+        """Have the next message taken, or read more, unless it leaves too many answers unread."""
+        if self._queued or self._ended:
+            return
+        # What waits for a client does so behind a full connection, and hardly one is.
+        if self.connection.full and self.client is not None and self.client.outbox.crowded:
+            self.connection.pause()  # `writable` comes here again
+        elif self._messages:
+            self._queued = True
+            self._host.reception.ask(self)
+        else:
+            self.connection.resume()
+
+    def _wait_no_longer(self) -> None:
+        self._send_away(Malformed("no hello came", INVALID_PARAMS))
+
+    def _send_away(self, error: Malformed) -> None:
+        self._host.send_away(self)
+        text = written({"id": None, "error": {"code": error.code, "message": str(error)}})
+        if self.client is not None:
+            self.client.outbox.put(text)
+        else:
+            self.connection.say(text)
+        self._end(POLICY, str(error)[:100])
+
+    def _end(self, code: int, reason: str) -> None:
+        self._finish()
+        if self.client is not None:
+            self.client.outbox.flush(last=True)
+        self.connection.close(code, reason)
+        self.connection.resume()  # it is to be heard that the other end agrees
+
+    def _finish(self) -> None:
+        self._ended = True
+        self._stranger.cancel()
+        self._messages.clear()

@@ -1,1 +1,0 @@
-"""What is on a cable of which nothing is known: its rate, framing and protocols, and the nodes."""

@@ -1,0 +1,111 @@
+"""A peer that guesses tokens is slowed down, and nobody else."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from busmaster import bounds
+from busmaster.app.service.refusals import Logins, failed_text, pause_after, peer_of
+
+HERE, ELSEWHERE = "10.0.0.1", "10.0.0.2"
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.failed: list[str] = []
+        self.logins = Logins(self.failed.append, lambda: self.now)
+
+    def judge(self, name: str | None = None, host: str = HERE) -> float | None:
+        return self.logins.judge(host, name)
+
+    def guess(self, count: int) -> None:
+        for _ in range(count):
+            self.now += self.judge() or 0.0
+
+
+def test_after_some_failures_each_further_one_costs_twice_the_time() -> None:
+    clock = Clock()
+    waits = [clock.judge() for _ in range(bounds.FREE_LOGINS)]
+    assert waits == [0.0] * bounds.FREE_LOGINS
+    for pause in (1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0):
+        assert clock.judge() == pause
+        clock.now += pause
+    assert len(clock.failed) == bounds.FREE_LOGINS + 7
+    assert pause_after(10**6) == bounds.LONGEST_LOGIN_PAUSE
+
+
+def test_during_a_pause_no_login_of_the_peer_is_checked_and_all_count_but_none_lengthens_it() -> None:
+    clock = Clock()
+    clock.guess(bounds.FREE_LOGINS)
+    assert clock.judge() == 1.0
+    clock.now += 0.25
+    assert clock.judge("scada") == 0.75
+    assert clock.judge() == 0.75
+    assert clock.failed == [HERE] * (bounds.FREE_LOGINS + 3)
+    clock.now += 0.75
+    assert clock.judge("scada") is None
+
+
+def test_a_right_login_from_another_peer_never_waits() -> None:
+    clock = Clock()
+    clock.guess(20)
+    assert clock.judge() == bounds.LONGEST_LOGIN_PAUSE
+    assert clock.judge("scada", ELSEWHERE) is None
+
+
+def test_a_name_that_has_logged_in_from_the_peer_is_not_locked_out() -> None:
+    clock = Clock()
+    assert clock.judge("scada") is None
+    clock.guess(20)
+    clock.judge()
+    assert clock.judge("scada") is None
+    assert clock.judge("other") == bounds.LONGEST_LOGIN_PAUSE
+    assert clock.judge() == bounds.LONGEST_LOGIN_PAUSE, "a right login makes no guess free"
+
+
+def test_failures_are_forgotten_after_a_while() -> None:
+    clock = Clock()
+    clock.guess(bounds.FREE_LOGINS)
+    clock.now += bounds.LOGINS_FORGOTTEN
+    assert clock.judge() == 1.0
+    clock.now += bounds.LOGINS_FORGOTTEN + 1
+    assert clock.judge() == 0.0
+
+
+def test_what_is_remembered_of_peers_is_bounded_and_the_oldest_is_forgotten() -> None:
+    clock = Clock()
+    clock.guess(bounds.FREE_LOGINS)
+    for number in range(bounds.MOST_LOGIN_PEERS - 1):
+        clock.judge(None, f"peer {number}")
+    assert clock.judge() == 1.0, "it is not forgotten yet"
+    for number in range(2 * bounds.MOST_LOGIN_PEERS):
+        clock.judge(None, f"another {number}")
+    assert len(clock.logins._peers) == bounds.MOST_LOGIN_PEERS
+    assert clock.judge() == 0.0
+    for number in range(100):
+        clock.judge(f"name {number}")
+    assert len(clock.logins._peers[HERE].good) == 16
+
+
+@pytest.mark.parametrize(
+    ("host", "peer"),
+    [
+        ("10.0.0.1", "10.0.0.1"),
+        ("::ffff:10.0.0.1", "10.0.0.1"),
+        ("::1", "::1"),
+        ("2001:db8::1:2:3", "2001:db8::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("?", "?"),
+    ],
+)
+def test_a_peer_is_an_address_or_a_network_of_one_machine(host: str, peer: str) -> None:
+    assert peer_of(host) == peer
+
+
+def test_a_report_names_the_worst_peers_and_counts_the_others() -> None:
+    text = failed_text("web", Counter({"a": 1, "b": 5, "c": 2, "d": 1, "e": 1}))
+    assert text == "10 failed logins at web: 5 from b, 2 from c, 1 from a and 2 more"
+    assert failed_text("web", Counter({"a": 1})) == "1 failed login at web: 1 from a"

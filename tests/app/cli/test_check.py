@@ -1,0 +1,78 @@
+"""`busmaster check`: what it prints, and its exit status."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.app.cli.conftest import Command
+
+GOOD = """\
+port = "/dev/nothing-is-there?baudrate=57600"
+
+[nodes.winder]
+protocol = "hcp2"
+address = 5
+
+[groups.axes]
+period = 0.1
+points = ["winder/1"]
+"""
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "line.toml"
+    path.write_text(GOOD)
+    return path
+
+
+def test_a_file_that_is_right_ends_with_0(busmaster: Command, path: Path) -> None:
+    checked = busmaster("check", str(path))
+    assert (checked.status, checked.out, checked.err) == (0, f"{path}: no problems\n", "")
+
+
+def test_problems_are_a_line_each_and_end_with_1(busmaster: Command, path: Path) -> None:
+    path.write_text(GOOD.replace("0.1", "-1").replace("= 5", "= 500"))
+    checked = busmaster("check", str(path))
+    assert (checked.status, checked.err) == (1, "")
+    first, second, verdict = checked.lines
+    assert first.startswith(f"{path}:5: nodes.winder.address: ")
+    assert second.startswith(f"{path}:8: groups.axes.period: ")
+    assert verdict == f"{path}: 2 problems"
+
+
+def test_warnings_go_to_standard_error_and_are_no_problems(busmaster: Command, path: Path) -> None:
+    path.write_text(GOOD.partition("[groups")[0])
+    checked = busmaster("check", str(path))
+    assert (checked.status, checked.out) == (0, f"{path}: no problems\n")
+    assert "warning: nothing is polled" in checked.err
+
+
+def test_json_has_problems_with_file_line_and_key_and_warnings(busmaster: Command, path: Path) -> None:
+    path.write_text(GOOD.replace("points", "pionts"))
+    checked = busmaster("check", "--json", str(path))
+    assert (checked.status, checked.err) == (1, "")
+    said = json.loads(checked.out)
+    assert (said["file"], said["ok"], said["warnings"]) == (str(path), False, [])
+    missing, unknown = said["problems"]
+    assert (unknown["file"], unknown["line"], unknown["key"]) == (str(path), 9, "groups.axes.pionts")
+    assert "did you mean 'points'?" in unknown["problem"]
+    assert missing["key"] == "groups.axes"
+
+
+def test_json_of_a_problem_of_the_whole_file_has_no_line(busmaster: Command, path: Path) -> None:
+    path.write_text("\n".join(GOOD.splitlines()[1:]))
+    [problem] = json.loads(busmaster("check", "--json", str(path)).out)["problems"]
+    assert (problem["line"], problem["key"]) == (None, "")
+
+
+def test_json_of_a_file_that_is_right_is_ok(busmaster: Command, path: Path) -> None:
+    checked = busmaster("check", "--json", str(path))
+    assert (checked.status, json.loads(checked.out)["ok"]) == (0, True)
+
+
+def test_a_file_that_is_not_there_is_wrong_usage(busmaster: Command, tmp_path: Path) -> None:
+    assert busmaster("check", str(tmp_path / "none.toml")).status == 2

@@ -1,0 +1,48 @@
+"""The line of `busmaster demo`, in virtual time: what the death of a node costs the others."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from busmaster.app.cli.demo import PERIOD, devices
+from busmaster.app.cli.demo_line import AWAY_FOR, LOSES_ITS_WIRE, SETTINGS, UP_FOR, make_line
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Health
+from busmaster.emulator.memory import MemoryPort
+from busmaster.testing.virtual_time import run_in_virtual_time
+
+
+async def missed_cycles() -> tuple[list[int], float]:
+    """Cycles missed while all nodes reply, then while one is away: until it is down, until it would be back, up to a
+    minute after that, and in the minute behind it. With them the longest period."""
+    line = make_line()
+    bus = Bus(MemoryPort(line), seed=1)
+    assert bus.endpoint.settings == SETTINGS
+    _, points = devices(bus)
+    missed: list[int] = []
+    async with bus:
+        group = bus.poll_group("drives", period=PERIOD, points=points)
+        node = next(node for node in bus.nodes if node.address == LOSES_ITS_WIRE)
+        await asyncio.sleep(UP_FOR)
+        missed.append(group.statistics().missed)
+        line.cut(bus.now(), line.device(LOSES_ITS_WIRE))
+        died = bus.now()
+        while node.health is not Health.DOWN:  # noqa: ASYNC110  time is virtual
+            await asyncio.sleep(PERIOD)
+        for until in (bus.now(), died + AWAY_FOR, died + 60, died + 120):
+            await asyncio.sleep(until - bus.now())
+            missed.append(group.statistics().missed - sum(missed))
+        return missed, max(group.recent_periods)
+
+
+@pytest.mark.slow
+def test_r11_a_node_that_dies_costs_a_second_of_cycles_and_a_node_that_is_down_next_to_none() -> None:
+    (before, dying, probed, later, last), longest = run_in_virtual_time(missed_cycles())
+    assert before == 0
+    assert 3 <= dying <= 1.4 / PERIOD
+    assert longest <= 1.4
+    assert probed <= 3
+    assert later <= 0.02 * 54 / PERIOD
+    assert last <= 0.01 * 60 / PERIOD

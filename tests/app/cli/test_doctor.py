@@ -1,0 +1,500 @@
+"""The doctor's findings: on emulated lines in virtual time; as a command, on ptys and TCP ports.
+
+A wrong baud rate cannot be had on a pty, whose speed is a number that nobody heeds: there the far end looks at the
+number, and is deaf while it is another than its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import socket
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import serial
+
+from busmaster.app.diagnostics import adapters, diagnosis, examination
+from busmaster.app.diagnostics.adapters import Finding
+from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
+from busmaster.app.diagnostics.probing import Outcome, Prober, opened
+from busmaster.capture.pcapng import read_packets
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.registry import find, kinds, make_device
+from busmaster.testing import run_in_virtual_time
+from busmaster.transport import identity
+from tests.app.cli.conftest import Command, without_time
+from tests.app.cli.conftest import Outcome as Ended
+from tests.transport.fakes import plugged
+from tests.transport.usb import UsbTree
+
+HCP2 = ("--protocol", "hcp2")
+
+
+def line_of(protocol: str, devices: Iterable[Device], **options: object) -> Line:
+    chance = random.Random(1)
+    return Line(find(protocol).profile.line, devices, chance=chance, **options)  # type: ignore[arg-type]  # Line's own
+
+
+def hcp2(address: int, delay: Delay | None = None, **faults: float) -> Device:
+    device = make_device("hcp2", address, delay=delay)
+    device.faults = Faults(**faults)
+    return device
+
+
+def examined(line: Line, addresses: Iterable[int], protocol: str = "hcp2", port: MemoryPort | None = None) -> Findings:
+    """In virtual time. What is not in order must say what to do."""
+    findings = Findings()
+    patient = Patient(port or MemoryPort(line), protocol, addresses=tuple(addresses), named=True)
+    run_in_virtual_time(examine(patient, findings.append))
+    assert all(finding.advice for finding in findings if not finding.ok)
+    return findings
+
+
+class Findings(list[Finding]):
+    def on(self, topic: str) -> Finding:
+        (finding,) = [finding for finding in self if finding.topic == topic]
+        return finding
+
+    @property
+    def wrong(self) -> set[str]:
+        return {finding.topic for finding in self if not finding.ok}
+
+
+@dataclass(frozen=True)
+class Claiming(MemoryPort):
+    """A port whose owner says of the echo whatever he likes."""
+
+    claim: bool = False
+
+    @property
+    def echo(self) -> bool:
+        return self.claim
+
+
+class Chatterbox(Device):
+    """Says the same again and again, whatever it hears."""
+
+    def __init__(self, words: bytes) -> None:
+        super().__init__(99)
+        self.words = words
+        self.wakeup = 0.0
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        pass
+
+    def wake(self, now: float) -> None:
+        self.reply(self.words, now, 0.0)
+        self.wakeup = now + 0.2
+
+
+# A line in order
+
+
+def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended() -> None:
+    findings = examined(line_of("hcp2", [hcp2(1), hcp2(2, Delay(0.010, 0.020))]), (1, 2))
+    assert findings.wrong == set()
+    assert [finding.topic for finding in findings] == [
+        "open",
+        "silence",
+        "echo",
+        "node 1",
+        "node 2",
+        "windows",
+        "learning",
+    ]
+    assert (
+        findings.on("node 1").what == "answers after 2.2 / 2.2 / 2.2 ms (least / median / p99 of 25): read element 1: 0"
+    )
+    assert findings.on("windows").what.endswith("set are 50 / 100 / 150 ms (late_after / window / max_reply_delay)")
+
+
+@pytest.mark.parametrize("protocol", list(kinds()))
+def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
+    address = find(protocol).profile.addresses[0]
+    findings = examined(line_of(protocol, [make_device(protocol, address)]), (address,), protocol)
+    assert findings.wrong == set()
+    label = find(protocol).profile.label(address)
+    assert str(find(protocol).profile.probe) in findings.on(label).what
+
+
+def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_fix() -> None:
+    line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
+    findings = examined(line, (3,), "msc")
+    assert findings.wrong == set()
+    assert findings.on("open").advice == "MSC nodes speak at 9600 baud alone, not at 19200"
+
+
+def test_a_node_is_left_with_nothing_unacknowledged() -> None:
+    """MSC sends a packet again until the host ACKs it."""
+
+    async def ask() -> None:
+        async with opened(MemoryPort(line)) as wire:
+            prober = Prober(wire, profile, profile.timings, profile.line.byte_time, echo=False)
+            assert (await prober.ask(3)).outcome is Outcome.ANSWERED
+            assert await wire.hear_all(5.0) == b""
+
+    profile = find("msc").profile
+    controller = EmulatedMsc(3)
+    line = line_of("msc", [controller])
+    run_in_virtual_time(ask())
+    assert (controller.unacknowledged, controller.retransmitted) == (False, 0)
+
+
+# Before anybody is asked
+
+
+def test_the_harmless_bytes_begin_no_frame_and_acknowledge_nothing() -> None:
+    for protocol, handle in kinds().items():
+        profile = handle.profile
+        request = profile.probe.open(profile.addresses[0], profile.timings).request
+        assert not set(HARMLESS) & {request[0], 0x02, 0x04, 0x06, 0x07, 0x08, 0x15}, protocol
+
+
+def test_where_another_master_is_heard_nothing_is_sent() -> None:
+    request = bytes.fromhex("07 30 35 02 30 31 05 03")  # HCP2: read element 1 of node 5
+    findings = examined(line_of("hcp2", [Chatterbox(request), hcp2(1)]), (1,))
+    assert findings[-1] is findings.on("silence")
+    assert "somebody speaks already, so nothing was sent" in findings[-1].what
+
+
+def test_noise_is_described_and_the_nodes_are_asked_all_the_same() -> None:
+    line = line_of("hcp2", [Chatterbox(bytes(5)), hcp2(1)])
+    findings = examined(line, (1,))
+    assert findings.on("silence").what.startswith("5 bytes came unexpected: 00 00 00 00 00 (zeros: ")
+    assert "node 1" in {finding.topic for finding in findings}
+
+
+@pytest.mark.parametrize(("present", "declared"), [(True, False), (False, True), (True, True), (False, False)])
+def test_an_echo_is_found_and_what_was_declared_is_checked(present: bool, declared: bool) -> None:
+    line = line_of("hcp2", [hcp2(1)], echo=Echo(0.003) if present else None)
+    findings = examined(line, (1,), port=Claiming(line, declared))
+    assert findings.wrong == (set() if present == declared else {"echo"})
+    assert findings.on("node 1").ok
+    if present and not declared:
+        assert "--echo" in findings.on("echo").advice
+
+
+def test_an_echo_that_differs_from_what_was_sent_is_shown() -> None:
+    line = line_of("hcp2", [], echo=Echo(corrupt=1.0))
+    assert "after 00 55 00 came " in examined(line, (1,)).on("echo").what
+
+
+# Nodes in trouble
+
+
+@pytest.mark.parametrize("second", [Delay(0.012), Delay(0.04)])
+def test_two_nodes_with_one_address_that_answer_after_each_other_are_found(second: Delay) -> None:
+    """Within the silence after a reply, or so late that the reply comes to the next request."""
+    findings = examined(line_of("hcp2", [hcp2(5), hcp2(5, second), hcp2(6)]), (5, 6))
+    assert findings.wrong == {"node 5"}
+    assert "there is another node with address 5" in findings.on("node 5").what
+
+
+def test_two_nodes_with_one_address_that_talk_at_once_are_found() -> None:
+    twins = [hcp2(5, Delay(0.002, 0.004)), hcp2(5, Delay(0.002, 0.004))]
+    findings = examined(line_of("hcp2", [*twins, hcp2(6)]), (5, 6))
+    assert findings.wrong == {"node 5"}
+    assert "there is another node with address 5" in findings.on("node 5").what
+
+
+def test_a_node_that_is_garbled_while_the_others_are_clean_may_have_a_twin() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, flip=0.3), hcp2(6)]), (5, 6))
+    assert findings.wrong == {"node 5"}
+    assert "replies garbled" in findings.on("node 5").what
+    assert "another node with address 5" in findings.on("node 5").advice
+
+
+def test_where_all_nodes_are_garbled_the_line_is_suspected() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5), hcp2(6)], faults=Faults(flip=0.4)), (5, 6))
+    assert {"node 5", "node 6"} <= findings.wrong
+    assert "termination" in findings.on("node 5").advice
+
+
+def test_a_node_that_sometimes_does_not_answer_is_said_so() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, lost=0.3)]), (5,))
+    assert findings.wrong == {"node 5"}
+    assert "requests, although it lives: read element 1: 0" in findings.on("node 5").what
+
+
+def test_a_named_node_that_is_not_there_is_named_and_the_others_are_measured() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5)]), (5, 9))
+    assert findings.wrong == {"node 9"}
+    assert findings.on("node 9").what == "does not answer"
+
+
+def test_a_port_that_floods_is_examined_all_the_same(busmaster: Command) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=flood, args=(server,), daemon=True)
+        thread.start()
+        done = busmaster("doctor", f"socket://127.0.0.1:{server.getsockname()[1]}")
+    assert done.status == 1
+    assert "bytes came unexpected" in done.out
+
+
+def flood(server: socket.socket) -> None:
+    """The first client, until it goes away."""
+    client, _ = server.accept()
+    with client, contextlib.suppress(OSError):
+        while True:
+            client.sendall(bytes(65536))
+
+
+def test_where_nobody_answers_that_is_one_finding() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5)]), (6, 7))
+    assert findings.wrong == {"nodes", "settings"}
+    assert findings.on("nodes").what == "no answer from nodes 6, 7 at 57600 8N1"
+    assert findings.on("settings").what == "nodes 6, 7: no answer with 20 other settings either"
+
+
+def test_what_learned_windows_would_come_to_is_said() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, Delay(0.020))]), (5,))
+    assert findings.on("learning").what.startswith("learned windows would be 32 ms at most: a lost reply would hold up")
+    assert "in place of 150 ms" in findings.on("learning").what
+    findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
+    assert "no shorter than the one that is set" in findings.on("learning").what
+
+
+@pytest.mark.parametrize(
+    ("milliseconds", "wrong", "advice"),
+    [
+        (4, False, "timing = { window = 0.015, max_reply_delay = 0.025 } in LINE.toml would waste less on dead nodes"),
+        (30, False, "timing = { window = 0.095, max_reply_delay = 0.145 } in LINE.toml would waste less on dead nodes"),
+        (34, False, ""),
+        (70, False, "counted late: late_after = 110 ms would fit"),
+        (120, True, "--timeout 365"),
+    ],
+)
+def test_windows_are_suggested_from_what_was_measured(milliseconds: int, wrong: bool, advice: str) -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, Delay(milliseconds / 1000))]), (5,))
+    assert findings.wrong == ({"windows"} if wrong else set())
+    said = findings.on("windows").advice
+    assert advice in said if advice else not said
+
+
+@pytest.mark.parametrize(
+    ("data", "guess"),
+    [
+        ("00 00 80", "zeros"),
+        ("ff ff fe", "ones"),
+        ("82 30 31 b1 03", ""),
+        ("82 30 b1 b2 03", "even parity"),
+        ("02 b0 31 32 83", "odd parity"),
+        ("11 22", ""),
+    ],
+)
+def test_garbage_is_shown_with_what_it_looks_like(data: str, guess: str) -> None:
+    text = diagnosis.garbage(bytes.fromhex(data))
+    assert text.startswith(data)
+    assert guess in text
+    assert bool(guess) == ("(" in text)
+
+
+# As a command
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These take their time in earnest."""
+    monkeypatch.setattr(examination, "LISTENING", 0.05)
+    monkeypatch.setattr(examination, "ECHOING", 0.03)
+    monkeypatch.setattr(examination, "PROBES", 4)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("hasty")
+def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command) -> None:
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000")
+    assert (done.status, done.err) == (0, "")
+    assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
+        *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows", "learning")
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("hasty")
+def test_json_has_an_object_for_each_finding(busmaster: Command) -> None:
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000", "--json")
+    findings = list(map(without_time, done.lines))
+    assert {tuple(finding) for finding in findings} == {("topic", "ok", "what", "advice")}
+    assert findings[0] == {"topic": "port", "ok": True, "what": f"{server.path} exists", "advice": ""}
+
+
+@pytest.mark.usefixtures("hasty")
+def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_is_recommended(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    usb = UsbTree(tmp_path / "sys")
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        usb.plug(server.path, "A500ABC")
+        by_serial = busmaster("doctor", "usb:A500ABC")  # and no node, which a busy machine may make late
+        by_path = busmaster("doctor", server.path)
+        value = busmaster("read", "usb:A500ABC", *HCP2, "--node", "1", "1")
+    absent = busmaster("doctor", "usb:A500XYZ")
+    assert (by_serial.status, by_path.status) == (0, 0), by_serial.out + by_path.out
+    assert f"ok    name        {server.path} is FTDI A500ABC, which usb:A500ABC finds again\n" in by_serial.out
+    assert "-> name it usb:A500ABC: " in by_path.out
+    assert (value.status, value.out) == (0, "1 0\n")
+    assert absent.status == 1
+    assert f"usb:A500XYZ is not plugged in: there is usb:A500ABC ({server.path})" in absent.out
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.parametrize("obeys", [True, False])
+def test_where_low_latency_is_asked_for_the_latency_timer_is_judged_as_the_opening_leaves_it(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, obeys: bool
+) -> None:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    usb = UsbTree(tmp_path / "sys")
+    timer = tmp_path / "sys/devices/1-1/1-1:1.0/ttyUSB0/latency_timer"
+
+    def set_flag(port: serial.Serial, flag: bool) -> None:
+        assert timer.read_text() == "16\n"
+        if flag and obeys:
+            timer.write_text("1\n")
+
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", set_flag)
+    monkeypatch.setattr(adapters, "low_latency", lambda _: timer.read_text() == "1\n")
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        usb.plug(server.path, "A500ABC")
+        device = tmp_path / "sys/class/tty" / os.path.basename(server.path)
+        device.mkdir()  # by the last part of its path, as of a node in /dev
+        (device / "device").symlink_to(timer.parent)
+        timer.write_text("16\n")
+        plain = busmaster("doctor", "usb:A500ABC")
+        asked = busmaster("doctor", "usb:A500ABC?low_latency=1")
+    [before] = [line for line in plain.lines if " latency " in line]
+    assert "16 ms" in before
+    assert "add ?low_latency=1" in plain.out
+    assert "?low_latency=1 may" in plain.out
+    assert "?low_latency=1" not in asked.out
+    assert f"its low-latency flag is {'set' if obeys else 'not set, though low_latency=1 asked for it'}\n" in asked.out
+    [after] = [line for line in asked.lines if " latency " in line]
+    assert ("1 ms" if obeys else "16 ms") in after
+    assert after.startswith("ok" if obeys else "FAIL")
+    assert ("low_latency=1 did not shorten it: write 1 to" in asked.out) is not obeys
+    assert asked.out.count("gathers received bytes") == 1
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controllers: TcpServer, tmp_path: Path) -> None:
+    file = tmp_path / "line.pcapng"
+    done = busmaster("doctor", controllers.path, *HCP2, "--nodes", "8,77", "--capture", str(file))
+    assert done.status == 1
+    assert "the adapter checks do not apply to a TCP port" in done.out
+    assert "FAIL  node 77     does not answer\n" in done.out
+    assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to fix\n"
+    with file.open("rb") as capture:
+        packets = list(read_packets(capture))
+    assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in packets]
+    told = {(packet.node, packet.outcome.name, packet.comment) for packet in packets}
+    assert (8, "NONE", "probe") in told
+    assert (8, "OK", "read element 1: 0.0") in told
+    assert (77, "NO_REPLY", "read element 1: no reply") in told
+
+
+@pytest.mark.usefixtures("hasty")
+def test_without_a_protocol_no_node_is_asked(busmaster: Command, controllers: TcpServer) -> None:
+    done = busmaster("doctor", controllers.path)
+    assert done.status == 0
+    assert "no node was asked" in done.out
+
+
+@pytest.mark.parametrize("port", ["/dev/absent", "/dev/null", "socket://127.0.0.1:1"])
+def test_a_port_that_does_not_open_is_a_finding(busmaster: Command, port: str) -> None:
+    done = busmaster("doctor", port)
+    assert done.status == 1
+    assert done.lines[-2].startswith("FAIL")
+    assert done.lines[-1].strip().startswith("-> ")
+
+
+def test_while_another_program_has_the_port_it_is_not_even_opened(busmaster: Command) -> None:
+    with plugged() as pty_master:
+        hold = f"f = open({pty_master.path!r}); print(flush=True); input()"
+        with subprocess.Popen([sys.executable, "-ISc", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+            assert other.stdout is not None
+            other.stdout.readline()
+            done = busmaster("doctor", pty_master.path, *HCP2)
+            assert pty_master.read(0) == b""
+            other.communicate(b"\n")
+    assert done.status == 1
+    assert f"(process {other.pid})" in done.out
+    assert "open " not in [line[6:16] for line in done.lines]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("PORT", "--nodes", "1"), "--nodes needs a --protocol"),
+        (("PORT", "--protocol", "mentor", "--nodes", "0-3"), "means all of them"),
+        (("PORT", "--protocol", "dc104", "--nodes", "1"), "has no addresses"),
+        (("PORT?baud=3",), "did you mean 'baudrate'?"),
+        (("PORT", "--protocol", "hcp4"), "no such protocol 'hcp4'; did you mean 'hcp'?"),
+    ],
+)
+def test_wrong_usage_is_status_2_and_nothing_is_examined(
+    busmaster: Command, arguments: tuple[str, ...], complaint: str
+) -> None:
+    done = busmaster("doctor", *arguments)
+    assert (done.status, done.out) == (2, "")
+    assert complaint in done.err
+
+
+# Other settings
+
+
+def rate_of(path: str) -> int:
+    port = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        return int(termios.tcgetattr(port)[5])
+    finally:
+        os.close(port)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_wrong_rate_is_found_and_the_port_is_left_as_it_was(busmaster: Command) -> None:
+    with serve_pty(Line(LineSettings(9600), [hcp2(1)], paced=False)) as server:
+        done = doctor_of_a_paced(server, busmaster)
+        assert rate_of(server.path) == termios.B57600
+    assert done.status == 1
+    assert "no answer from node 1 at 57600 8N1" in done.out
+    assert "node 1 answers at 9600 8N1\n" in done.out
+    assert "add ?baudrate=9600&bytesize=8&parity=N to the port" in done.out
+
+
+@pytest.mark.usefixtures("hasty")
+def test_where_no_rate_helps_it_is_said_what_was_tried(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(examination, "RATES", (9600, 19200))
+    monkeypatch.setattr(examination, "FRAMINGS", ())
+    with serve_pty(line_of("hcp2", [], paced=False)) as server:
+        done = doctor_of_a_paced(server, busmaster)
+    assert "no answer with 2 other settings either" in done.out
+
+
+def doctor_of_a_paced(server: PtyServer, busmaster: Callable[..., Ended]) -> Ended:
+    """Where it is told that the port is paced, a rate matters."""
+    return busmaster("doctor", f"{server.path}?paced=1", *HCP2, "--nodes", "1")
+
+
+def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
+    candidates = other_settings(LineSettings(9600, 7, "E"))
+    assert len(set(candidates)) == len(candidates)
+    assert LineSettings(9600, 7, "E") not in candidates
+    framings = [candidate.framing for candidate in candidates]
+    assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)

@@ -1,0 +1,405 @@
+"""The screen, drawn in a terminal of given size: what stands on it, and what its keys do to the line."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+from rich.cells import cell_len
+from textual.pilot import Pilot
+
+from busmaster.app.cli.live import Screen
+from busmaster.app.cli.terminal import made_printable
+from busmaster.app.service.picture import Picture
+from busmaster.errors import WriteUnconfirmed
+from tests.app.service.pictures import GROUP, node, row, tell, three_drives
+
+SIZES = [(60, 20), (80, 24), (120, 40)]
+sizes = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+
+
+class Wishes:
+    """A line that does nothing but remember what was wished, and fails where it is told to."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[Any, ...]] = []
+        self.error: Exception | None = None
+
+    async def pause(self, group: str, paused: bool, /) -> None:
+        self.said.append(("pause", group, paused))
+
+    async def demand(self, group: str, /) -> None:
+        self.said.append(("demand", group))
+
+    async def suspend(self, protocol: str, address: int, for_: float, /) -> None:
+        self.said.append(("suspend", protocol, address, for_))
+
+    async def details(self, group: str, key: str, /) -> Mapping[str, Any]:
+        timeline = {"queued": 1.0, "started": 1.004, "first_byte": 1.009, "last_byte": 1.012, "attempts": 1}
+        limit = {"name": "outputs", "minimum": 0, "maximum": 7, "max_step": None, "writable": True}
+        told = {"command": "read element 10", "hint": "", "low": None, "high": 5.5, "limits": [limit]}
+        return told | {"timeline": timeline | {"exchanges_ahead": 2, "quiet_time_ahead": 0.0}}
+
+    async def write(self, group: str, key: str, value: Any, /) -> None:
+        self.said.append(("write", group, key, value))
+        if self.error is not None:
+            raise self.error
+
+
+@asynccontextmanager
+async def drawn(
+    picture: Picture, size: tuple[int, int] = (80, 24), *, read_only: bool = False
+) -> AsyncIterator[tuple[Screen, Wishes, Pilot[int]]]:
+    line = Wishes()
+    screen = Screen(picture, line, read_only=read_only)
+    async with screen.run_test(size=size) as pilot:
+        await pilot.pause()
+        yield screen, line, pilot
+
+
+def lines(screen: Screen) -> list[str]:
+    return ["".join(segment.text for segment in strip) for strip in screen.screen._compositor.render_strips()]
+
+
+def table(screen: Screen) -> list[list[str]]:
+    """The words of the rows."""
+    return [line.split() for line in lines(screen) if line.startswith("node ")]
+
+
+@sizes
+@pytest.mark.asyncio
+async def test_the_picture_fits_and_says_what_the_owner_says(size: tuple[int, int]) -> None:
+    nodes = (node(1), node(2), node(9, "down"))
+    async with drawn(tell(Picture(), *three_drives(), nodes=nodes), size) as (screen, _, _):
+        shown = lines(screen)
+        rows = table(screen)
+    width, height = size
+    assert len(shown) == height
+    assert {cell_len(line) for line in shown} == {width}
+    assert "busmaster poll  /dev/ttyUSB0  57600 8N1" in shown[0]
+    assert "0:01:01" in shown[0]
+    assert "53% busy  ready  2 waiting" in shown[1]
+    assert shown[2].startswith(" axes every 200 ms  missed 1  cycle 61")
+    assert [words[:3] for words in rows] == [
+        ["node", "1", "axis0.position"],
+        ["node", "2", "axis0.position"],
+        ["node", "9", "axis0.position"],
+    ]
+    assert [words[-1] for words in rows] == ["up", "up", "down"]
+    assert rows[0][3:5] == ["1.5", "mm"]
+    assert rows[2][3:5] == ["!", "-"]
+    assert "node 9 is down, was suspect" in "\n".join(shown)
+    assert "quit" in shown[-1] or "leave" in shown[-1]
+
+
+@pytest.mark.asyncio
+async def test_the_whole_of_a_wide_terminal_is_used_and_columns_stay_aligned() -> None:
+    picture = tell(Picture(), *three_drives())
+    async with drawn(picture) as (screen, _, pilot):
+        await pilot.resize_terminal(120, 40)
+        await pilot.pause()
+        shown = lines(screen)
+    header = next(line for line in shown if "VALUE" in line)
+    drawn_row = next(line for line in shown if "1.5" in line)
+    assert header.index("VALUE") + len("VALUE") == drawn_row.index("1.5") + len("1.5")
+    assert header.index("HEALTH") == drawn_row.index("up")
+    assert {cell_len(line) for line in shown} == {120}
+
+
+@pytest.mark.asyncio
+async def test_no_colour_gives_a_picture_in_the_terminals_own_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stands out does so by its words, marks and weight."""
+    monkeypatch.setenv("NO_COLOR", "1")
+    nodes = (node(1), node(2), node(9, "down"))
+    async with drawn(tell(Picture(), *three_drives(), nodes=nodes)) as (screen, _, pilot):
+        for keys in ((), ("w",), ("escape", "question_mark")):
+            await pilot.press(*keys)
+            await pilot.pause()
+            segments = [segment for strip in screen.screen._compositor.render_strips() for segment in strip]
+            colours = {part for one in segments if one.style for part in (one.style.color, one.style.bgcolor) if part}
+            assert {colour.name for colour in colours} <= {"default"}
+            assert "node 9" in "".join(lines(screen)) or keys
+
+
+@pytest.mark.asyncio
+async def test_only_colours_that_light_and_dark_grounds_both_show_are_used() -> None:
+    rows = (*three_drives(), row(3, quality="late"), row(4, quality="stale"))
+    nodes = (node(1), node(2, "suspect"), node(3, "suspended"), node(4, "unknown"), node(9, "down"))
+    async with drawn(tell(Picture(), *rows, nodes=nodes, utilisation=0.99, state="offline")) as (screen, _, _):
+        segments = [segment for strip in screen.screen._compositor.render_strips() for segment in strip]
+    colours = {part for one in segments if one.style for part in (one.style.color, one.style.bgcolor) if part}
+    assert {colour.name for colour in colours} <= {"default", "red", "magenta", "color(1)", "color(5)"}
+
+
+@pytest.mark.asyncio
+async def test_the_selection_stays_on_its_row_through_every_change() -> None:
+    picture = tell(Picture(), *three_drives())
+    async with drawn(picture) as (screen, _, pilot):
+        await pilot.press("down")
+        before = screen.table.selected
+        assert before is not None
+        assert before.name == "node 2 axis0.position"
+        changes: list[dict[str, Any]] = [{"set": 2}, {"set": 3}]
+        for number, change in enumerate(changes):
+            tell(picture, row(number + 3, "inputs", 1), row(number + 5, "inputs", 1), *three_drives(), **change)
+            screen.take_picture()
+            await pilot.pause()
+            now = screen.table.selected
+            assert now is not None
+            assert now.identity == before.identity
+        await pilot.press("o")
+        await pilot.resize_terminal(60, 20)
+        await pilot.press("slash", *"axis0", "enter")
+        await pilot.pause()
+        now = screen.table.selected
+        assert now is not None
+        assert now.identity == before.identity
+        assert len(table(screen)) == 3
+
+
+@pytest.mark.asyncio
+async def test_a_click_selects_the_row_under_it_wherever_the_table_is_scrolled_to() -> None:
+    async with drawn(tell(Picture(), *(row(number) for number in range(1, 41))), (60, 20)) as (screen, _, pilot):
+        for keys in ((), ("end",), ("home",)):
+            await pilot.press(*keys)
+            await pilot.pause()
+            second = table(screen)[1]
+            await pilot.click(screen.table, offset=(0, 1))
+            await pilot.pause()
+            assert screen.table.selected is not None
+            assert screen.table.selected.name.split() == second[:3]
+
+
+@pytest.mark.asyncio
+async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
+    nodes = (node(1), node(2), node(9, "down"))
+    async with drawn(tell(Picture(), *three_drives(), nodes=nodes)) as (screen, _, pilot):
+        await pilot.press("slash", *"down axis0", "enter")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9"]
+        assert "filter: down axis0" in lines(screen)[-1]
+        await pilot.press("slash", *(["backspace"] * 10), "enter")
+        tell(screen.picture, *three_drives(), row(10, "inputs", alarm="high"), nodes=(*nodes, node(10)), set=2)
+        await pilot.press("o", "o", "o")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9", "10", "1", "2"]
+        assert "trouble" in lines(screen)[-1]
+
+
+@pytest.mark.asyncio
+async def test_an_offline_line_is_not_up() -> None:
+    async with drawn(tell(Picture(), *three_drives(), state="offline", losses=1)) as (screen, _, _):
+        shown = "\n".join(lines(screen))
+        assert [words[-1] for words in table(screen)] == ["offline"] * 3
+    assert "offline  2 waiting  lost 1 time" in shown
+
+
+@pytest.mark.asyncio
+async def test_a_paused_group_rests_and_is_not_late() -> None:
+    paused = {**GROUP, "paused": True}
+    async with drawn(tell(Picture(), *three_drives(), groups=(paused,), now=5000.0)) as (screen, _, _):
+        shown = lines(screen)
+    assert shown[2].startswith(" axes  paused  every 200 ms")
+    assert "rests up" in " ".join(next(line for line in shown if line.startswith("node 1")).split()).replace("3.1 ", "")
+
+
+@pytest.mark.asyncio
+async def test_a_value_that_could_not_be_read_came_late_or_left_its_limits_has_a_mark() -> None:
+    rows = (row(1, error="no reply"), row(2, quality="late"), row(3, alarm="high"), row(4, alarm="low"))
+    async with drawn(tell(Picture(), *rows, row(5, quality="stale"), row(6))) as (screen, _, _):
+        assert [words[3] for words in table(screen)] == ["!", "~", "↑", "↓", "?", "0"]
+
+
+@pytest.mark.asyncio
+async def test_many_groups_leave_room_for_the_points_and_that_of_the_row_is_shown() -> None:
+    groups = tuple({**GROUP, "name": f"group{number}"} for number in range(30))
+    async with drawn(tell(Picture(), row(group="group17"), groups=groups), (60, 20)) as (screen, _, _):
+        shown = lines(screen)
+    assert shown[2].startswith(" group17 every")
+    assert shown[3].startswith(" and 29 more groups")
+    assert any(line.startswith("node 5") for line in shown)
+
+
+@pytest.mark.asyncio
+async def test_keys_pause_poll_and_suspend_what_is_selected_or_all() -> None:
+    groups = (GROUP, {**GROUP, "name": "slow", "paused": True})
+    nodes = (node(5), node(6, "suspended"))
+    rows = (row(5), row(6, "inputs", group="slow"))
+    async with drawn(tell(Picture(), *rows, nodes=nodes, groups=groups)) as (_, line, pilot):
+        await pilot.press("p", "d", "D", "P", "s", "n", "s", "y", "down", "p", "s", "y")
+        await pilot.pause()
+    assert line.said == [
+        ("pause", "axes", True),
+        ("demand", "axes"),
+        ("demand", "axes"),
+        ("demand", "slow"),
+        ("pause", "axes", True),
+        ("pause", "slow", True),
+        ("suspend", "hcp2", 5, 60.0),
+        ("pause", "slow", False),
+        ("suspend", "hcp2", 6, 0.0),
+    ]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(("key", "status"), [("q", 0), ("ctrl+c", 130)])
+async def test_ctrl_c_is_told_from_leaving(key: str, status: int) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        await pilot.press(key)
+        await pilot.pause()
+    assert screen.return_value == status
+
+
+async def pressed(*keys: str, point: Any, read_only: bool = False) -> list[tuple[Any, ...]]:
+    """What is wished of the line when these keys are pressed on that row."""
+    async with drawn(tell(Picture(), point), read_only=read_only) as (_, line, pilot):
+        await pilot.press(*keys)
+        await pilot.pause()
+    return line.said
+
+
+@pytest.mark.asyncio
+async def test_a_value_is_written_once_it_was_asked_whether_it_is_meant() -> None:
+    written = await pressed("w", *"1", "full_stop", "5", "enter", "y", point=row())
+    assert written == [("write", "axes", "5/outputs", 1.5)]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    "keys",
+    [
+        ("w", "5", "enter", "n"),
+        ("w", "5", "escape"),
+        ("w", "5", "enter", "escape"),
+        ("w", "5"),
+        ("w", *"abc", "enter", "y"),
+    ],
+)
+async def test_a_value_that_was_not_confirmed_is_not_written(keys: tuple[str, ...]) -> None:
+    assert await pressed(*keys, point=row()) == []
+
+
+@pytest.mark.asyncio
+async def test_what_is_read_only_asks_for_no_value() -> None:
+    assert await pressed("w", "5", "enter", "y", point=row(), read_only=True) == []
+    assert await pressed("w", "5", "enter", "y", point=row(writable=False)) == []
+
+
+@pytest.mark.asyncio
+async def test_it_is_said_what_became_of_a_write() -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+        await pilot.press("w", "1", "enter", "y")
+        await pilot.pause()
+        assert "node 5 outputs = 1 written" in "\n".join(lines(screen))
+        line.error = WriteUnconfirmed("no reply within 100 ms")
+        await pilot.press("w", "2", "enter", "y")
+        await pilot.pause()
+        assert "node 5 outputs = 2: no reply within 100 ms" in "\n".join(lines(screen))
+
+
+@sizes
+@pytest.mark.asyncio
+async def test_details_show_limits_and_the_last_exchange_of_a_point(size: tuple[int, int]) -> None:
+    async with drawn(tell(Picture(), row(value=3, unit="V")), size) as (screen, _, pilot):
+        await pilot.press("enter")
+        shown = ""
+        while "exchange" not in shown:
+            await pilot.pause()
+            shown = " ".join(" ".join(line.strip("│ ") for line in lines(screen)).split())
+        await pilot.press("escape")
+        assert len(screen.screen_stack) == 1
+    assert "node 5 outputs (5/outputs) value 3 V, asked for 0.1s ago" in shown
+    assert "limits written from 0 to 7; alarm high 5.5" in shown
+    assert "exchange waited 4.0 ms behind 2, reply after 5.0 ms, whole after 8.0 ms" in shown
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("keys", [("w",), ("s",), ("slash",), ("enter",), ("question_mark",)])
+async def test_the_terminal_may_change_its_size_while_something_is_asked(keys: tuple[str, ...]) -> None:
+    async with drawn(tell(Picture(), *three_drives(), row()), (120, 40)) as (screen, line, pilot):
+        await pilot.press("end", *keys)
+        for size in ((60, 20), (80, 24), (40, 10), (120, 40)):
+            await pilot.resize_terminal(*size)
+            await pilot.pause()
+            assert {cell_len(shown) for shown in lines(screen)} == {size[0]}
+        await pilot.press("escape")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+        assert [words[1] for words in table(screen)] == ["1", "2", "9", "5"]
+    assert line.said == []
+
+
+@pytest.mark.asyncio
+async def test_silence_of_the_owner_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        screen.heard -= 10
+        screen.draw()
+        await pilot.pause()
+        assert "no news for 1" in lines(screen)[0]
+        screen.take_picture()
+        await pilot.pause()
+        assert "no news" not in lines(screen)[0]
+
+
+@pytest.mark.asyncio
+async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -> None:
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        screen.away = "no program serves /run/line.sock"
+        screen.take_picture()
+        await pilot.pause()
+        assert "its owner is away" in lines(screen)[0]
+        assert any("no program serves /run/line.sock" in line for line in lines(screen))
+        assert len(table(screen)) == 1
+        screen.away = ""
+        screen.take_picture()
+        await pilot.pause()
+        assert not any("away" in line or "no program" in line for line in lines(screen))
+
+
+@pytest.mark.asyncio
+async def test_rows_stay_until_an_owner_that_is_back_has_told_its_own() -> None:
+    async with drawn(tell(Picture(), *three_drives())) as (screen, _, pilot):
+        screen.picture = Picture()
+        screen.take_picture()
+        await pilot.resize_terminal(90, 24)  # all rows are drawn again
+        await pilot.pause()
+        assert "waiting for the program that owns the line" in lines(screen)[0]
+        assert len(table(screen)) == 3
+        tell(screen.picture, *three_drives()[:2])
+        screen.take_picture()
+        await pilot.pause()
+        assert len(table(screen)) == 2
+
+
+@pytest.mark.asyncio
+async def test_keys_do_nothing_before_there_is_a_picture() -> None:
+    async with drawn(Picture()) as (screen, line, pilot):
+        assert "waiting for the program that owns the line" in lines(screen)[0]
+        await pilot.press("p", "P", "d", "s", "w", "enter", "o", "up", "down", "end")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+    assert line.said == []
+
+
+@pytest.mark.asyncio
+async def test_nothing_that_the_owner_says_is_obeyed_by_a_terminal() -> None:
+    """A title, an error or a device's text with escape sequences in it is shown as text."""
+    evil = "\x1b[2J\x9b31m\x07"
+    point, held = row(5, evil, evil, unit=evil, error=evil, group=evil)
+    point["node"] = evil
+    nodes = (node(5, evil, label=evil),)
+    said = {"title": evil, "state": evil, "line": evil, "settings": evil, "events": [[1.0, evil]]}
+    groups = ({**GROUP, "name": evil},)
+    async with drawn(tell(Picture(made_printable), (point, held), nodes=nodes, groups=groups, **said)) as (
+        screen,
+        _,
+        pilot,
+    ):
+        for key in ("up", "enter"):
+            await pilot.press(key)
+            await pilot.pause()
+            shown = "".join(lines(screen))
+            assert shown.isprintable()
+            assert r"\u001b[2J" in shown

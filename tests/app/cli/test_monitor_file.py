@@ -1,0 +1,305 @@
+"""`busmaster monitor LINE.toml`: points and outputs fed from what another master asks, without a byte of ours."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from socket import create_server
+from typing import Any
+
+import pytest
+
+from busmaster.app.cli import main
+from busmaster.app.cli.overheard import HeardGroup, Overheard
+from busmaster.app.config import load
+from busmaster.app.line import ConfiguredLine
+from busmaster.bus.samples import Quality, Sample
+from busmaster.capture.decode import Decoder
+from busmaster.capture.frames import Direction
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import find
+from tests.app.cli.conftest import started
+from tests.app.outputs.brokers import needs_mosquitto, running
+from tests.app.outputs.cycles import until
+from tests.app.outputs.test_mqtt import heard as heard_of
+from tests.app.outputs.test_mqtt import listening
+from tests.patience import PATIENCE
+
+FILE = """
+port = "socket://127.0.0.1:{port}?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 2
+[nodes.winder.points]
+tension = {{ item = "1", unit = "N", factor = 0.1, high = 0.4 }}
+[nodes.spare]
+protocol = "hcp2"
+address = 3
+[groups.fast]
+period = 0.1
+points = ["winder/tension"]
+[outputs.sqlite]
+path = "{folder}/line.sqlite"
+"""
+REQUEST = hcp2.Read(1).open(2, hcp2.PROFILE.timings).request
+REPLY = bytes.fromhex("02 30 31 35 03 37")
+"""Element 1 is 5."""
+
+
+class Tapped:
+    """A serial server on somebody else's line."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+        self.over = threading.Event()
+        self._server = create_server(("127.0.0.1", 0))
+        self.port: int = self._server.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        connection, _ = self._server.accept()
+        with connection:
+            connection.settimeout(0.02)
+            while not self.over.is_set():
+                try:
+                    connection.sendall(REQUEST + REPLY)
+                    self.heard += connection.recv(100)
+                except TimeoutError:
+                    continue
+                except OSError:
+                    break
+
+    def close(self) -> None:
+        self.over.set()
+        self._server.close()
+        self._thread.join()
+
+
+@contextmanager
+def tapped() -> Iterator[Tapped]:
+    line = Tapped()
+    try:
+        yield line
+    finally:
+        line.close()
+
+
+def written(folder: Path, port: int = 1) -> Path:
+    path = folder / "line.toml"
+    path.write_text(FILE.format(port=port, folder=folder))
+    return path
+
+
+def rows(path: Path, query: str = "select node, item, value, unit from history") -> list[tuple[Any, ...]]:
+    if not path.exists():
+        return []
+    database = sqlite3.connect(path, timeout=PATIENCE)
+    try:
+        return database.execute(query).fetchall()
+    except sqlite3.OperationalError:
+        return []  # it is just being made
+    finally:
+        database.close()
+
+
+@pytest.mark.slow
+def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> None:
+    with tapped() as line:
+        command = [sys.executable, "-m", "busmaster", "monitor", str(written(tmp_path, line.port)), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            cycle = json.loads(process.stdout.readline())
+            until(lambda: len(rows(tmp_path / "line.sqlite")) > 2)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE)
+        assert line.heard == b""
+    assert cycle["group"] == "fast"
+    assert cycle["samples"]["winder/tension"] == {
+        "value": 0.5,
+        "quality": "overheard",
+        "error": None,
+        "late": False,
+    }
+    assert set(rows(tmp_path / "line.sqlite")) == {("winder", "tension", 0.5, "N")}
+    assert "sqlite: " in said
+    assert "0 dropped" in said
+    alarm = "winder/tension = 0.5 N is above its high of 0.4 N"
+    assert said.count(f"busmaster: {alarm}\n") == 1
+    assert rows(tmp_path / "line.sqlite", "select node, text from events") == [("winder", alarm)]
+    assert process.returncode == 130
+
+
+@pytest.mark.slow
+@needs_mosquitto
+@pytest.mark.asyncio
+async def test_mqtt_says_that_it_listens_and_of_the_state_of_a_line_that_nobody_asks_it_says_nothing(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path) as broker, tapped() as line:
+        path = written(tmp_path, line.port)
+        path.write_text(path.read_text() + f'[outputs.mqtt]\nport = {broker.port}\nprefix = "line"\n')
+        async with listening(broker, "line/#") as messages:
+            with started("monitor", str(path)) as process:
+                found = await heard_of(messages, 8)
+                process.send_signal(signal.SIGINT)
+                await asyncio.to_thread(process.communicate)
+    topics = {topic for topic, *_ in found}
+    assert {"line/status", "line/values/winder/tension", "line/alarms/winder/tension"} <= topics
+    assert topics <= {"line/status", "line/values/winder/tension", "line/alarms/winder/tension", "line/events"}
+
+
+def heard(folder: Path, *pieces: bytes, apart: float = 0.03) -> list[object]:
+    """The values of the point that these pieces of the line, each some seconds behind the one before, stand for."""
+    line = ConfiguredLine(load(written(folder)), outputs=False)
+    points = line.members("fast")
+    overheard = Overheard(find("hcp2").protocol, points, lambda: 0.0)
+    overheard.groups.append(HeardGroup("fast", 0.1, points, 0.0))
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    found: list[object] = []
+    for number, piece in enumerate(pieces):
+        for frame in decoder.feed(piece, number * apart, Direction.UNKNOWN) + decoder.quiet():
+            overheard.heard(frame)
+            snapshot = overheard.groups[0].turn(number * apart, 0.0)
+            found += [sample.value for sample in snapshot.samples.values()] if snapshot else []
+    return found
+
+
+OTHER = hcp2.Read(2).open(2, hcp2.PROFILE.timings).request
+OTHER_NODE = hcp2.Read(1).open(3, hcp2.PROFILE.timings).request
+
+
+@pytest.mark.parametrize(
+    ("pieces", "values"),
+    [
+        ([REQUEST + REPLY], [0.5]),
+        ([REQUEST, REPLY], [0.5]),
+        ([REPLY], []),
+        ([OTHER + REPLY], []),
+        ([OTHER_NODE + REPLY], []),
+        ([REQUEST + REPLY[:-1] + b"\0"], []),
+        ([REQUEST, REPLY[:3], REPLY], []),
+        ([REQUEST + REPLY + REPLY], [0.5]),
+        ([REQUEST, REQUEST + REPLY], [0.5]),
+    ],
+)
+def test_only_the_answer_to_its_own_request_is_a_value(
+    tmp_path: Path, pieces: list[bytes], values: list[object]
+) -> None:
+    assert heard(tmp_path, *pieces) == values
+
+
+def test_an_answer_that_is_later_than_max_reply_delay_may_be_another_requests(tmp_path: Path) -> None:
+    assert heard(tmp_path, REQUEST, REPLY, apart=1.0) == []
+
+
+def test_what_is_missing_or_too_much_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["monitor", str(written(tmp_path)), "--protocol", "hcp2"]) == 2
+    assert "leave out --protocol" in capsys.readouterr().err
+    assert main(["monitor", "/dev/null"]) == 2
+    assert "--protocol P, or a LINE.toml" in capsys.readouterr().err
+
+
+NAK = b"\x15"
+
+
+def asked(node: int, element: int = 1) -> bytes:
+    return hcp2.Read(element).open(node, hcp2.PROFILE.timings).request
+
+
+def overheard_of(folder: Path, *pieces: tuple[float, bytes], earlier: float = 0.0) -> list[Sample[Any]]:
+    """The samples of the point that these bytes, each at its time, stand for; the last came `earlier`."""
+    line = ConfiguredLine(load(written(folder)), outputs=False)
+    points = line.members("fast")
+    now = [0.0]
+    overheard = Overheard(find("hcp2").protocol, points, lambda: now[0])
+    overheard.groups.append(HeardGroup("fast", 0.1, points, 0.0))
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    found: list[Sample[Any]] = []
+    for at, piece in pieces:
+        now[0] = at
+        for frame in decoder.feed(piece, at, Direction.UNKNOWN):
+            frame.earlier = earlier if at == pieces[-1][0] else 0.0
+            overheard.heard(frame)
+            snapshot = overheard.groups[0].turn(at, 0.0)
+            found += snapshot.samples.values() if snapshot else []
+    return found
+
+
+MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.max_reply_delay
+
+
+@pytest.mark.parametrize(
+    ("pieces", "values"),
+    [
+        pytest.param([(0, asked(3)), (0.03, asked(2)), (0.04, REPLY)], [], id="gone on to the next node"),
+        pytest.param(
+            [(0, asked(3)), (0.03, asked(3)), (0.04, REPLY), (0.05, asked(2)), (0.06, REPLY)], [], id="repeated"
+        ),
+        pytest.param([(0, asked(2)), (0.03, asked(2)), (0.04, REPLY), (0.05, REPLY)], [0.5], id="repeated to itself"),
+        pytest.param(
+            [(0, asked(3)), (0.03, asked(3)), (0.04, REPLY), (0.05, asked(2, 4)), (0.06, asked(2)), (0.07, REPLY)],
+            [],
+            id="open requests outlive what is asked in between",
+        ),
+        pytest.param([(0, asked(3, 4)), (0.03, asked(2)), (0.04, REPLY)], [0.5], id="its reply would begin otherwise"),
+        pytest.param([(0, asked(3)), (0.03, asked(3)), (0.04, NAK), (0.05, asked(2)), (0.06, REPLY)], [], id="a NAK"),
+        pytest.param([(0, asked(9)), (0.03, asked(2)), (0.04, REPLY)], [], id="of a node that is not in the file"),
+        pytest.param([(0, b"\x07\x46\x46"), (0.15, asked(2)), (0.16, REPLY)], [], id="perhaps a damaged request"),
+        pytest.param(
+            [(0, asked(3)), (0.06 + MAX_REPLY_DELAY, asked(2)), (0.07 + MAX_REPLY_DELAY, REPLY)], [0.5], id="it is over"
+        ),
+    ],
+)
+def test_a_reply_that_an_open_request_could_have_caused_is_no_value(
+    tmp_path: Path, pieces: list[tuple[float, bytes]], values: list[float]
+) -> None:
+    assert [sample.value for sample in overheard_of(tmp_path, *pieces)] == values
+
+
+def test_a_request_is_open_while_its_reply_may_have_come_before_it_was_read(tmp_path: Path) -> None:
+    late = MAX_REPLY_DELAY + 0.06
+    pieces = [(0.0, asked(3)), (late, asked(2)), (late + 0.01, REPLY)]
+    assert [sample.value for sample in overheard_of(tmp_path, *pieces, earlier=0.0)] == [0.5]
+    assert overheard_of(tmp_path, *pieces, earlier=0.05 + late - MAX_REPLY_DELAY) == []
+
+
+def test_what_is_overheard_is_never_good_and_as_old_as_its_first_byte_may_be(tmp_path: Path) -> None:
+    before = time.monotonic()
+    (sample,) = overheard_of(tmp_path, (5.0, asked(2)), (5.02, REPLY), earlier=3.0)
+    assert sample.quality is Quality.OVERHEARD
+    assert not sample.quality.is_current
+    assert before - 3.1 < sample.finished <= time.monotonic() - 3.0
+    assert sample.age(time.monotonic()) >= 3.0
+
+
+@pytest.mark.slow
+def test_a_listener_that_stood_still_tells_no_old_value_as_new(tmp_path: Path) -> None:
+    with create_server(("127.0.0.1", 0)) as server:
+        path = written(tmp_path, server.getsockname()[1])
+        with started("monitor", str(path), "--json") as process:
+            line, _ = server.accept()
+            with line:
+                assert process.stdout is not None
+                line.sendall(REQUEST + REPLY)
+                json.loads(process.stdout.readline())
+                process.send_signal(signal.SIGSTOP)
+                line.sendall(REQUEST + REPLY)
+                said = time.time()
+                time.sleep(1.0)  # how old the bytes become
+                process.send_signal(signal.SIGCONT)
+                json.loads(process.stdout.readline())
+                process.send_signal(signal.SIGINT)
+                process.communicate()
+    moments = rows(tmp_path / "line.sqlite", "select time, quality from samples order by rowid")
+    assert moments[-1][0] < said + 0.5
+    assert {quality for _, quality in moments} == {"overheard"}

@@ -1,0 +1,154 @@
+"""`busmaster points`: a table for people, CSV out and in, as commands and as processes."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.app.cli.conftest import ENVIRONMENT, Command
+from tests.patience import PATIENCE
+
+LINE = """\
+port = "/dev/ttyUSB0"
+
+[nodes.w]                       # the winder
+protocol = "hcp2"
+address = 5
+
+[nodes.w.points]
+position = { item = "axis0.position", unit = "°C", factor = 0.001 }
+status = { item = "11", bits = { READY = 0, FAULT = 3 } }   # of the program
+
+[nodes.d6-7]
+protocol = "microflex"
+address = "6-7"
+template = "microflex"
+"""
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "line.toml"
+    path.write_text(LINE)
+    return path
+
+
+def process(*arguments: str | Path, given: bytes = b"", encoding: str = "") -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(
+        [sys.executable, "-m", "busmaster", "points", *map(str, arguments)],
+        input=given,
+        capture_output=True,
+        env=ENVIRONMENT | ({"PYTHONIOENCODING": encoding} if encoding else {}),
+        timeout=PATIENCE,
+        check=False,
+    )
+
+
+def test_people_see_a_table_with_the_columns_in_which_something_is_said(busmaster: Command, path: Path) -> None:
+    shown = busmaster("points", str(path))
+    assert (shown.status, shown.err) == (0, "")
+    assert shown.lines[0].split() == ["NODE", "POINT", "ITEM", "UNIT", "FACTOR", "BITS", "ALARM_IF_SET", "ORIGIN"]
+    assert shown.lines[1].split() == ["w", "position", "axis0.position", "°C", "0.001"]
+    temperature = next(line for line in shown.lines if "temperature" in line)
+    assert temperature.split() == ["d6-7", "temperature", "temperature", "°C", "microflex"]
+    assert len({line.index("temperature") for line in shown.lines[1:] if "temperature" in line}) == 1
+
+
+@pytest.mark.slow
+def test_a_terminal_narrower_than_the_table_shows_the_points_one_below_the_other(path: Path) -> None:
+    shown, terminal = pty.openpty()
+    with os.fdopen(shown, "rb", buffering=0) as reader:
+        environment = ENVIRONMENT | {"COLUMNS": "50"}
+        arguments = [sys.executable, "-m", "busmaster", "points", str(path)]
+        subprocess.run(arguments, stdout=terminal, env=environment, timeout=PATIENCE, check=True)
+        lines = reader.read(65536).decode().splitlines()
+        os.close(terminal)
+    assert lines[:3] == ["w/position (axis0.position)", "    unit °C, factor 0.001", "w/status (11)"]
+    assert max(map(len, lines)) <= 50
+
+
+def test_a_file_without_points_says_so(busmaster: Command, path: Path) -> None:
+    path.write_text('port = "/dev/ttyUSB0"\n[nodes.w]\nprotocol = "hcp2"\naddress = 5\n')
+    assert busmaster("points", str(path)).lines == ["no points: describe them in [nodes.NAME.points]"]
+
+
+@pytest.mark.slow
+def test_out_and_in_again_the_file_is_not_even_written(path: Path) -> None:
+    before = path.stat()
+    out = process(path, "--csv", encoding="ascii")
+    assert (out.returncode, out.stderr) == (0, b"")
+    assert "°C".encode() in out.stdout
+    back = process(path, "--from", "-", given=out.stdout)
+    assert (back.returncode, back.stdout) == (0, b"")
+    assert back.stderr.decode() == f"busmaster: {path}: no points changed: it is as it was\n"
+    after = path.stat()
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
+@pytest.mark.slow
+def test_points_go_from_one_file_to_another_and_come_out_the_same(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_bytes(process(path, "--csv").stdout)
+    other = tmp_path / "other.toml"
+    head, _, rest = LINE.partition("[nodes.w.points]")
+    other.write_text(f"{head}[nodes.d6-7]{rest.partition('[nodes.d6-7]')[2]}")
+    back = process(other, "--from", tmp_path / "points.csv")
+    assert back.returncode == 0, back.stderr
+    assert [line.partition(" is new")[0] for line in back.stdout.decode().splitlines()] == ["w/position", "w/status"]
+    assert process(other, "--csv").stdout == (tmp_path / "points.csv").read_bytes()
+    assert "# the winder" in other.read_text()
+
+
+def test_what_changes_is_shown_and_what_the_csv_has_not_stays(busmaster: Command, path: Path, tmp_path: Path) -> None:
+    table = tmp_path / "points.csv"
+    table.write_text(
+        "\ufeffnode;point;item;factor;maximum\r\nw;position;axis0.position;0.01;\r\nd6-7;speed_reference;;;80\r\n"
+    )
+    shown = busmaster("points", str(path), "--from", str(table))
+    assert shown.status == 0
+    assert shown.lines == ["w/position: factor 0.001 -> 0.01", "d6-7/speed_reference: maximum none -> 80"]
+    assert shown.err.startswith(
+        f"busmaster: {path}: 2 points changed\nbusmaster: not in the CSV, and so as before: w/status, "
+    )
+    assert path.read_text() == (
+        LINE.replace("0.001", "0.01").replace(
+            'template = "microflex"\n',
+            'template = "microflex"\n\n[nodes.d6-7.points]\nspeed_reference = { maximum = 80 }\n',
+        )
+    )
+
+
+def test_a_bad_row_writes_nothing_and_each_is_told(busmaster: Command, path: Path, tmp_path: Path) -> None:
+    table = tmp_path / "points.csv"
+    table.write_text('node,point,item,maximum\nw,good,20,1\nw,bad,nothing,1\nw,worse,21,"1,5"\n')
+    shown = busmaster("points", str(path), "--from", str(table))
+    assert (shown.status, shown.out) == (2, "")
+    told = shown.err.splitlines()
+    assert len(told) == 2
+    assert told[0].startswith(f"busmaster: {table}: row 3, column item: no such ")
+    assert told[1] == f"busmaster: {table}: row 4, column maximum: it has a decimal comma: write 1.5, not 1,5"
+    assert path.read_text() == LINE
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--csv", "--from", "-"), "--csv and --from exclude each other"),
+        (("--from", "none.csv"), "'none.csv' does not exist"),
+    ],
+)
+def test_wrong_usage_is_told(busmaster: Command, path: Path, arguments: tuple[str, ...], told: str) -> None:
+    shown = busmaster("points", str(path), *arguments)
+    assert (shown.status, shown.out) == (2, "")
+    assert told in shown.err
+    assert path.read_text() == LINE
+
+
+def test_an_escape_sequence_in_a_name_does_not_reach_a_terminal(busmaster: Command, path: Path) -> None:
+    path.write_text(LINE.replace('unit = "°C"', 'unit = "\\u001b[31m"'))
+    assert "\x1b" not in busmaster("points", str(path)).out
+    assert b"\x1b[31m" in process(path, "--csv").stdout

@@ -1,0 +1,56 @@
+"""The bar: on a terminal at standard error, and nowhere else."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+from contextlib import suppress
+
+import pytest
+
+from busmaster.emulator.serve import TcpServer
+from tests.app.cli.conftest import ENVIRONMENT, ROOT
+from tests.patience import PATIENCE
+
+SCAN = ("scan", "--protocol", "hcp2", "--nodes", "6-9", "--timeout", "300")
+
+
+def scan_on_a_terminal(port: str, *, results_too: bool) -> tuple[bytes, bytes]:
+    """Standard output, and what the terminal got: standard error, or both."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "busmaster", *SCAN, port],
+        cwd=ROOT,
+        env=ENVIRONMENT | {"TERM": "xterm-256color", "COLUMNS": "80"},
+        stdin=subprocess.DEVNULL,
+        stdout=slave if results_too else subprocess.PIPE,
+        stderr=slave,
+    )
+    os.close(slave)
+    drawn = b""
+    with suppress(OSError):  # EIO: the last who had it open is gone
+        while data := os.read(master, 65536):
+            drawn += data
+    os.close(master)
+    out, _ = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+    return out or b"", drawn
+
+
+@pytest.mark.slow
+def test_the_bar_is_drawn_on_the_terminal_and_standard_output_has_the_results_alone(controllers: TcpServer) -> None:
+    out, drawn = scan_on_a_terminal(controllers.path, results_too=False)
+    assert out == b"6 read element 1: 0\n7 read element 1: 0\n8 read element 1: 0\n"
+    assert b"scanning" in drawn
+    assert b"4/4" in drawn
+    assert b"element" not in drawn
+
+
+@pytest.mark.slow
+def test_a_result_on_the_same_terminal_has_a_line_of_its_own(controllers: TcpServer) -> None:
+    _, drawn = scan_on_a_terminal(controllers.path, results_too=True)
+    for node in b"678":
+        assert b"\x1b[2K" + bytes([node]) + b" read element 1: 0\r\n" in drawn
+    assert drawn.endswith(b"\x1b[2K")

@@ -1,0 +1,197 @@
+"""`[service]` in LINE.toml: who may come, who may do what, and what is refused as it is read."""
+
+from __future__ import annotations
+
+import asyncio
+import grp
+import pwd
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster.app.config import FileError, LineFile
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.service.permission import Permission, digest_of
+from busmaster.app.service.rights import Role
+from busmaster.errors import InvalidCommand
+
+USER, GROUP = pwd.getpwuid(0).pw_name, grp.getgrgid(0).gr_name
+TEXT = """
+port = "/dev/ttyUSB0?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 5
+points.force = { item = "10", unit = "N" }
+points.force_fine = { item = "10", unit = "mN", factor = 1000 }
+[nodes."drive1-3"]
+protocol = "hcp2"
+address = "11-13"
+points.speed = { item = "20" }
+points.weight = { item = "21", writable = false }
+[nodes.press]
+protocol = "hcp"
+address = 1
+"""
+HMI = "hmi   a-token-of-the-hmi-0001\n"
+
+
+def parse(text: str) -> LineFile:
+    return read(Source("line.toml", text))
+
+
+def role(said: str, text: str = TEXT) -> Permission:
+    """What this user may do, of whom the file says so much."""
+    file = parse(f'{text}[service.users.{USER}]\nrole = "write"\n{said}\n')
+    return ConfiguredLine(file, outputs=False).authorisation.access.users[0]
+
+
+def only(*names: str) -> Any:
+    return role(f"allow_writes = {list(names)!r}").only
+
+
+def test_a_role_is_of_a_user_a_group_or_a_token(tmp_path: Path) -> None:
+    (tmp_path / "tokens").write_text(HMI)
+    (tmp_path / "tokens").chmod(0o600)
+    file = parse(f"""{TEXT}[service]
+group = "{GROUP}"
+listen = "0.0.0.0:7420"
+token_file = "{tmp_path}/tokens"
+users.{USER}.role = "read"
+groups.{GROUP}.role = "write"
+tokens.hmi = {{ role = "write", allow_writes = "winder/force" }}
+""")
+    access = ConfiguredLine(file, outputs=False).authorisation.access
+    assert access.users == {0: Permission(f"user {USER}", Role.READ)}
+    assert access.groups == {0: Permission(f"group {GROUP}", Role.WRITE)}
+    assert access.tokens == {"hmi": Permission("token hmi", Role.WRITE, {("hcp2", 5): frozenset({10})})}
+    assert access.secrets == {}  # until the line is served
+    assert file.service.listen == ("0.0.0.0", 7420)
+    assert file.service.secrets() == {"hmi": digest_of("a-token-of-the-hmi-0001")}
+
+
+def test_what_may_be_written_is_a_quantity_whatever_names_it() -> None:
+    assert only("winder/force") == only("winder/force_fine") == only("winder/10") == {("hcp2", 5): frozenset({10})}
+
+
+def test_points_are_named_as_in_a_group_or_by_a_pattern_of_nodes() -> None:
+    speeds = {("hcp2", number): frozenset({20}) for number in (11, 12, 13)}
+    assert only("drive1-3/speed") == only("drive*/speed") == speeds
+    assert only("drive1/speed,22", "drive1/23") == {("hcp2", 11): frozenset({20, 22, 23})}
+    assert only("drive1/speed", "drive1/*", "drive1/22") == {("hcp2", 11): None}
+    assert set(only("*/*")) == {("hcp2", 5), *speeds, ("hcp", 1)}
+    assert role("").only is None
+
+
+@pytest.mark.parametrize(
+    ("said", "complaint"),
+    [
+        ('allow_writes = "winder/nothing"', r"users\.\w+\.allow_writes\[1\]: no such item 'nothing'"),
+        ('allow_writes = ["winder/force", "drive*/weight"]', r"allow_writes\[2\]: drive1/weight is read-only"),
+        ('allow_writes = "reel*/speed"', "no node is called like 'reel*'; there are winder, drive1"),
+        ('allow_writes = "*"', r"a point is written NODE/ITEM, not '\*'"),
+        ("allow_writes = []", "leave it out for all of the line"),
+        ('allow_reads = "winder/force"', "no such key; did you mean 'allow_writes'"),
+    ],
+)
+def test_what_is_no_point_that_could_be_written_is_refused_with_its_place(said: str, complaint: str) -> None:
+    with pytest.raises(FileError, match=complaint.replace("reel*", r"reel\*")) as refused:
+        role(said)
+    assert str(refused.value).startswith("line.toml:")
+
+
+@pytest.mark.parametrize(
+    ("said", "complaint"),
+    [
+        ('listen = "0.0.0.0:7420"', "service.listen: 0.0.0.0 is open to the network: give each program a token"),
+        ('listen = "plc"', "service.listen: a TCP address is written HOST:PORT"),
+        ('token_file = "tokens"', "service.token_file: tokens are for TCP: say where"),
+        ('tokens.hmi.role = "read"', "service.tokens.hmi: a token is written in a file of its own"),
+        ('users.nobody-at-all.role = "read"', "there is no user 'nobody-at-all' on this machine"),
+        ('groups.nobody-at-all.role = "read"', "there is no group 'nobody-at-all' on this machine"),
+        (f'groups.{GROUP}.role = "read"', "no group comes to a socket of mode 0600: say whose it is, as group = "),
+        (f'users.{USER}.role = "owner"', "no such role 'owner'; there are read, write, admin"),
+        (f"users.{USER} = {{}}", "'role' is missing"),
+        (
+            f'users.{USER} = {{ role = "read", allow_writes = "winder/force" }}',
+            'names what a role = "write" or',
+        ),
+    ],
+)
+def test_what_is_wrong_in_the_section_is_refused_with_its_place(said: str, complaint: str) -> None:
+    with pytest.raises(FileError, match=complaint):
+        parse(f"{TEXT}[service]\n{said}\n")
+
+
+def tokens(folder: Path, text: str, mode: int = 0o600, roles: str = "") -> dict[str, bytes]:
+    path = folder / "tokens"
+    path.write_text(text)
+    path.chmod(mode)
+    said = f'listen = "127.0.0.1:7420"\ntoken_file = "{path}"\n{roles}'
+    return parse(f"{TEXT}[service]\n{said}\n").service.secrets()
+
+
+def test_a_file_of_tokens_has_a_name_and_a_token_a_line(tmp_path: Path) -> None:
+    found = tokens(tmp_path, f"# of the plant\n\n{HMI}logger\tanother-token-0002\n")
+    assert found == {"hmi": digest_of("a-token-of-the-hmi-0001"), "logger": digest_of("another-token-0002")}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("hmi secret\n", "tokens:1: the token of hmi has less than 16 characters: make one with openssl rand -hex 32"),
+        (f"{HMI}hmi another-token-0002\n", "tokens:2: there are two tokens 'hmi'"),
+        ("a-token-of-the-hmi-0001\n", "tokens:1: a line is a name and its token"),
+        ("hmi = a-token-of-the-hmi-0001\n", "tokens:1: a line is a name and its token"),
+        ("# none yet\n", "there are no tokens in"),
+    ],
+)
+def test_a_file_that_is_no_list_of_tokens_is_refused_and_no_token_told(
+    tmp_path: Path, text: str, complaint: str
+) -> None:
+    with pytest.raises(FileError, match=complaint) as refused:
+        tokens(tmp_path, text)
+    assert str(refused.value).startswith("line.toml:")
+    assert "a-token" not in str(refused.value)
+    assert "another" not in str(refused.value)
+
+
+@pytest.mark.parametrize("mode", [0o604, 0o644, 0o660, 0o602])
+def test_tokens_that_others_may_read_or_change_are_refused(tmp_path: Path, mode: int) -> None:
+    with pytest.raises(FileError, match=r"service\.token_file: others may read .*, or change it: chmod 600"):
+        tokens(tmp_path, HMI, mode)
+    assert tokens(tmp_path, HMI, 0o640)
+
+
+def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"service\.tokens\.hmy: there is no token 'hmy' in "):
+        tokens(tmp_path, HMI, roles='tokens.hmy.role = "write"')
+    with pytest.raises(FileError, match=r"service\.tokens\.logger: there is no token 'logger' in "):
+        tokens(tmp_path, HMI, roles='tokens.hmi.role = "write"\ntokens.logger.role = "read"')
+    with pytest.raises(FileError, match="cannot be read: No such file"):
+        parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/none"\n').service.secrets()
+    with pytest.raises(FileError, match="it is a FIFO, a socket or a device"):
+        parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "/dev/null"\n').service.secrets()
+
+
+def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> None:
+    line = ConfiguredLine(parse(f'{TEXT}[service.users.{USER}]\nrole = "read"\n'), outputs=False)
+
+    async def run() -> None:
+        with pytest.raises(InvalidCommand, match=r"another \[service\] needs a restart"):
+            await line.take(parse(f'{TEXT}[service]\nlisten = "127.0.0.1:7420"\n'))
+        line.authorisation.take_secrets({"hmi": b"kept"})
+        line.authorisation.on_access.append(lambda: told.append(line.authorisation.access.users[0].writes))
+        await line.take(parse(f'{TEXT}[service.users.{USER}]\nrole = "write"\n'))
+
+    told: list[bool] = []
+    asyncio.run(run())
+    assert told == [True]
+    assert line.authorisation.access.secrets == {"hmi": b"kept"}
+
+
+def test_the_share_of_line_time_that_each_program_has() -> None:
+    assert parse(TEXT).service.share == 1.0
+    assert parse(f"{TEXT}[service]\nshare = 0.5\n").service.share == 0.5

@@ -1,0 +1,275 @@
+"""What can be said of a port without opening it, on made-up /proc and /sys trees and on real ptys."""
+
+from __future__ import annotations
+
+import fcntl
+import grp
+import os
+import stat
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster.app.diagnostics.adapters import Finding, inspect, latency_timer, low_latency, made_rate, rs485_mode
+from busmaster.app.diagnostics.examination import driver, rate
+from busmaster.transport import identity
+from busmaster.transport.holders import Holder, holders, how_to_open, lock_owner, owning_group
+from tests.transport.fakes import PtyMaster, plugged
+from tests.transport.usb import UsbTree
+
+
+@pytest.fixture
+def pty_master() -> Iterator[PtyMaster]:
+    with plugged() as end:
+        yield end
+
+
+@pytest.fixture
+def sysfs(tmp_path: Path, pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A /sys in which the pty is an FTDI adapter with its timer at 16 ms."""
+    device = tmp_path / "sys/class/tty" / os.path.basename(pty_master.path) / "device"
+    device.mkdir(parents=True)
+    (device / "latency_timer").write_text("16\n")
+    (tmp_path / "drivers/ftdi_sio").mkdir(parents=True)
+    (device / "driver").symlink_to(tmp_path / "drivers/ftdi_sio")
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    return tmp_path / "sys"
+
+
+@pytest.fixture
+def process(pty_master: PtyMaster) -> Iterator[int]:
+    """The id of another process that has the port open and locked."""
+    hold = f"import fcntl; f = open({pty_master.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-ISc", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        yield other.pid
+        other.communicate(b"\n")
+
+
+def topics(found: tuple[Finding, ...]) -> dict[str, bool]:
+    return {finding.topic: finding.ok for finding in found}
+
+
+def test_a_port_in_order_has_nothing_against_it(pty_master: PtyMaster) -> None:
+    assert topics(inspect(pty_master.path)) == {"port": True, "permission": True, "holders": True}
+
+
+def test_every_fault_comes_with_what_to_do(tmp_path: Path, pty_master: PtyMaster, sysfs: Path, process: int) -> None:
+    found = inspect(pty_master.path)
+    assert topics(found) == {"port": True, "permission": True, "holders": False, "driver": True, "latency": False}
+    assert all(finding.advice for finding in found if not finding.ok)
+    text = "\n".join(finding.what for finding in found)
+    assert f"(process {process})" in text
+    assert "ftdi_sio" in text
+    assert "up to 16 ms" in text
+
+
+def test_a_quick_adapter_is_in_order(pty_master: PtyMaster, sysfs: Path) -> None:
+    timer = sysfs / "class/tty" / os.path.basename(pty_master.path) / "device/latency_timer"
+    timer.write_text("1\n")
+    assert latency_timer(pty_master.path) == 1
+    assert topics(inspect(pty_master.path))["latency"]
+    timer.unlink()
+    assert latency_timer(pty_master.path) is None
+
+
+def test_an_adapter_that_is_named_by_a_link_is_examined_as_what_it_points_to(tmp_path: Path, sysfs: Path) -> None:
+    """As one is of /dev/serial/by-id."""
+    [entry] = os.listdir(sysfs / "class/tty")
+    link = tmp_path / "usb-FTDI_A5069RR4-if00-port0"
+    link.symlink_to(f"/dev/pts/{entry}")
+    found = inspect(str(link))
+    assert not topics(found)["latency"]
+    assert "ftdi_sio" in "\n".join(finding.what for finding in found)
+    assert latency_timer(str(link)) == 16
+
+
+def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("/dev/pts/99999")
+    (tmp_path / "null").symlink_to("/dev/null")
+    for name, says in (
+        ("file", "is no device"),
+        ("link", "which is gone"),
+        ("none", "does not exist"),
+        ("null", "is no serial port"),
+    ):
+        (finding,) = inspect(str(tmp_path / name))
+        assert not finding.ok
+        assert says in finding.what
+
+
+def test_a_port_that_may_not_be_opened_names_its_group(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    permission = inspect(pty_master.path)[1]
+    assert not permission.ok
+    assert f"it belongs to the group {owning_group(pty_master.path)}" in permission.what
+    assert permission.advice == how_to_open(pty_master.path)
+
+
+@pytest.mark.parametrize(
+    ("group", "mode", "joins"), [(20, 0o660, True), (20, 0o640, False), (20, 0o600, False), (0, 0o660, False)]
+)
+def test_only_a_group_that_opens_the_port_and_is_not_roots_is_to_be_joined(
+    group: int, mode: int, joins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = os.stat_result((stat.S_IFCHR | mode, 0, 0, 1, 0, group, 0, 0, 0, 0))
+    monkeypatch.setattr(os, "stat", lambda *_: said)
+    advice = how_to_open("/dev/ttyS0")
+    assert ("sudo usermod -aG" in advice) is joins
+    assert ('MODE="0660"' in advice) is not joins
+
+
+def test_a_group_without_a_name_goes_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nameless(gid: int) -> None:
+        raise KeyError(gid)
+
+    status = os.stat_result((stat.S_IFCHR | 0o660, 0, 0, 1, 4711, 4712, 0, 0, 0, 0))  # owner 4711, group 4712
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", lambda *_: status)
+        patch.setattr(grp, "getgrgid", nameless)
+        group = owning_group("/dev/ttyS0")
+    assert group == "4712"
+
+
+def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path, pty_master: PtyMaster) -> None:
+    link = tmp_path / "port"
+    link.symlink_to(pty_master.path)
+    assert holders(str(link)) == ()
+    assert lock_owner(str(link)) is None
+    with open(pty_master.path, "rb", buffering=0) as port:
+        fcntl.flock(port, fcntl.LOCK_EX)
+        (holder,) = holders(str(link))
+        assert str(holder) == "this program"
+        assert lock_owner(str(link)) == holder
+
+
+def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(pty_master: PtyMaster) -> None:
+    """An emulator has the port open too, so that clients may come and go."""
+    with open(pty_master.path, "rb", buffering=0):
+        assert holders(pty_master.path)
+        assert topics(inspect(pty_master.path))["holders"]
+
+
+def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, pty_master: PtyMaster) -> None:
+    inode = os.stat(pty_master.path)
+    place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
+    in_another_container = (0, -1)
+    for pid, owner in ((4711, Holder(4711, "another program")), *((number, None) for number in in_another_container)):
+        (tmp_path / "locks").write_text(
+            f"1: POSIX ADVISORY WRITE 1 00:01:2 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
+        )
+        assert lock_owner(pty_master.path, proc=tmp_path) == owner
+    assert str(Holder(4711, "another program")) == "another program (process 4711)"
+
+
+def test_a_system_without_these_trees_knows_nothing(tmp_path: Path, pty_master: PtyMaster) -> None:
+    assert lock_owner(pty_master.path, proc=tmp_path / "proc") is None
+    assert lock_owner(str(tmp_path / "gone")) is None
+    assert holders(pty_master.path, proc=tmp_path / "proc") == ()
+
+
+def test_a_pty_has_no_rs485_mode_and_a_driver_tells_its_own(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert rs485_mode(pty_master.fd) is None
+    for flags in (0, 1, 2 | 4):
+        monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flags=flags: settings.__setitem__(0, flags))
+        assert rs485_mode(pty_master.fd) is bool(flags & 1)
+
+
+def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert low_latency(pty_master.fd) is None
+    for flag in (0, 1 << 13):
+        monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flag=flag: settings.__setitem__(4, flag))
+        assert low_latency(pty_master.fd) is bool(flag)
+
+
+def test_the_low_latency_flag_is_told_with_how_to_set_it(
+    monkeypatch: pytest.MonkeyPatch, pty_master: PtyMaster
+) -> None:
+    def told(flags: int | None, wanted: bool | None = None) -> tuple[str, str]:
+        def ioctl(_descriptor: int, request: int, settings: Any) -> int:
+            if flags is None or request != termios.TIOCGSERIAL:
+                raise OSError("no such flag")
+            settings[4] = flags
+            return 0
+
+        monkeypatch.setattr(fcntl, "ioctl", ioctl)
+        [finding] = [finding for finding in driver(pty_master.fd, wanted) if finding.topic == "driver"]
+        assert finding.ok
+        return finding.what, finding.advice
+
+    assert told(1 << 13) == ("its low-latency flag is set", "")
+    assert told(0) == ("its low-latency flag is not set", "?low_latency=1 may bring replies sooner")
+    assert told(None) == ("it has no low-latency flag", "")
+    assert told(1 << 13, wanted=True) == ("its low-latency flag is set", "")
+    assert told(0, wanted=True) == ("its low-latency flag is not set, though low_latency=1 asked for it", "")
+    assert told(0, wanted=False) == ("its low-latency flag is not set", "")
+
+
+def test_a_rate_that_a_uart_cannot_make_is_told_where_its_driver_tells_what_it_divides(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert made_rate(pty_master.fd, 57600) is None
+    assert list(rate(pty_master.fd, 57600)) == []
+    monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings: settings.__setitem__(7, 115200))
+    assert list(rate(pty_master.fd, 38400)) == []
+    [finding] = rate(pty_master.fd, 76800)
+    assert not finding.ok
+    assert finding.what == "its UART makes 57600 baud of 76800, -25.0%"
+
+
+def test_who_is_not_root_is_told_that_other_users_programs_cannot_be_seen(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    [finding] = [one for one in inspect(pty_master.path) if one.topic == "holders"]
+    assert finding.ok
+    assert finding.what == "no other program of yours has it open"
+    assert "root" in finding.advice
+
+
+# -- a name that lasts -----------------------------------------------------------------------------------------------
+
+
+def name_of(port: str) -> Finding:
+    (finding,) = [finding for finding in inspect(port) if finding.topic == "name"]
+    assert finding.ok
+    return finding
+
+
+def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, pty_master: PtyMaster) -> None:
+    usb.plug(pty_master.path, "A500ABC")
+    finding = name_of(pty_master.path)
+    assert finding.what == f"{pty_master.path} is FTDI A500ABC"
+    assert finding.advice == f"name it usb:A500ABC: {pty_master.path} goes to whichever adapter is found first"
+    finding = name_of("usb:A500ABC")
+    assert finding.what == f"{pty_master.path} is FTDI A500ABC, which usb:A500ABC finds again"
+    assert not finding.advice
+
+
+def test_an_adapter_without_a_serial_number_goes_by_its_place(
+    usb: UsbTree, pty_master: PtyMaster, tmp_path: Path
+) -> None:
+    usb.plug(pty_master.path, place="1-1.2")
+    assert name_of(pty_master.path).advice == "it has no serial number: leave it in this USB port"
+    link = tmp_path / "links/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(pty_master.path)
+    assert name_of(pty_master.path).advice.startswith(f"name it {link}: ")
+    assert not name_of(str(link)).advice
+
+
+def test_a_serial_number_that_is_not_there_is_all_that_is_said(usb: UsbTree) -> None:
+    (finding,) = inspect("usb:A500ABC")
+    assert not finding.ok
+    assert finding.what == "usb:A500ABC is not plugged in: no USB serial port was found"

@@ -1,0 +1,53 @@
+"""A probe of `doctor` and `discover`, as a capture of it has it."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from busmaster.app.diagnostics.probing import Outcome, Prober, opened
+from busmaster.arbiter.tap import Attempt, Tap, Verdict
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.registry import find, make_device
+from busmaster.testing.virtual_time import run_in_virtual_time
+
+SETTINGS = LineSettings(57600)
+
+
+class Attempts(Tap):
+    """Keeps the attempts."""
+
+    def __init__(self) -> None:
+        self.ended: list[Attempt] = []
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        pass
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        pass
+
+    def attempted(self, attempt: Attempt, /) -> None:
+        self.ended.append(attempt)
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "outcome", "verdict"),
+    [(0.0, Outcome.ANSWERED, Verdict.OK), (1.0, Outcome.GARBLED, Verdict.SPOILT)],
+)
+def test_an_echo_that_differs_is_recorded_as_a_spoilt_exchange(
+    corrupt: float, outcome: Outcome, verdict: Verdict
+) -> None:
+    """SPOILT: what came was not read. A damaged reply, which was read, is GARBLED."""
+    profile, tap = find("hcp2").profile, Attempts()
+    line = Line(SETTINGS, [make_device("hcp2", 3)], chance=random.Random(1), echo=Echo(corrupt=corrupt))
+
+    async def ask() -> Outcome:
+        async with opened(MemoryPort(line), tap) as wire:
+            prober = Prober(wire, profile, profile.timings, SETTINGS.byte_time, echo=True)
+            return (await prober.ask(3)).outcome
+
+    assert run_in_virtual_time(ask()) is outcome
+    assert [attempt.verdict for attempt in tap.ended] == [verdict]

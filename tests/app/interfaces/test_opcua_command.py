@@ -1,0 +1,171 @@
+"""`busmaster opcua` as a process of its own: killed, with certificates and users, and what it refuses."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.x509.oid import NameOID
+from opcua import ua
+
+from busmaster.app.interfaces.opcua import read_trusted
+from busmaster.emulator.serve import TcpServer
+from tests.app.cli.conftest import Command, busmaster, owner, serve, started
+from tests.app.interfaces.opcua_client import other_client
+from tests.patience import PATIENCE
+
+__all__ = ["busmaster"]
+TOKEN = "0123456789abcdef0123456789abcdef"
+TEXT = """
+title = "Slitter"
+port = "PORT?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 1
+points.force = { item = "10", unit = "N", factor = 0.1, minimum = -50, maximum = 50 }
+[groups.fast]
+period = 0.05
+points = ["winder/force"]
+"""
+
+
+@pytest.fixture
+def controllers() -> Iterator[TcpServer]:
+    with serve("hcp2", 1) as server:
+        yield server
+
+
+@pytest.fixture
+def file(tmp_path: Path, controllers: TcpServer) -> Path:
+    path = tmp_path / "slitter.toml"
+    path.write_text(TEXT.replace("PORT", controllers.path))
+    return path
+
+
+@contextmanager
+def interface(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """An interface that follows its line, and where clients find it."""
+    with started("opcua", *arguments, "--bind", "127.0.0.1:0") as process:
+        assert process.stderr is not None
+        try:
+            said = ""
+            while "is followed" not in said or not (found := re.search(r"opc\.tcp://\S+", said)):
+                line = process.stderr.readline()
+                assert line, said
+                said += line
+            yield process, found[0]
+        finally:
+            process.kill()
+            process.communicate(timeout=PATIENCE)
+
+
+def certificate(folder: Path, name: str) -> tuple[str, str]:
+    """A certificate that has signed itself, and its key: the paths of both."""
+    key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
+    who = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    now = datetime.datetime.now(datetime.UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(who)
+        .issuer_name(who)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.UniformResourceIdentifier(f"urn:{name}")]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    folder.mkdir(exist_ok=True)
+    paths = folder / f"{name}.der", folder.parent / f"{name}.pem"
+    paths[0].write_bytes(made.public_bytes(serialization.Encoding.DER))
+    form, open_ = serialization.PrivateFormat.TraditionalOpenSSL, serialization.NoEncryption()
+    paths[1].write_bytes(key.private_bytes(serialization.Encoding.PEM, form, open_))
+    return str(paths[0]), str(paths[1])
+
+
+@pytest.mark.slow
+def test_an_interface_that_is_killed_again_and_again_is_nothing_to_the_line(file: Path) -> None:
+    with owner("serve", str(file)) as (process, _):
+        for _ in range(5):  # more was tried by hand: an interface takes seconds to start
+            with interface("slitter") as (killed, _url):
+                killed.send_signal(signal.SIGKILL)
+        with interface("slitter", "--allow", "winder/*") as (ended, url):
+            with other_client(url) as client:
+                assert client.write("winder/force", 3.0) == "Good"
+                assert client.write("winder/force", 51.0) == "BadOutOfRange"
+                assert client.property("winder/force", "EURange").High == 50
+            ended.terminate()
+            assert ended.wait(PATIENCE) == 143
+        assert process.poll() is None
+
+
+@pytest.mark.slow
+def test_with_a_certificate_only_trusted_clients_come_and_users_with_a_token_write(file: Path, tmp_path: Path) -> None:
+    server_files, client_files = certificate(tmp_path / "own", "interface"), certificate(tmp_path / "trusted", "client")
+    other_files = certificate(tmp_path / "others", "other")
+    server_key = Path(server_files[1]).rename(tmp_path / "server.key")  # PEM, whatever its name
+    tokens = tmp_path / "tokens"
+    tokens.write_text(f"scada {TOKEN}\n")
+    tokens.chmod(0o600)
+    options = ["--certificate", server_files[0], "--key", str(server_key), "--trusted", str(tmp_path / "trusted")]
+    with (
+        owner("serve", str(file)),
+        interface("slitter", "--allow", "winder/force", "--token-file", str(tokens), *options) as (_, url),
+    ):
+
+        def secured(files: tuple[str, str], **more: Any) -> Any:
+            return other_client(url, set_security_string=(f"Basic256Sha256,SignAndEncrypt,{','.join(files)}",), **more)
+
+        with secured(client_files) as client:
+            while client.read("winder/force").status != "Good":
+                pass
+            assert client.write("winder/force", 3.0) == "BadUserAccessDenied"
+            assert client.user_access("winder/force") == 1  # CurrentRead
+        with secured(client_files, set_user=("scada",), set_password=(TOKEN,)) as client:
+            assert client.write("winder/force", 3.0) == "Good"
+            assert client.user_access("winder/force") == 3  # CurrentRead and CurrentWrite
+        for files, more in (
+            (client_files, {"set_user": ("scada",), "set_password": ("x" * 32,)}),
+            (other_files, {}),
+        ):
+            with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"), secured(files, **more):
+                pass
+        with pytest.raises(ua.UaError), other_client(url):  # nobody is let in who says things openly
+            pass
+
+
+def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:
+    folder = tmp_path / "trusted"
+    for name in ("first", "second"):
+        certificate(folder, name)
+    assert len(read_trusted(str(folder))) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--read-only", "--allow", "*"), "--read-only says that nothing may"),
+        (("--bind", "0.0.0.0:0", "--allow", "*"), "needs --token-file"),
+        (("--certificate", __file__), "belong together"),
+        (("--trusted", "."), "--trusted needs --certificate"),
+        (("--bind", "here"), "--bind: a TCP address is written HOST:PORT"),
+    ],
+)
+def test_what_would_open_more_than_is_meant_is_wrong_usage(
+    busmaster: Command,
+    arguments: tuple[str, ...],
+    complaint: str,
+) -> None:
+    ran = busmaster("opcua", "slitter", *arguments)
+    assert ran.status == 2
+    assert complaint in ran.err

@@ -1,0 +1,215 @@
+"""What OPC UA clients ask for and do not get: what is not supported, and what is beyond a bound."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+import struct
+from datetime import UTC, datetime
+from typing import Any
+
+import opcua
+import pytest
+from opcua import ua
+
+from busmaster import bounds
+from busmaster.app.interfaces import opcua_connections, opcua_sessions
+from tests.app.interfaces.opcua_client import OtherClient
+from tests.app.interfaces.test_opcua import Opened, opened
+from tests.app.service.lines import until
+from tests.patience import PATIENCE
+
+__all__ = ["opened"]
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+ABSOLUTE, PERCENT = ua.DeadbandType.Absolute, ua.DeadbandType.Percent
+
+
+def read(
+    client: OtherClient, name: str, attribute: Any = ua.AttributeIds.Value, *, age: float = 0, part: str = ""
+) -> Any:
+    wanted = ua.ReadValueId()
+    wanted.NodeId, wanted.AttributeId, wanted.IndexRange = client.node(name).nodeid, attribute, part
+    asked = ua.ReadParameters()
+    asked.MaxAge = age
+    asked.NodesToRead.append(wanted)
+    return client.client.uaclient.read(asked)[0]
+
+
+def monitor(client: OtherClient, names: list[str], kind: Any = None, deadband: float = 0.0) -> list[str]:
+    """Create items of a subscription of their own, and return their statuses."""
+    subscription = client.client.create_subscription(100, None)
+    asked = ua.CreateMonitoredItemsParameters()
+    asked.SubscriptionId = subscription.subscription_id
+    for name in names:
+        item = ua.MonitoredItemCreateRequest()
+        item.ItemToMonitor.NodeId, item.ItemToMonitor.AttributeId = client.node(name).nodeid, ua.AttributeIds.Value
+        item.MonitoringMode = ua.MonitoringMode.Reporting
+        item.RequestedParameters.QueueSize = 1
+        if kind is not None:
+            filter_ = ua.DataChangeFilter()
+            filter_.Trigger = ua.DataChangeTrigger.StatusValue
+            filter_.DeadbandType, filter_.DeadbandValue = kind, deadband
+            item.RequestedParameters.Filter = filter_
+        asked.ItemsToCreate.append(item)
+    try:
+        return [result.StatusCode.name for result in client.client.uaclient.create_monitored_items(asked)]
+    finally:
+        subscription.delete()
+
+
+@pytest.mark.slow
+async def test_a_read_that_is_not_supported_is_refused(opened: Opened) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        assert (
+            await asyncio.to_thread(read, opened.client, "5/10", part="0:1")
+        ).StatusCode.name == "BadIndexRangeInvalid"
+        for age in (-1.0, math.nan):
+            with pytest.raises(ua.UaStatusCodeError, match="BadMaxAgeInvalid"):
+                await asyncio.to_thread(read, opened.client, "5/10", age=age)
+        assert (await asyncio.to_thread(read, opened.client, "5/10", age=1000.0)).StatusCode.name == "Good"
+
+
+async def test_a_deadband_that_is_not_supported_is_refused(opened: Opened) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        for kind, deadband, name, status in (
+            (PERCENT, 10.0, "5/10", "BadMonitoredItemFilterUnsupported"),
+            (ABSOLUTE, -1.0, "5/10", "BadDeadbandFilterInvalid"),
+            (ABSOLUTE, math.nan, "5/10", "BadDeadbandFilterInvalid"),
+            (ABSOLUTE, math.inf, "5/10", "BadDeadbandFilterInvalid"),
+            (ABSOLUTE, 1.0, "Line Connected", "BadFilterNotAllowed"),
+            (ABSOLUTE, 1.0, "5/10", "Good"),
+            (None, 0.0, "5/10", "Good"),
+        ):
+            assert await asyncio.to_thread(monitor, opened.client, [name], kind, deadband) == [status], (kind, deadband)
+
+
+async def test_a_write_that_is_not_supported_is_refused_and_one_beyond_a_limit_is_out_of_range(opened: Opened) -> None:
+    async with opened.owned() as line:
+        group = line.poll("10")
+        group.points[0].limit(minimum=-5, maximum=250)
+        await opened.is_("5/10", "Good")
+        wanted = ua.WriteValue()
+        wanted.NodeId, wanted.AttributeId = opened.client.node("5/10").nodeid, ua.AttributeIds.Value
+        wanted.Value = ua.DataValue(ua.Variant(1.0, ua.VariantType.Double))
+        wanted.Value.SourceTimestamp = datetime(2026, 1, 1, tzinfo=UTC)
+        assert await asyncio.to_thread(opened.client.status_of, wanted) == "BadWriteNotSupported"
+        assert line.audit() == []
+        assert await opened.write("5/10", 251.0) == "BadOutOfRange"
+        assert await opened.write("5/10", -6.0) == "BadOutOfRange"
+        for value, kind in ((True, ua.VariantType.Boolean), ("7", ua.VariantType.String)):
+            assert await opened.write("5/10", value, kind) == "BadTypeMismatch"
+        assert await opened.write("5/10", 250.0) == "Good"
+
+
+async def test_the_server_says_whose_it_is(opened: Opened) -> None:
+    def info() -> list[str]:
+        node = opened.client.client.get_node
+        names = ("ProductUri", "ManufacturerName", "ProductName", "SoftwareVersion")
+        found = [node(getattr(ua.ObjectIds, f"Server_ServerStatus_BuildInfo_{name}")).get_value() for name in names]
+        server = opened.client.client.get_endpoints()[0].Server
+        return [*found, server.ApplicationUri, server.ProductUri, *node(ua.ObjectIds.Server_ServerArray).get_value()]
+
+    told = await asyncio.to_thread(info)
+    assert all("busmaster" in text for text in (*told[:3], *told[4:])), told
+    assert told[3][0].isdigit()
+
+
+async def test_a_waiting_write_does_not_keep_its_client_from_reading(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        go_on, arrived = asyncio.Event(), asyncio.Event()
+        write = opened.line.write
+
+        async def held(*what: Any) -> None:
+            arrived.set()
+            await go_on.wait()
+            await write(*what)
+
+        monkeypatch.setattr(opened.line, "write", held)
+        waiting = asyncio.create_task(opened.write("5/10", 12.0))
+        await arrived.wait()
+        assert (await asyncio.to_thread(opened.client.read, "5/10")).status == "Good"
+        assert not waiting.done()
+        go_on.set()
+        assert await waiting == "Good"
+
+
+async def test_monitored_items_beyond_the_bounds_are_refused(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        monkeypatch.setattr(opcua_sessions, "MOST_SESSION_ITEMS", 3)
+        assert await asyncio.to_thread(monitor, opened.client, ["5/10"] * 4) == [
+            *["Good"] * 3,
+            "BadTooManyMonitoredItems",
+        ]
+        monkeypatch.setattr(opcua_sessions, "MOST_ITEMS", 2)
+        assert (await asyncio.to_thread(monitor, opened.client, ["5/10"] * 3))[2] == "BadTooManyMonitoredItems"
+        monkeypatch.setattr(opcua_sessions, "MOST_OPERATIONS", 2)
+        with pytest.raises(ua.UaStatusCodeError, match="BadTooManyOperations"):
+            await asyncio.to_thread(monitor, opened.client, ["5/10"] * 3)
+
+
+def closes(address: tuple[str, int], sent: bytes) -> int:
+    """Send bytes, and return how many were taken before the server closed the connection."""
+    with socket.create_connection(address, timeout=PATIENCE) as connection:
+        taken = 0
+        try:
+            for begin in range(0, len(sent), 4096):
+                connection.sendall(sent[begin : begin + 4096])
+                taken += 4096
+            while connection.recv(4096):
+                pass
+        except ConnectionError:
+            pass
+        return taken
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        pytest.param(b"HELF" + struct.pack("<I", bounds.LONGEST_OPCUA_HELLO + 1), id="a long Hello"),
+        pytest.param(b"MSGF" + struct.pack("<I", 1 << 30) + bytes(100), id="a chunk of 1 GB"),
+        pytest.param(b"MSGC" + struct.pack("<III", 32, 0, 0) + bytes(16), id="a message before the channel"),
+        pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="another protocol"),
+    ],
+)
+async def test_a_message_that_is_too_long_or_out_of_order_ends_its_connection(opened: Opened, sent: bytes) -> None:
+    host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
+    await asyncio.to_thread(closes, (host, int(port)), sent)
+
+
+async def test_a_connection_without_a_session_is_closed(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opcua_connections, "SESSION_WITHIN", 0.1)
+    host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
+    await asyncio.to_thread(closes, (host, int(port)), b"")
+
+
+@pytest.mark.slow
+async def test_the_work_of_a_client_that_is_killed_ends_at_once(opened: Opened) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+
+        def vanish() -> None:
+            client = opcua.Client(opened.url, timeout=PATIENCE)
+            client.connect()
+            subscription = client.create_subscription(100, None)
+            subscription.subscribe_data_change([OtherClient(client).node("5/10")] * 2000)
+            client.keepalive.stop()
+            client.uaclient._uasocket._socket.socket.shutdown(socket.SHUT_RDWR)
+            client.uaclient._uasocket._thread.join(PATIENCE)
+            client.uaclient._uasocket._socket.socket.close()
+
+        service = opened.server.iserver.subscription_service
+        await asyncio.to_thread(vanish)
+        await until(lambda: not service.subscriptions)
+        assert (await opened.is_("5/10", "Good")).value == 0.0

@@ -1,0 +1,154 @@
+"""What OPC UA calls a value, a write, a unit and whoever comes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from asyncua import ua
+
+from busmaster.app.interfaces.opcua_access import Rules, Users
+from busmaster.app.interfaces.opcua_terms import (
+    CODES,
+    range_of,
+    status_of_sample,
+    status_of_write,
+    type_of,
+    unit_of,
+    variant_of,
+    widened,
+)
+from busmaster.app.service.permission import digest_of
+from busmaster.arbiter.transaction import Timeline
+from busmaster.bus.samples import Quality, Sample
+from busmaster.errors import (
+    BusClosed,
+    BusError,
+    GarbledReply,
+    InvalidCommand,
+    LineDown,
+    NodeDown,
+    NoReply,
+    NoSuchParameter,
+    NotStarted,
+    Refused,
+    VerifyFailed,
+    WriteUnconfirmed,
+)
+
+KINDS = ua.VariantType
+TOKEN = "0123456789abcdef"
+
+
+def sample(error: BusError | None, quality: Quality) -> Sample[Any]:
+    timeline = Timeline(*[0] * len(Timeline._fields))
+    return Sample(None if error else 1.0, error, 0.0, 0.0, 0.0, quality, timeline, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("error", "quality", "status"),
+    [
+        (None, Quality.GOOD, CODES.Good),
+        (None, Quality.LATE, CODES.Good),
+        (None, Quality.STALE, CODES.UncertainLastUsableValue),
+        (NoReply("x"), Quality.BAD, CODES.BadNoCommunication),
+        (NodeDown("x"), Quality.BAD, CODES.BadNoCommunication),
+        (LineDown("x"), Quality.BAD, CODES.BadNoCommunication),
+        (GarbledReply("x"), Quality.BAD, CODES.BadCommunicationError),
+        (Refused("x"), Quality.BAD, CODES.BadDeviceFailure),
+        (NoSuchParameter("x"), Quality.BAD, CODES.BadConfigurationError),
+        (BusError("x"), Quality.BAD, CODES.BadNoCommunication),
+    ],
+)
+def test_a_value_has_the_status_of_what_became_of_its_read(
+    error: BusError | None, quality: Quality, status: int
+) -> None:
+    assert status_of_sample(sample(error, quality)) == status
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (None, CODES.Good),
+        (InvalidCommand("x"), CODES.BadRequestNotAllowed),
+        (Refused("x"), CODES.BadRequestNotAllowed),
+        (NotStarted("x"), CODES.BadNoCommunication),
+        (NodeDown("x"), CODES.BadNoCommunication),
+        (LineDown("x"), CODES.BadNoCommunication),
+        (BusClosed("x"), CODES.BadNoCommunication),
+        (WriteUnconfirmed("x"), CODES.BadTimeout),
+        (VerifyFailed("x"), CODES.BadTimeout),
+        (NoReply("x", attempts=1), CODES.BadTimeout),
+    ],
+)
+def test_a_write_that_may_have_been_carried_out_is_a_timeout_and_no_other_is(
+    error: Exception | None, status: int
+) -> None:
+    assert status_of_write(error) == status
+
+
+def test_a_quantity_that_was_whole_by_chance_stays_a_double() -> None:
+    assert [type_of(value) for value in (True, 1, 1.5, "x", (1, 2.5))] == [
+        *(KINDS.Boolean, KINDS.Int64, KINDS.Double, KINDS.String, KINDS.Double),
+    ]
+    assert widened(None, 7) is KINDS.Int64
+    assert widened(KINDS.Int64, 7.5) is KINDS.Double
+    assert widened(KINDS.Double, 7) is KINDS.Double
+    assert widened(KINDS.Double, "x") is KINDS.String
+    assert variant_of(7, KINDS.Double).Value == 7.0
+    nothings: tuple[Any, ...] = (None, (), {}, (1, "x"))
+    for nothing in nothings:
+        with pytest.raises(TypeError):
+            type_of(nothing)
+
+
+def test_a_unit_has_its_number_where_there_is_one() -> None:
+    assert unit_of("mm").UnitId == 5066068  # MMT
+    assert unit_of("°C").UnitId == 4408652  # CEL
+    assert (unit_of("counts").UnitId, unit_of("counts").DisplayName.Text) == (-1, "counts")
+
+
+def test_the_range_of_a_point_is_what_may_be_written_else_its_limits_of_alarm() -> None:
+    def limits(low: Any, high: Any, **more: Any) -> Any:
+        found = range_of({"low": low, "high": high, "limits": [more] if more else []}, "force")
+        return found and (found.Low, found.High)
+
+    assert limits(1, 2) == (1, 2)
+    assert limits(1, 2, name="force", minimum=-5, maximum=5) == (-5, 5)
+    assert limits(1, 2, name="force", minimum=None, maximum=5) == (1, 2)
+    assert limits(1, 2, name="another", minimum=-5, maximum=5) == (1, 2)
+    assert limits(None, 2) is None
+
+
+def test_who_may_write_is_who_shows_a_token_where_there_are_tokens_or_others_may_come() -> None:
+    secrets = {"scada": digest_of(TOKEN), "other": digest_of(TOKEN[::-1])}
+    users = Users(Rules(secrets=secrets))
+    known, anonymous = users.get_user(None, "scada", TOKEN), users.get_user(None)
+    assert known is not None
+    assert anonymous is not None
+    assert users.get_user(None, "scada", "x") is None
+    assert users.get_user(None, "admin", TOKEN) is None
+    assert users.get_user(None, "other", TOKEN) is None
+    assert Rules(secrets=secrets).refusal(known) == ""
+    assert "anonymous" in Rules(secrets=secrets).refusal(anonymous)
+    assert Rules().refusal(anonymous) == ""
+    assert "without a token" in Rules(is_local=False).refusal(anonymous)
+    assert Rules(secrets=secrets, is_local=False).refusal(known) == ""
+
+
+def test_who_says_things_openly_or_is_not_trusted_is_not_let_in() -> None:
+    assert Users(Rules(is_signed=True)).get_user(None) is None
+    assert Users(Rules(is_signed=True)).get_user(None, certificate=b"own") is not None
+    with_tokens = Users(Rules(is_signed=True, secrets={"scada": digest_of(TOKEN)}))
+    assert with_tokens.get_user(None, "scada", TOKEN) is None
+    assert with_tokens.get_user(None, "scada", TOKEN, b"own") is not None
+    trusting = Users(Rules(is_signed=True, trusted=[b"own"]))
+    assert trusting.get_user(None, certificate=b"another") is None
+    assert trusting.get_user(None, certificate=b"own") is not None
+
+
+def test_what_may_be_written_is_what_is_named() -> None:
+    rules = Rules(allow=("winder/force", "drive*/speed"))
+    assert [rules.may_be_written(key) for key in ("winder/force", "drive7/speed", "winder/forces", "drive7/mode")] == [
+        *(True, True, False, False),
+    ]

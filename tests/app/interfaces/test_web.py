@@ -1,0 +1,492 @@
+"""The REST API and the stream of the page, by real sockets: what is answered, who is let in, what becomes of writes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jsonschema import Draft202012Validator
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from busmaster import Hcp2Controller, MicroFlexDrive
+from busmaster.app.interfaces import audience, following
+from busmaster.app.interfaces.audience import MOST_EXCHANGES, Seat
+from busmaster.app.interfaces.web import PAGE, serving
+from busmaster.app.service.permission import Access, Permission, digest_of
+from busmaster.app.service.rights import Role
+from busmaster.bounds import LONGEST_COMMAND
+from busmaster.bus.limits import Limit
+from busmaster.errors import InvalidCommand
+from busmaster.registry import kinds
+from tests.app.interfaces.lines import HERE, ONE, READS, Page, assert_goes_on_alone, page, poll, shows
+from tests.app.service.lines import Served, served, until
+from tests.patience import PATIENCE
+
+NETWORK = ("192.0.2.7", 8420)
+TOKEN = "0123456789abcdef"
+SCHEMA = json.loads((PAGE / "openapi.json").read_text())
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test waits between two tries to connect."""
+    monkeypatch.setattr(following, "FIRST_PAUSE", 0.001)
+    monkeypatch.setattr(following, "LONGEST_PAUSE", 0.001)
+
+
+def check(path: str, method: str, status: int, said: Any) -> None:
+    """Raise ValidationError for an answer that is not as the schema has it."""
+    answer = SCHEMA["paths"][path][method]["responses"][str(status)]
+    if "$ref" in answer:
+        answer = SCHEMA["components"]["responses"][answer["$ref"].rpartition("/")[2]]
+    schema = answer["content"]["application/json"]["schema"]
+    Draft202012Validator({**schema, "components": SCHEMA["components"]}).validate(said)
+
+
+async def put(of: Page, value: Any, path: str = ONE, **headers: str) -> tuple[int, Any]:
+    """Status and answer of a write, which the schema allows."""
+    answer = await of.client.put(path, json={"value": value}, headers=headers)
+    check("/api/points/{group}/{key}", "put", answer.status_code, answer.json())
+    return answer.status_code, answer.json()
+
+
+@pytest.mark.asyncio
+async def test_all_that_it_answers_is_as_its_schema_says(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        for path in ("line", "nodes", "groups", "events", "points"):
+            answer = await of.client.get(f"/api/{path}")
+            assert answer.status_code == 200
+            assert answer.json() or path == "events"
+            check(f"/api/{path}", "get", 200, answer.json())
+        answer = await of.client.get(ONE)
+        check("/api/points/{group}/{key}", "get", 200, answer.json())
+        assert answer.json()["details"]["command"] == "read element 10"
+        answer = await of.client.get("/api/points/axes/5/11")
+        assert answer.status_code == 404
+        check("/api/points/{group}/{key}", "get", 404, answer.json())
+
+
+@pytest.mark.asyncio
+async def test_a_microflex_is_called_by_the_protocol_that_its_file_has(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line, MicroFlexDrive(line.bus, 7).point("speed_measured"))
+        await shows(of.line)
+        for path in ("nodes", "points"):
+            said = (await of.client.get(f"/api/{path}")).json()
+            check(f"/api/{path}", "get", 200, said)
+            assert {(one["address"], one["protocol"]) for one in said} == {(5, "hcp2"), (7, "microflex")}
+
+
+def test_each_kind_of_node_is_called_by_its_own_name() -> None:
+    for name, kind in kinds().items():
+        assert kind.profile.kind_name == name
+
+
+@pytest.mark.asyncio
+async def test_a_point_that_is_not_known_yet_is_not_told_to_be_none(tmp_path: Path) -> None:
+    async with page(tmp_path) as of:  # and nobody serves a line
+        answer = await of.client.get(ONE)
+        assert (answer.status_code, answer.json()["error"]) == (503, "LineDown")
+        check("/api/points/{group}/{key}", "get", 503, answer.json())
+
+
+@pytest.mark.asyncio
+async def test_its_schema_has_every_path_and_is_served(tmp_path: Path) -> None:
+    async with page(tmp_path) as of:
+        assert (await of.client.get("/openapi.json")).json() == SCHEMA
+    Draft202012Validator.check_schema({"$defs": SCHEMA["components"]["schemas"]})
+    assert SCHEMA["openapi"].startswith("3.1")
+    methods = {(path, method) for path, of in SCHEMA["paths"].items() for method in of if method != "parameters"}
+    named = {"line", "nodes", "groups", "events", "points"}
+    one = "/api/points/{group}/{key}"
+    assert methods == {(f"/api/{name}", "get") for name in named} | {(one, "get"), (one, "put")}
+
+
+@pytest.mark.asyncio
+async def test_a_write_passes_the_owners_authorisation_and_its_limits_hold(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        point = Hcp2Controller(line.bus, 5).point("10")
+        point.node.limit(Limit(name=point.key, read=point.command, decode=point.value_of, maximum=50))
+        await shows(of.line)
+        assert await put(of, 12.5) == (200, {"written": 12.5})
+        status, said = await put(of, 51)
+        assert (status, said["error"]) == (400, "InvalidCommand")
+        assert "50" in said["what"]
+        assert line.audit() == [("5/10", "written"), ("5/10", "refused")]
+        assert of.writes[0] == "5/10 = 12.5, asked by a page from 127.0.0.1: written"
+        assert len(of.writes) == 2
+
+
+@pytest.mark.asyncio
+async def test_of_nonsense_only_the_beginning_is_told(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await put(of, "x" * 4000))[0] == 400
+        [told] = of.writes
+        assert told.startswith("5/10 = 'xxx")
+        assert told.count("... (40") == 2  # the value, and the error that has it
+        assert len(told) < 600
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        (b'{"value": null}', "application/json", 400),
+        (b'{"value": [1]}', "application/json", 400),
+        (b'{"value": 1, "also": 2}', "application/json", 400),
+        (b"{", "application/json", 400),
+        (b"[" * LONGEST_COMMAND, "application/json", 400),
+        (b"\xff", "application/json", 400),
+        (b" " * (LONGEST_COMMAND + 1), "application/json", 413),
+        (b'{"value": 1}', "text/plain", 415),
+        (b'{"value": 1}', "application/x-www-form-urlencoded", 415),
+    ],
+)
+@pytest.mark.asyncio
+async def test_a_body_that_says_no_value_writes_nothing(tmp_path: Path, body: bytes, kind: str, status: int) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        answer = await of.client.put(ONE, content=body, headers={"Content-Type": kind})
+        assert answer.status_code == status
+        check("/api/points/{group}/{key}", "put", status, answer.json())
+        assert line.records == []
+
+
+@pytest.mark.asyncio
+async def test_while_the_owner_is_away_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
+    async with page(tmp_path) as of:
+        async with served(tmp_path) as line:
+            poll(line)
+            await shows(of.line)
+        await until(lambda: not of.line.is_connected)
+        said = (await of.client.get("/api/line")).json()
+        assert not said["connected"]
+        assert said["why"]
+        check("/api/line", "get", 200, said)
+        status, said = await put(of, 1)
+        assert (status, said["error"]) == (503, "NotStarted")
+        answer = await of.client.get(ONE)
+        assert answer.status_code == 503
+
+
+# who is let in
+
+EVIL = [
+    {"Host": "evil.example"},
+    {"Host": "localhost.evil.example"},
+    {"Host": "127.0.0.1.evil.example:80"},
+    {"Host": "192.0.2.7"},
+    {"Host": ""},
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "http://127.0.0.1:1"},
+    {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"},
+]
+
+
+@pytest.mark.parametrize("headers", EVIL)
+@pytest.mark.asyncio
+async def test_a_foreign_origin_and_a_rebound_host_are_refused(tmp_path: Path, headers: dict[str, str]) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        for path in ("/", "/api/points", "/page/page.js", "/openapi.json"):
+            assert (await of.client.get(path, headers=headers)).status_code == 403
+        answer = await of.client.put(ONE, json={"value": 1}, headers=headers)
+        assert answer.status_code == 403
+        assert "access-control-allow-origin" not in answer.headers
+        assert line.records == []
+
+
+@pytest.mark.parametrize("headers", [of for of in EVIL if of.get("Host") != ""])
+@pytest.mark.asyncio
+async def test_a_websocket_of_another_sites_page_is_refused(tmp_path: Path, headers: dict[str, str]) -> None:
+    async with served(tmp_path), page(tmp_path) as of:
+        host = headers.get("Host")
+        more = {name: value for name, value in headers.items() if name != "Host"}
+        port = int(of.url.rpartition(":")[2].strip("/"))
+        url = of.url.replace("http", "ws", 1) if host is None else f"ws://{host.partition(':')[0]}:{port}/"
+        with pytest.raises(InvalidStatus, match="403"):
+            await connect(f"{url}api/stream", host="127.0.0.1", port=port, additional_headers=more, proxy=None)
+
+
+@pytest.mark.asyncio
+async def test_no_preflight_is_answered_and_no_page_may_hold_it_in_a_frame(tmp_path: Path) -> None:
+    async with page(tmp_path) as of:
+        answer = await of.client.request("OPTIONS", ONE, headers={"Access-Control-Request-Method": "PUT"})
+        assert answer.status_code == 405
+        answer = await of.client.get("/")
+        assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+        assert "default-src 'self'" in answer.headers["content-security-policy"]
+
+
+@pytest.mark.asyncio
+async def test_beyond_this_machine_nobody_writes_without_tokens_and_all_may_look(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path, seen_at=NETWORK) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await of.client.get("/api/line")).json()["read_only"]
+        status, said = await put(of, 1)
+        assert (status, "--token-file" in said["what"]) == (403, True)
+        assert line.records == []
+
+
+@pytest.mark.parametrize("seen_at", [HERE, NETWORK])
+@pytest.mark.asyncio
+async def test_where_there_are_tokens_a_write_shows_one(tmp_path: Path, seen_at: tuple[str, int]) -> None:
+    secrets = {"hmi": digest_of(TOKEN)}
+    async with served(tmp_path) as line, page(tmp_path, seen_at=seen_at, secrets=secrets) as of:
+        poll(line)
+        await shows(of.line)
+        said = (await of.client.get("/api/line")).json()
+        assert (said["read_only"], said["wants_token"]) == (False, True)
+        for shown in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {TOKEN}"}):
+            assert (await put(of, 1, **shown))[0] == 401
+        assert line.records == []
+        assert (await put(of, 1, Authorization=f"Bearer {TOKEN}"))[0] == 200
+        assert of.writes == [
+            "1 failed login at web: 1 from 127.0.0.1",  # the others are reported a minute later
+            "5/10 = 1, asked by token hmi from 127.0.0.1: written",
+        ]
+
+
+@pytest.mark.asyncio
+async def test_an_interface_that_is_read_only_and_a_role_that_may_read_write_nothing(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path, read_only=True) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await put(of, 1))[0] == 400
+        assert line.records == []
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]"])
+@pytest.mark.asyncio
+async def test_this_machines_own_names_are_let_in_with_their_origin(tmp_path: Path, host: str) -> None:
+    async with page(tmp_path) as of:
+        port = of.url.rpartition(":")[2].strip("/")
+        headers = {"Host": f"{host}:{port}", "Origin": f"http://{host}:{port}"}
+        assert (await of.client.get("/api/line", headers=headers)).status_code == 200
+
+
+# the stream
+
+
+async def hear(stream: ClientConnection, *methods: str) -> dict[str, Any]:
+    """The bodies of the next of these messages."""
+    found: dict[str, Any] = {}
+    while set(methods) - set(found):
+        said = json.loads(await stream.recv())
+        found[said["method"]] = said["body"]
+    return found
+
+
+def stream_of(of: Page) -> connect:
+    return connect(f"{of.url.replace('http', 'ws', 1)}api/stream", proxy=None)
+
+
+@pytest.mark.asyncio
+async def test_a_page_that_comes_late_is_told_all_and_then_what_changes(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        async with stream_of(of) as stream:
+            told = await hear(stream, "state", "rows", "values", "groups", "nodes", "frame", "past")
+            assert told["state"]["connected"]
+            assert [row["key"] for row in told["rows"]["rows"]] == ["5/10", "5/outputs"]
+            assert told["past"]["past"][0]
+            await put(of, 7)
+            while (await hear(stream, "values"))["values"]["values"][0][0] != 7:
+                pass
+
+
+@pytest.mark.asyncio
+async def test_a_page_is_told_the_latest_of_the_past_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audience, "PAST_VALUES", 2)
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        await until(lambda: len(of.line.picture.rows[0].past) > 3)
+        known = [time for time, _ in of.line.picture.rows[0].past]
+        async with stream_of(of) as stream:
+            past = (await hear(stream, "past"))["past"]["past"][0]
+        assert len(past) == 2
+        assert past[0][0] >= known[-2]
+
+
+@pytest.mark.asyncio
+async def test_rows_and_past_values_are_those_of_the_owner_that_came_last(tmp_path: Path) -> None:
+    """The numbers of the sets of points begin again with each owner; a page shows a past of the set it has alone."""
+    async with page(tmp_path) as of:
+        for sets in (3, 1):
+            async with served(tmp_path) as line:
+                poll(line)
+                for number in range(1, sets):
+                    controller = Hcp2Controller(line.bus, 5)
+                    await shows(of.line)
+                    line.bus.poll_group(f"more {number}", period=0.02, points=[controller.point(str(20 + number))])
+                    await until(lambda: len(of.line.picture.rows) == 1 + len(line.bus.groups))
+                await shows(of.line)
+                found = set()
+                async with stream_of(of) as stream:
+                    while (message := json.loads(await stream.recv()))["method"] != "past":
+                        if message["method"] == "rows":  # in parts
+                            found.add(message["body"]["set"])
+                assert found == {message["body"]["set"]}
+            await until(lambda: not of.line.is_connected)
+
+
+@pytest.mark.asyncio
+async def test_a_page_is_told_when_the_owner_goes_and_when_it_is_back(tmp_path: Path) -> None:
+    async with page(tmp_path) as of, stream_of(of) as stream:
+        for _ in range(3):
+            async with served(tmp_path) as line:
+                poll(line)
+                while not (await hear(stream, "state"))["state"]["connected"]:
+                    pass
+                told = await hear(stream, "rows", "values")
+                assert len(told["rows"]["rows"]) == 2
+            while (await hear(stream, "state"))["state"]["connected"]:
+                pass
+
+
+@pytest.mark.asyncio
+async def test_a_page_is_told_when_the_interfaces_role_is_changed_and_one_that_comes_then_all_else(
+    tmp_path: Path,
+) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        async with stream_of(of) as stream:
+            assert not (await hear(stream, "state"))["state"]["read_only"]
+            line.authorisation.access = READS
+            assert (await hear(stream, "state"))["state"]["read_only"]
+            assert (await of.client.get("/api/line")).json()["read_only"]
+            await hear(stream, "frame")
+        async with stream_of(of) as stream:
+            told = await hear(stream, "state", "rows", "frame")
+            assert told["state"]["read_only"]
+            assert [row["key"] for row in told["rows"]["rows"]] == ["5/10", "5/outputs"]
+
+
+@pytest.mark.asyncio
+async def test_the_wire_is_looked_at_only_while_a_page_wants_it(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        assert not tapped(line)
+        async with stream_of(of) as one, stream_of(of) as other:
+            await one.send('{"exchanges":true}')
+            await other.send('{"exchanges":true}')
+            told = (await hear(one, "exchanges"))["exchanges"]
+            while not told["exchanges"]:
+                told = (await hear(one, "exchanges"))["exchanges"]
+            assert "ok" in told["exchanges"][0]
+            await one.send('{"exchanges":false}')
+            await hear(other, "exchanges")
+            assert tapped(line)
+        await until(lambda: not tapped(line))
+
+
+def tapped(line: Served) -> bool:
+    return line.bus._pump.tap is not None
+
+
+@pytest.mark.asyncio
+async def test_the_wire_is_looked_at_again_when_the_owner_is_back(tmp_path: Path) -> None:
+    async with page(tmp_path) as of, stream_of(of) as stream:
+        await stream.send('{"exchanges":true}')
+        for _ in range(2):
+            async with served(tmp_path) as line:
+                poll(line)
+                await hear(stream, "exchanges")
+                assert tapped(line)
+
+
+@pytest.mark.parametrize("text", ["{", '{"exchanges": 1}', "x" * 2000])
+@pytest.mark.asyncio
+async def test_a_page_that_says_anything_else_is_let_go(tmp_path: Path, text: str) -> None:
+    async with page(tmp_path) as of, stream_of(of) as stream:
+        await stream.send(text)
+        with pytest.raises(ConnectionClosed):
+            await hear(stream, "farewell")
+        assert (await of.client.get("/api/line")).status_code == 200
+
+
+@pytest.mark.asyncio
+async def test_of_what_a_slow_page_has_not_taken_the_latest_of_each_is_told() -> None:
+    seat = Seat()
+    for number in range(1000):
+        seat.put(("values", 0), f"values {number}")
+        seat.put(("frame", 0), f"frame {number}")
+        seat.put_exchanges(f"exchanges {number}")
+    texts = await seat.take()
+    assert texts[-3:-1] == ["values 999", "frame 999"]
+    assert len(texts) == 2 + MOST_EXCHANGES
+    waiting = asyncio.ensure_future(seat.take())
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    seat.put(("frame", 0), "frame")
+    assert await waiting == ["frame"]
+
+
+# the line beside it
+
+
+@pytest.mark.slow
+@pytest.mark.asyncio
+async def test_interfaces_with_pages_that_come_and_go_leave_nothing_with_the_line(tmp_path: Path) -> None:
+    async with served(tmp_path) as line:
+        poll(line)
+        for _ in range(20):
+            async with page(tmp_path) as of, stream_of(of) as stream:
+                await stream.send('{"exchanges":true}')
+                await hear(stream, "state", "rows")
+        await assert_goes_on_alone(line)
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_is_taken_is_one_sentence() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InvalidCommand, match="cannot be listened at"):
+        async with serving(None, taken.getsockname()):
+            pass
+
+
+@pytest.mark.asyncio
+async def test_a_role_of_the_line_holds_for_its_page(tmp_path: Path) -> None:
+    access = Access(users={os.getuid(): Permission("this user", Role.READ)})
+    async with served(tmp_path, access=access) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await of.client.get("/api/line")).json()["read_only"]
+        status, said = await put(of, 1)
+        assert (status, "may read this line and not write" in said["what"]) == (400, True)
+        assert line.audit() == [("5/10", "refused")]
+
+
+@pytest.mark.asyncio
+async def test_a_request_with_two_lengths_is_refused_and_its_connection_closed(tmp_path: Path) -> None:
+    """A server before this one may take what follows for another request."""
+    async with page(tmp_path) as of:
+        host = of.url.removeprefix("http://").strip("/")
+        reader, writer = await asyncio.open_connection(*host.split(":"))
+        lengths = "Content-Length: 5\r\nTransfer-Encoding: chunked\r\n"
+        smuggled = f"GET /openapi.json HTTP/1.1\r\nHost: {host}\r\n\r\n"
+        writer.write(f"PUT {ONE} HTTP/1.1\r\nHost: {host}\r\n{lengths}\r\n0\r\n\r\n{smuggled}".encode())
+        async with asyncio.timeout(PATIENCE):
+            answer = (await reader.read()).decode()
+        writer.close()
+        assert answer.startswith("HTTP/1.1 400 ")
+        assert "connection: close" in answer.lower()
+        assert answer.count("HTTP/1.1") == 1
+        assert "not both" in answer

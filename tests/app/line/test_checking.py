@@ -1,0 +1,238 @@
+"""`check` finds what `run` would refuse about a file, all of it at once, and opens neither port nor outputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from busmaster.app.config import FileError, load
+from busmaster.app.line import ConfiguredLine, check
+
+EXAMPLES = sorted((Path(__file__).parents[3] / "examples").glob("*.toml"))
+HEAD = 'port = "/dev/nothing-is-there?baudrate=57600"\n'
+NODE = '[nodes.winder]\nprotocol = "hcp2"\naddress = 5\n'
+GROUP = '[groups.axes]\nperiod = 0.1\npoints = ["winder/1"]\n'
+GOOD = HEAD + NODE + GROUP
+
+EVERYWHERE = """\
+title = 5
+port = 7
+strict = "yes"
+unknown = 1
+
+[protocols.hpc2]
+
+[nodes.press]
+protocol = "msc2"
+address = 1
+
+[nodes.winder]
+protocol = "mentor"
+adress = 4
+address = 14
+
+[nodes.winder.points]
+speed = { item = "3.02", bogus = 1, limit = 2 }
+current = { item = "no-such-item" }
+
+[groups.press]
+period = 0.1
+points = ["press/1", "pres*/2"]
+
+[groups.slow]
+period = 0
+
+[groups.wrong]
+period = 1
+points = ["reel/1"]
+
+[outputs.csv]
+path = "no-such-folder/line.csv"
+groups = ["slow"]
+
+[outputs.cvs]
+path = "line.csv"
+
+[outputs.jsonl]
+path = "same"
+
+[outputs.sqlite]
+path = "same"
+
+[outputs.mqtt]
+password_file = "no-such-password"
+tls = true
+ca_file = "no-such-certificates"
+allow_commands = ["press/1", "reel/1"]
+
+[safe]
+writes = { "press/1" = 0, "reel/1" = 0, "winder/3.02" = "fast" }
+repeatable = ["reel/2"]
+
+[service]
+share = 0.5
+listen = "0.0.0.0:7420"
+
+[service.users.no-such-user]
+role = "read"
+
+[service.users.root]
+role = "owner"
+
+[service.tokens.hmi]
+role = "write"
+
+[emulator]
+paced = 1
+
+[emulator.nodes.press]
+lively = true
+"""
+PROBLEMS = [
+    "1: title",
+    "2: port",
+    "3: strict",
+    "4: unknown",
+    "6: protocols.hpc2",
+    "9: nodes.press.protocol",
+    "14: nodes.winder.adress",
+    "18: nodes.winder.points.speed.bogus",
+    "18: nodes.winder.points.speed.limit",
+    "19: nodes.winder.points.current.item",
+    "26: groups.slow.period",
+    "30: groups.wrong.points[1]",
+    "32: outputs.csv",
+    "36: outputs.cvs",
+    "43: outputs.sqlite.path",
+    "46: outputs.mqtt.password_file",
+    "48: outputs.mqtt.ca_file",
+    "52: safe.writes.reel/1",
+    "53: safe.repeatable",
+    "57: service.listen",
+    "59: service.users.no-such-user",
+    "63: service.users.root.role",
+    "65: service.tokens.hmi",
+    "69: emulator.paced",
+]
+"""What is wrong there. Nothing is reported of the node "press" but its protocol, whoever names it, nor of the commands
+of an output that could not be made."""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "line.toml"
+    path.write_text(text)
+    return path
+
+
+def problems(folder: Path, text: str) -> list[FileError]:
+    return list(check(written(folder, text)).problems)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))
+def test_examples_have_no_problems(path: Path) -> None:
+    assert check(path).problems == ()
+
+
+def test_all_problems_of_all_tables_are_reported_at_once_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = problems(tmp_path, EVERYWHERE)
+    assert sorted(f"{error.line}: {error.key}" for error in found) == sorted(PROBLEMS)
+    assert [error.line for error in found] == sorted(error.line for error in found)
+
+
+WRONG = {
+    "no TOML": "port = \n",
+    "no nodes": HEAD,
+    "a table that is none": f'{HEAD}nodes = "all"\n',
+    "a node that is no table": f"{HEAD}[nodes]\nwinder = 5\n",
+    "no port": NODE,
+    "a port that is none": f'port = "/dev/ttyS0?baudrate=fast"\n{NODE}',
+    "two nodes of one address": f'{GOOD}[nodes.other]\nprotocol = "hcp2"\naddress = 5\n',
+    "a template that is not there": f'{HEAD}{NODE}template = "none.toml"\n',
+    "a point that is no item": f'{GOOD}[nodes.winder.points]\nspeed = {{ item = "?" }}\n',
+    "a limit of another item": f"{GOOD}[nodes.winder.points]\n1 = {{ minimum = 5, maximum = 1 }}\n",
+    "a group of unknown points": f'{HEAD}{NODE}[groups.axes]\nperiod = 0.1\npoints = ["winder/none"]\n',
+    "a safe state of an unknown item": f'{GOOD}[safe]\nwrites = {{ "winder/?" = 0 }}\n',
+    "a repeatable write that is none": (
+        f'{GOOD}[safe]\nwrites = {{ "winder/1" = 0 }}\nrepeatable = ["winder/1", "winder/2"]\n'
+    ),
+    "a token file that is not there": f'{GOOD}[service]\nlisten = "127.0.0.1:0"\ntoken_file = "none"\n',
+    "a role for points that are none": f'{GOOD}[service.users.root]\nrole = "write"\nallow_writes = ["winder/?"]\n',
+    "a learned file without learning": f'learned = "times"\n{GOOD}',
+    "an emulated node that is none": f"{GOOD}[emulator.nodes.reel]\nlively = true\n",
+}
+
+
+def refuse(path: Path) -> None:
+    """Do with a file what `run` does before it opens the port."""
+    ConfiguredLine(file := load(path))
+    file.service.secrets()
+
+
+@pytest.mark.parametrize("text", WRONG.values(), ids=WRONG)
+def test_the_first_problem_is_the_one_for_which_run_refuses_the_file(text: str, tmp_path: Path) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(FileError) as refused:
+        refuse(path)
+    assert [str(error) for error in check(path).problems] == [str(refused.value)]
+
+
+def test_what_names_a_node_with_a_problem_is_not_reported_as_unknown(tmp_path: Path) -> None:
+    node = '[nodes.drive1-2]\nprotocol = "hcp2"\naddress = "3-2"\n'
+    uses = '[groups.drives]\nperiod = 0.1\npoints = ["drive1-2/1", "drive2/2", "drive*/3"]\n'
+    rest = '[safe]\nwrites = { "drive1/1" = 0 }\n[emulator.nodes.drive2]\nlively = true\n'
+    [error] = problems(tmp_path, HEAD + node + NODE + uses + rest)
+    assert error.key == "nodes.drive1-2.address"
+
+
+def test_an_unknown_key_does_not_hide_the_problems_of_the_same_table(tmp_path: Path) -> None:
+    found = problems(tmp_path, f'{GOOD}colour = "red"\nshape = "round"\nphase = -1\n')
+    assert [error.key for error in found] == ["groups.axes.colour", "groups.axes.shape", "groups.axes.phase"]
+
+
+def test_a_node_that_learns_but_has_a_problem_still_keeps_learned_times(tmp_path: Path) -> None:
+    [error] = problems(tmp_path, f'learned = "times"\n{HEAD}{NODE}timing = "learned"\nretries = -1\n')
+    assert error.key == "nodes.winder.retries"
+
+
+def test_a_problem_in_a_template_names_the_template(tmp_path: Path) -> None:
+    (tmp_path / "ours.toml").write_text('protocol = "hcp2"\n[points]\nspeed = { item = "1", factor = 0 }\n')
+    [error] = problems(tmp_path, f'{HEAD}{NODE}template = "ours.toml"\n')
+    assert (error.file, error.line) == (str(tmp_path / "ours.toml"), 3)
+
+
+def test_nothing_is_opened_and_nothing_written(tmp_path: Path) -> None:
+    outputs = f'[outputs.sqlite]\npath = "{tmp_path}/line.sqlite"\nspill = "{tmp_path}/spool"\n'
+    path = written(tmp_path, f'{GOOD}{outputs}[outputs.csv]\npath = "{tmp_path}/line.csv"\n')
+    assert check(path) == check(path)
+    assert not check(path).problems
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_doubts_are_warnings(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    head = 'port = "/dev/nothing-is-there?baudrate=57600&parity=O"\n'
+    report = check(written(tmp_path, f'{head}{NODE}[outputs.csv]\npath = "{tmp_path}/folder"\n'))
+    assert report.problems == ()
+    assert [warning.partition(":")[0] for warning in report.warnings] == [
+        "hcp2 is meant for 8N1, but /dev/nothing-is-there is 8O1",
+        "nothing is polled",
+        "outputs.csv.path",
+    ]
+
+
+def test_a_schedule_that_does_not_fit_is_a_warning(tmp_path: Path) -> None:
+    report = check(written(tmp_path, HEAD + NODE + GROUP.replace("0.1", "0.001")))
+    assert report.problems == ()
+    [warning] = report.warnings
+    assert warning.startswith("cycles will be missed")
+
+
+def test_what_only_the_emulator_refuses_is_a_warning(tmp_path: Path) -> None:
+    report = check(written(tmp_path, f'{GOOD}[emulator.nodes.winder]\nvalues = {{ "no-such-item" = 1 }}\n'))
+    assert report.problems == ()
+    [warning] = report.warnings
+    assert warning.startswith("busmaster emulate refuses it: ")

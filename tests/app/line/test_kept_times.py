@@ -1,0 +1,221 @@
+"""Reply times that a line has learned are kept for its next run: on an emulated line, in virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from busmaster import InvalidCommand, MemoryPort
+from busmaster.app.config import emulated_line
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine, kept_times
+from busmaster.bus.node import Node
+from busmaster.testing import run_in_virtual_time
+
+TEXT = """
+port = "/dev/ttyUSB0"
+timing = "learned"
+learned = "FILE"
+[nodes.winder]
+protocol = "hcp2"
+address = 1
+[nodes.drive]
+protocol = "hcp2"
+address = 2
+[groups.fast]
+period = 0.05
+points = ["winder,drive/1"]
+"""
+LONG = 15.0
+"""Seconds in which 200 replies of each node come."""
+SHORT = 3.0
+"""In which 20 do."""
+
+
+OFTEN = 20.0
+"""Seconds from one keeping to the next, here."""
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_times, "KEEP_EVERY", OFTEN)
+
+
+@pytest.fixture
+def text(tmp_path: Path) -> str:
+    return TEXT.replace("FILE", str(tmp_path / "learned.json"))
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    return tmp_path / "learned.json"
+
+
+def opened(text: str, told: Callable[[str], None] = lambda _: None) -> ConfiguredLine:
+    file = read(Source("line.toml", text))
+    return ConfiguredLine(file, port=MemoryPort(emulated_line(file)), tell=told)
+
+
+def trusted(line: ConfiguredLine) -> set[str]:
+    return {
+        name
+        for name, handle in line.nodes.items()
+        if any(times.trusted for times in Node.of(handle).statistics().learned)
+    }
+
+
+def run_for(text: str, seconds: float, told: Callable[[str], None] = lambda _: None) -> set[str]:
+    """Run the line, and return the nodes whose times it trusted then."""
+
+    async def main() -> set[str]:
+        async with opened(text, told) as line:
+            await asyncio.sleep(seconds)
+            return trusted(line)
+
+    return run_in_virtual_time(main())
+
+
+def test_a_line_begins_with_what_its_last_run_has_learned_and_trusts_it_after_fewer_replies(text: str) -> None:
+    assert run_for(text, SHORT) == set()
+    assert run_for(text, LONG) == {"winder", "drive"}
+    assert run_for(text, SHORT) == {"winder", "drive"}
+
+
+def test_a_run_that_is_too_short_to_learn_leaves_what_was_kept(text: str, kept: Path) -> None:
+    run_for(text, LONG)
+    before = json.loads(kept.read_text())
+    run_for(text, 0.3)
+    assert json.loads(kept.read_text()) == before
+
+
+def test_times_are_kept_while_the_line_runs_too(text: str, kept: Path) -> None:
+    def names() -> set[str]:
+        return set(json.loads(kept.read_text())["nodes"]) if kept.exists() else set()
+
+    async def main() -> None:
+        async with opened(text):
+            await asyncio.sleep(OFTEN - 1.0)
+            assert names() == set()
+            await asyncio.sleep(2.0)
+            assert names() == {"winder", "drive"}
+
+    run_in_virtual_time(main())
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "left"),
+    [
+        ('"/dev/ttyUSB0"', '"/dev/ttyUSB0?baudrate=19200"', set()),
+        ('protocol = "hcp2"\naddress = 2', 'protocol = "hcp"\naddress = 2', {"winder"}),
+        ('protocol = "hcp2"\naddress = 2', 'protocol = "hcp2"\naddress = 3', {"winder"}),
+        ("address = 2", "address = 2\ntiming = { window = 0.12 }", {"winder"}),
+        ("[nodes.winder]", "[nodes.reel]", {"drive"}),
+    ],
+)
+def test_what_was_learned_with_other_settings_is_forgotten(text: str, before: str, after: str, left: set[str]) -> None:
+    run_for(text, LONG)
+    changed = text.replace(before, after)
+    assert run_for(changed if "reel" not in after else changed.replace("winder,", "reel,"), SHORT) == left
+
+
+DAMAGED = [
+    "",
+    "{",
+    "[]",
+    '{"version": 1, "nodes": {}}',
+    '{"version": 2, "nodes": {"winder": {"settings": "", "times": [{"kind": "Read"}]}}}',
+    '{"version": 2, "nodes": {"winder": 5}}',
+    '{"version": 2, "nodes": [5]}',
+    "\0\0\0\0",
+    "[" * 100_000,
+]
+
+
+@pytest.mark.parametrize("damaged", DAMAGED, ids=range(len(DAMAGED)))
+def test_a_file_that_is_damaged_is_told_once_and_begun_anew(text: str, kept: Path, damaged: str) -> None:
+    kept.write_text(damaged)
+    told: list[str] = []
+    assert run_for(text, SHORT, told.append) == set()
+    assert len(told) == 1
+    assert str(kept) in told[0]
+    assert "learned anew" in told[0]
+    told.clear()
+    run_for(text, LONG, told.append)
+    assert run_for(text, SHORT, told.append) == {"winder", "drive"}
+    assert len(told) == 1, "by the second run, for the first had nothing to keep"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("slowest", -1.0), ("heard", 1e400), ("pause", float("nan")), ("window", "5"), ("kind", []), ("packet", 1)],
+)
+def test_no_time_that_cannot_be_is_taken(text: str, kept: Path, key: str, value: object) -> None:
+    run_for(text, LONG)
+    said = json.loads(kept.read_text())
+    said["nodes"]["winder"]["times"][0][key] = value
+    kept.write_text(json.dumps(said))
+    told: list[str] = []
+    assert run_for(text, SHORT, told.append) == set()
+    assert len(told) == 1
+
+
+def test_where_nothing_can_be_kept_it_is_told_once(text: str, kept: Path) -> None:
+    kept.mkdir()
+    told: list[str] = []
+    run_for(text, 3 * OFTEN, told.append)
+    assert told == [
+        f"{kept}: Is a directory: reply times are learned anew",
+        f"{kept}: Is a directory: the reply times that were learned are not kept",
+    ]
+
+
+def test_a_node_that_was_away_when_the_line_was_opened_begins_with_what_was_kept(text: str) -> None:
+    run_for(text, LONG)
+
+    async def main() -> None:
+        file = read(Source("line.toml", text))
+        emulated = emulated_line(file)
+        late = next(device for device in emulated.devices if device.address == 2)
+        late.faults.dead = True
+        async with ConfiguredLine(file, port=MemoryPort(emulated)) as line:
+            await asyncio.sleep(SHORT)
+            assert trusted(line) == {"winder"}
+            late.faults.dead = False
+            await asyncio.sleep(8.0)  # too short for 200 replies
+            assert trusted(line) == {"winder", "drive"}
+
+    run_in_virtual_time(main())
+
+
+def test_a_file_that_is_read_again_may_bring_back_a_node_and_its_times(text: str) -> None:
+    run_for(text, LONG)
+    alone = text.replace('[nodes.drive]\nprotocol = "hcp2"\naddress = 2\n', "").replace("winder,drive/1", "winder/1")
+
+    async def main() -> None:
+        file = read(Source("line.toml", text))
+        line = ConfiguredLine(read(Source("line.toml", alone)), port=MemoryPort(emulated_line(file)))
+        async with line:
+            await asyncio.sleep(SHORT)
+            await line.take(file)
+            await asyncio.sleep(SHORT)
+            assert trusted(line) == {"winder", "drive"}
+
+    run_in_virtual_time(main())
+
+
+def test_a_place_without_a_folder_or_without_learning_is_refused(text: str) -> None:
+    with pytest.raises(InvalidCommand, match="there is no folder"):
+        opened(text.replace("learned.json", "nowhere/learned.json"))
+    with pytest.raises(InvalidCommand, match='say timing = "learned" too'):
+        opened(text.replace('timing = "learned"\n', ""))
+
+
+def test_it_is_enough_that_one_node_learns(text: str, kept: Path) -> None:
+    one = text.replace('timing = "learned"\n', "").replace("address = 2", 'address = 2\ntiming = "learned"')
+    assert run_for(one, LONG) == {"drive"}
+    assert set(json.loads(kept.read_text())["nodes"]) == {"drive"}

@@ -1,0 +1,159 @@
+"""The line that a file describes, opened: on an emulated line, in virtual time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import busmaster
+from busmaster import BusClosed, InvalidCommand, MemoryPort, WriteUnconfirmed
+from busmaster.app.config import emulated_line
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.testing import run_in_virtual_time
+
+TEXT = """
+port = "/dev/ttyUSB0"
+[nodes.winder]
+protocol = "hcp2"
+address = 1
+[nodes.winder.points]
+force = { item = "10", unit = "N", factor = 0.1 }
+[nodes.drive2-3]
+protocol = "microflex"
+address = "2-3"
+[groups.fast]
+period = 0.1
+points = ["winder/force,11", "drive2-3/speed_measured"]
+[groups.slow]
+period = 1
+phase = 0.5
+points = "winder/inputs"
+"""
+
+
+def opened(text: str = TEXT) -> ConfiguredLine:
+    """On its own emulation."""
+    file = read(Source("line.toml", text))
+    return ConfiguredLine(file, port=MemoryPort(emulated_line(file)))
+
+
+def test_a_protocol_that_sends_decimal_points_rounds_by_decimals_and_scales_nothing() -> None:
+    text = """
+port = "/dev/ttyS0"
+[nodes.belt]
+protocol = "ct-ansi"
+address = 12
+points = { reference = { item = "1.21", decimals = 1 } }
+"""
+
+    async def main() -> None:
+        async with opened(text) as line:
+            await line.point("belt/reference").write(-47.64)
+            assert await line.point("belt/reference").read() == -47.6
+
+    run_in_virtual_time(main())
+
+
+def test_nodes_and_groups_are_there_by_name_and_polled() -> None:
+    async def main() -> None:
+        async with opened() as line:
+            winder = line.nodes["winder"]
+            assert isinstance(winder, Hcp2Controller)
+            await winder.write(10, 125, 7)
+            async for snapshot in line.groups["fast"]:
+                values = {point.key: sample.value for point, sample in snapshot.samples.items()}
+                break
+            assert values["winder/force"] == 12.5
+            assert values["winder/11"] == 7
+            assert set(values) == {"winder/force", "winder/11", "drive2/speed_measured", "drive3/speed_measured"}
+            assert snapshot[line.point("winder/force")].value == 12.5
+            assert line.groups["slow"].period == 1
+
+    run_in_virtual_time(main())
+
+
+def test_a_point_is_read_and_written_on_its_scale_and_a_write_makes_samples_stale() -> None:
+    async def main() -> None:
+        async with opened() as line:
+            point = line.point("winder/force")
+            await point.write(4.5)
+            assert await point.read() == 4.5
+            assert await line.nodes["winder"].point("10").read() == 45
+            assert line.bus.latest(point) is None
+
+    run_in_virtual_time(main())
+
+
+def test_it_is_closed_when_it_is_left() -> None:
+    async def main() -> None:
+        async with opened() as line:
+            pass
+        with pytest.raises(BusClosed):
+            await line.point("winder/11").read()
+
+    run_in_virtual_time(main())
+
+
+def test_a_long_run_of_an_msc_is_written_through_its_handle() -> None:
+    text = """
+port = "/dev/ttyUSB0"
+[nodes.press]
+protocol = "msc"
+address = 1
+address_step = 4
+symbols = { cam = 3000 }
+[nodes.press.points]
+profile = { item = "cam:40", unit = "mm", factor = 0.001 }
+"""
+
+    async def main() -> None:
+        async with opened(text) as line:
+            await line.point("press/profile").write([i / 8 for i in range(40)])
+            found = await line.nodes["press"].point("cam:40").read()
+            assert found == tuple(125 * i for i in range(40))
+
+    run_in_virtual_time(main())
+
+
+def test_a_node_answers_by_its_name_in_errors() -> None:
+    text = TEXT + "[emulator.nodes.drive2]\nfaults = { dead = 1 }\n"
+
+    async def main() -> None:
+        async with opened(text) as line:
+            with pytest.raises(WriteUnconfirmed, match=r"^drive2: "):
+                await line.nodes["drive2"].point("1").write(1.0)
+
+    run_in_virtual_time(main())
+
+
+def test_no_such_point_is_said_with_what_there_is() -> None:
+    line = opened()
+    for name, complaint in (("winder", "NODE/ITEM"), ("wind/1", "winder, drive2, drive3"), ("winder/forse", "'force'")):
+        with pytest.raises(InvalidCommand, match=complaint):
+            line.point(name)
+
+
+def test_the_plan_counts_each_group_once_whether_it_runs_or_not() -> None:
+    async def main() -> None:
+        line = opened()
+        before = [(group.name, group.values) for group in line.plan().groups]
+        async with line:
+            assert [(group.name, group.values) for group in line.plan().groups] == before
+        assert before == [("fast", 4), ("slow", 1)]
+
+    run_in_virtual_time(main())
+
+
+def test_open_line_reads_a_file_and_says_where_it_is_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(TEXT)
+    assert list(busmaster.open_line(path).nodes) == ["winder", "drive2", "drive3"]
+    path.write_text(TEXT.replace("winder/inputs", "winder/input"))
+    with pytest.raises(InvalidCommand, match=r"line\.toml:17: groups\.slow\.points\[1\]: .*did you mean 'inputs'\?"):
+        busmaster.open_line(path)
+    with pytest.raises(FileNotFoundError):
+        busmaster.open_line(tmp_path / "none.toml")

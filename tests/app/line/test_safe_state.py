@@ -1,0 +1,153 @@
+"""The safe state of a file, as it reaches the nodes of an emulated line, in virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from busmaster import Hcp2Controller, MemoryPort
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.service.record import Outcome, WriteRecord
+from busmaster.bus.node import Node
+from busmaster.emulator.device import Device
+from busmaster.emulator.line import Line
+from busmaster.errors import Refused, Superseded, WriteUnconfirmed
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.testing.virtual_time import run_in_virtual_time
+
+TEXT = """
+port = "/dev/ttyUSB0?baudrate=57600"
+[nodes.gone]
+protocol = "hcp2"
+address = 1
+points.speed = { item = "10" }
+[nodes.winder]
+protocol = "hcp2"
+address = 2
+points.refused = { item = "190" }
+points.speed = { item = "10" }
+points.force = { item = "11" }
+"""
+WITHIN = 5.0
+Story = Callable[[ConfiguredLine, list[WriteRecord]], Awaitable[None]]
+
+
+class Forgetful(EmulatedMint):
+    """Confirms so many writes of 0 without carrying them out."""
+
+    left = 0
+
+    def write_element(self, element: int, value: float, now: float) -> bool:
+        if value == 0 and self.left:
+            self.left -= 1
+            return True
+        return super().write_element(element, value, now)
+
+
+def on_a_line(story: Story, *safe: str, gone: bool = False, forgetful: int = 0) -> None:
+    """Run it on a line whose safe state leaves these points at 0.
+
+    Node 1 may be gone, and node 2 `forgetful` of so many writes.
+    """
+
+    async def run() -> None:
+        winder = Forgetful(2, axes=1)
+        winder.left = forgetful
+        devices: list[Device] = [EmulatedMint(1), winder]
+        devices[0].faults.dead = float(gone)
+        points = [f'"{name}"' for name in safe]
+        writes = ", ".join(f"{point} = 0" for point in points)
+        text = f"{TEXT}[safe]\nwithin = {WITHIN}\nrepeatable = [{', '.join(points)}]\nwrites = {{ {writes} }}\n"
+        port = MemoryPort(Line(Hcp2Controller.profile.line, devices, chance=random.Random(1)))
+        line = ConfiguredLine(read(Source("line.toml", text)), port=port, outputs=False)
+        records: list[WriteRecord] = []
+        line.authorisation.record = records.append
+        async with line:
+            for element in (10, 11):
+                await Hcp2Controller(line.bus, 2).write(element, 7)
+            await story(line, records)
+
+    run_in_virtual_time(run())
+
+
+def test_a_node_that_is_gone_does_not_hold_up_the_others() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        outcomes = await line.safe_state.enter(line.authorisation, "a test", leaving=False)
+        assert list(outcomes) == ["gone/speed", "winder/speed"]
+        assert outcomes["winder/speed"] is None
+        assert [record.point for record in records] == ["winder/speed", "gone/speed"]
+        assert records[0].took < WITHIN / 2
+        assert records[1].took == pytest.approx(WITHIN, abs=0.5)
+        assert await line.nodes["winder"].read(10) == 0
+
+    on_a_line(story, "gone/speed", "winder/speed", gone=True)
+
+
+def test_what_was_sent_and_could_not_be_sent_again_is_not_called_not_started() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        outcomes = await line.safe_state.enter(line.authorisation, "a test")
+        assert isinstance(outcomes["gone/speed"], WriteUnconfirmed)
+        assert [record.outcome for record in records] == [Outcome.UNCONFIRMED]
+        assert Node.of(line.nodes["gone"]).health.value == "down"  # what was tried last was not sent
+
+    on_a_line(story, "gone/speed", gone=True)
+
+
+def test_a_write_that_is_refused_does_not_keep_the_others_of_its_node_from_being_sent() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        outcomes = await line.safe_state.enter(line.authorisation, "a test", leaving=False)
+        assert isinstance(outcomes["winder/refused"], Refused)
+        assert outcomes["winder/speed"] is outcomes["winder/force"] is None
+        assert [await line.nodes["winder"].read(element) for element in (10, 11)] == [0, 0]
+
+    on_a_line(story, "winder/refused", "winder/speed", "winder/force")
+
+
+def test_a_node_that_is_suspended_is_left_in_its_safe_state_too() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        Node.of(line.nodes["winder"]).suspend(100 * WITHIN)
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
+
+    on_a_line(story, "winder/speed")
+
+
+def test_each_write_is_read_back_and_sent_again_until_it_reads_as_it_was_written() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
+        assert [record.outcome for record in records] == [Outcome.WRITTEN]
+        assert await line.nodes["winder"].read(10) == 0
+
+    on_a_line(story, "winder/speed", forgetful=3)
+
+
+def test_what_waits_for_the_line_waits_until_the_safe_state_is_sent() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        drive = line.nodes["winder"]
+        before = Node.of(drive).statistics().attempts
+        reads = [asyncio.ensure_future(drive.read(20)) for _ in range(50)]
+        await asyncio.sleep(0)
+        assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
+        assert Node.of(drive).statistics().attempts - before < len(reads)
+        assert await asyncio.gather(*reads) == [0] * len(reads)
+
+    on_a_line(story, "winder/speed")
+
+
+@pytest.mark.parametrize("leaving", [True, False])
+def test_a_line_that_is_left_takes_no_other_write_and_one_that_is_not_left_does(leaving: bool) -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        drive = line.nodes["winder"]
+        await line.safe_state.enter(line.authorisation, "a test", leaving=leaving)
+        if leaving:
+            with pytest.raises(Superseded):
+                await drive.write(10, 5)
+        else:
+            await drive.write(10, 5)
+        assert await drive.read(10) == (0 if leaving else 5)
+
+    on_a_line(story, "winder/speed")

@@ -1,0 +1,93 @@
+"""From the line to its outputs: what is polled and what happens reaches each of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from busmaster import MemoryPort
+from busmaster.app.config import FileError, emulated_line
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
+from busmaster.bus.node import Node
+
+TEXT = """
+port = "/dev/ttyUSB0"
+[nodes.winder]
+protocol = "hcp2"
+address = 1
+[nodes.away]
+protocol = "hcp2"
+address = 2
+[groups.fast]
+period = 0.02
+points = "winder/1-2"
+[groups.slow]
+period = 0.1
+points = "winder/3"
+[emulator.nodes.away]
+faults = { dead = 1 }
+[outputs.sqlite]
+path = "FOLDER/x.db"
+[outputs.jsonl]
+path = "FOLDER/x.jsonl"
+groups = ["slow"]
+"""
+
+
+def opened(folder: Path, text: str = TEXT, outputs: bool = True) -> ConfiguredLine:
+    file = read(Source("line.toml", text.replace("FOLDER", str(folder))))
+    return ConfiguredLine(file, port=MemoryPort(emulated_line(file)), outputs=outputs)
+
+
+async def run(line: ConfiguredLine, cycles: int) -> None:
+    async with line:
+        async for snapshot in line.groups["fast"]:
+            if snapshot.cycle >= cycles:
+                break
+
+
+@pytest.mark.asyncio
+async def test_nothing_is_lost_between_the_line_and_an_output(tmp_path: Path) -> None:
+    """What was polled before the line was closed is written when it is closed."""
+    line = opened(tmp_path)
+    await run(line, 20)
+    counts = {output.kind: output for output in line.outputs.statistics()}
+    assert counts["sqlite"].dropped == counts["sqlite"].waiting == 0
+    polled = 2 * line.groups["fast"].statistics().cycles + line.groups["slow"].statistics().cycles
+    with closing(sqlite3.connect(tmp_path / "x.db")) as database:
+        [samples] = database.execute("select count(*) from samples").fetchone()
+        [events] = database.execute("select count(*) from events").fetchone()
+    assert samples == polled
+    assert samples + events == counts["sqlite"].written
+
+
+@pytest.mark.asyncio
+async def test_an_output_gets_the_groups_that_it_asked_for_and_all_events(tmp_path: Path) -> None:
+    line = opened(tmp_path)
+    async with line:
+        await Node.of(line.nodes["away"]).probe()
+        async for _ in line.groups["slow"]:
+            break
+    objects = [json.loads(text) for text in (tmp_path / "x.jsonl").read_text().splitlines()]
+    assert {found["group"] for found in objects if "group" in found} == {"slow"}
+    assert "away is down, was unknown" in [found.get("event") for found in objects]
+
+
+@pytest.mark.asyncio
+async def test_without_outputs_nothing_is_written(tmp_path: Path) -> None:
+    await run(opened(tmp_path, outputs=False), 1)
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_extra_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    for output, extra in (("mqtt", "mqtt"), ("metrics", "metrics")):
+        with pytest.raises(FileError, match=rf"outputs\.{output}: .* pip install 'busmaster\[{extra}\]'"):
+            opened(tmp_path, f"{TEXT}[outputs.{output}]\n")

@@ -1,0 +1,359 @@
+"""OpenMetrics, scraped over HTTP as Prometheus does, and read by its own parser."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import os
+import re
+import socket
+import threading
+import time
+import urllib.request
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster.app.outputs import metrics as metrics_module
+from busmaster.app.outputs import scrapes
+from busmaster.app.outputs.base import OutputStatistics
+from busmaster.app.outputs.metrics import MetricsOutput, number_of
+from busmaster.app.outputs.settings import MetricsSettings
+from busmaster.arbiter.counters import DriverErrors
+from busmaster.arbiter.health import Health
+from busmaster.bus.bus import Bus
+from busmaster.bus.meaning import Meaning
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort, MemoryTransport
+from busmaster.errors import LineDown, NoReply
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
+from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.app.outputs.cycles import BUS, until
+from tests.patience import PATIENCE
+from tests.ports import free_port
+
+pytestmark = pytest.mark.skipif(
+    find_spec("prometheus_client") is None, reason="needs prometheus-client (the extra named metrics)"
+)
+Metrics = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+def scraped(port: int) -> Metrics:
+    parser = importlib.import_module("prometheus_client.openmetrics.parser")
+    request = urllib.request.Request(
+        f"http://127.0.0.1:{port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
+    )
+    with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+        text = answer.read().decode()
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in parser.text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def of(metrics: Metrics, name: str, **labels: str) -> float:
+    return metrics[f"busmaster_{name}", frozenset(labels.items())]
+
+
+@pytest.fixture(autouse=True)
+def scrapes_have_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (metrics_module, scrapes):
+        monkeypatch.setattr(module, "PATIENCE", PATIENCE)
+
+
+def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> None:
+    run_in_virtual_time(count_and_scrape())
+
+
+async def count_and_scrape() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    controller, absent = Hcp2Controller(bus, 5), Hcp2Controller(bus, 6)
+    counts = OutputStatistics("sqlite", "written", 10, 2, 3, "disk full")
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus, outputs=lambda: (counts,))
+    async with bus:
+        output.start()
+        group = bus.poll_group("axes", period=0.02, points=[controller.point("1")])
+        async for snapshot in group:
+            if snapshot.cycle == 3:
+                break
+        group.pause()
+        with pytest.raises(NoReply):
+            await absent.read(1, retries=0)
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert of(metrics, "node_attempts_total", node="node 5") == 3
+    assert of(metrics, "node_exchanges_total", node="node 5", outcome="ok") == 3
+    assert of(metrics, "node_exchanges_total", node="node 6", outcome="no_reply") == 1
+    assert of(metrics, "node_latency_seconds_count", node="node 5") == 3
+    assert of(metrics, "node_latency_seconds_bucket", node="node 5", le="0.001") == 0
+    assert of(metrics, "node_latency_seconds_bucket", node="node 5", le="0.5") == 3
+    assert 0.001 < of(metrics, "node_latency_seconds_sum", node="node 5") < 1
+    assert of(metrics, "group_cycles_total", group="axes") == 3
+    assert of(metrics, "group_missed_total", group="axes") == group.statistics().missed
+    assert of(metrics, "group_period_seconds", group="axes") == 0.02
+    assert of(metrics, "group_achieved_period_seconds", group="axes") > 0.019
+    assert 0 < of(metrics, "line_utilisation_ratio") <= 1
+    assert of(metrics, "output_dropped_total", output="sqlite") == 2
+    assert of(metrics, "output_up", output="sqlite") == 0
+
+
+def test_the_utilisation_of_the_line_is_of_the_last_seconds() -> None:
+    run_in_virtual_time(poll_and_pause())
+
+
+async def poll_and_pause() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus)
+    async with bus:
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        group = bus.poll_group("axes", period=0.02, points=[Hcp2Controller(bus, 5).point("1")])
+        await asyncio.sleep(60)
+        busy = await asyncio.to_thread(scraped, output.port)
+        group.pause()
+        await asyncio.sleep(metrics_module.UTILISATION_WINDOW + 1)
+        idle = await asyncio.to_thread(scraped, output.port)
+        bus.reset_statistics()
+        group.resume()
+        await asyncio.sleep(metrics_module.UTILISATION_WINDOW + 1)
+        again = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    share = of(busy, "line_busy_seconds_total") / 60
+    assert share > 0.1
+    assert of(busy, "line_utilisation_ratio") == pytest.approx(share, rel=0.02)
+    assert of(idle, "line_utilisation_ratio") == 0
+    assert of(idle, "line_busy_seconds_total") == pytest.approx(share * 60, rel=0.01)
+    assert of(again, "line_utilisation_ratio") == pytest.approx(share, rel=0.02)
+
+
+@pytest.mark.asyncio
+async def test_a_scrape_has_the_drivers_counts_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: DriverErrors | None = None
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [])))
+    monkeypatch.setattr(bus._pump, "driver_errors", lambda: found)
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus)
+    async with bus:
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        without = await asyncio.to_thread(scraped, output.port)
+        found = DriverErrors(framing=1, parity=2, breaks=3, overruns=4, buffer_overruns=5)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert of(without, "line_damaged_total") == of(without, "line_breaks_total") == 0
+    assert not any(name.startswith("busmaster_driver") for name, _ in without)
+    names = ("framing", "parity", "breaks", "overruns", "buffer_overruns")
+    assert [of(metrics, f"driver_{name}_total") for name in names] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_is_taken_is_told_and_tried_again() -> None:
+    said: list[str] = []
+    port = free_port()
+    with socket.create_server(("127.0.0.1", port)):
+        output = MetricsOutput("metrics", MetricsSettings(port=port), BUS, said.append)
+        output._retry = 0.01
+        output.start()
+        await asyncio.to_thread(until, lambda: bool(said))
+    await asyncio.to_thread(until, lambda: said[-1] == "metrics is up again")
+    await asyncio.to_thread(scraped, port)
+    await asyncio.to_thread(output.close, PATIENCE)
+    down, up = said
+    assert down.startswith(f"metrics is down: 127.0.0.1:{port}: Address already in use")
+    assert up == "metrics is up again"
+
+
+@asynccontextmanager
+async def served(**options: Any) -> AsyncIterator[MetricsOutput]:
+    """A line with one node, polled three times, and its metrics."""
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)], paced=False)))
+    controller = Hcp2Controller(bus, 5)
+    output = MetricsOutput("metrics", MetricsSettings(port=0, **options), bus)
+    async with bus:
+        await controller.write(1, 12.5)
+        group = bus.poll_group("axes", period=0.02, points=[controller.point("1")])
+        async for snapshot in group:
+            if snapshot.cycle == 3:
+                break
+        group.pause()
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        try:
+            yield output
+        finally:
+            await asyncio.to_thread(output.close, PATIENCE)
+    assert not output._thread.is_alive()
+
+
+@pytest.mark.asyncio
+async def test_values_are_gauges_where_their_group_is_named() -> None:
+    async with served(groups=("axes",)) as output:
+        metrics = await asyncio.to_thread(scraped, output.port)
+    labels = {"group": "axes", "node": "5", "item": "1", "unit": ""}
+    assert of(metrics, "value", **labels) == 12.5
+    assert of(metrics, "value_time_seconds", **labels) == pytest.approx(time.time(), abs=60)
+    async with served() as output:
+        metrics = await asyncio.to_thread(scraped, output.port)
+    assert not any(name.startswith("busmaster_value") for name, _ in metrics)
+
+
+@pytest.mark.asyncio
+async def test_a_stale_value_is_told_as_such_and_a_lost_one_keeps_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    output = MetricsOutput("metrics", MetricsSettings(port=0, groups=("axes",)), bus)
+    labels = {"group": "axes", "node": "5", "item": "10", "unit": ""}
+    async with bus:
+        point = Hcp2Controller(bus, 5).point("10")
+        group = bus.poll_group("axes", period=1000.0, points=[point])
+        async for _ in group:
+            break
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        assert (of(metrics, "line_up"), of(metrics, "node_up", node="node 5")) == (1, 1)
+        assert of(metrics, "value_good", **labels) == 1
+        read_at = of(metrics, "value_time_seconds", **labels)
+        await point.write(7.0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        assert (of(metrics, "value", **labels), of(metrics, "value_good", **labels)) == (0, 0)
+        monkeypatch.setattr(MemoryPort, "open", never_opens)
+        transport = bus._pump._transport
+        assert isinstance(transport, MemoryTransport)
+        transport.lose(OSError("unplugged"))
+        while not bus.condition.is_lost:  # noqa: ASYNC110  nobody tells it
+            await asyncio.sleep(0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert (of(metrics, "line_up"), of(metrics, "node_up", node="node 5")) == (0, 0)
+    assert of(metrics, "value_good", **labels) == 0
+    assert of(metrics, "value_time_seconds", **labels) == read_at
+    assert ("busmaster_value", frozenset(labels.items())) not in metrics
+
+
+PAGE = (Path(__file__).parents[3] / "docs" / "howto" / "mqtt-and-grafana.md").read_text()
+"""What users are told to put into panels and alerts."""
+
+
+def firing(metrics: Metrics) -> set[str]:
+    """Which alerts of the page, `METRIC == 0` or `METRIC != 0`, fire on these samples, as Prometheus computes them."""
+    alerts = re.findall(r"`(busmaster_\w+) (==|!=) 0`", PAGE)
+    assert len(alerts) >= 5
+    return {
+        name
+        for name, sign in alerts
+        if any(sample == name and (value == 0) == (sign == "==") for (sample, _), value in metrics.items())
+    }
+
+
+@pytest.mark.asyncio
+async def test_the_alerts_of_the_page_fire_when_the_line_is_lost_and_not_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    counts = OutputStatistics("sqlite", "written", 10, 0, 0, "")
+    output = MetricsOutput("metrics", MetricsSettings(port=0, groups=("axes",)), bus, outputs=lambda: (counts,))
+    async with bus:
+        point = replace(Hcp2Controller(bus, 5).point("10"), meaning=Meaning(high=5.0))
+        group = bus.poll_group("axes", period=0.05, points=[point])
+        async for _ in group:
+            break
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        calm = await asyncio.to_thread(scraped, output.port)
+        monkeypatch.setattr(MemoryPort, "open", never_opens)
+        transport = bus._pump._transport
+        assert isinstance(transport, MemoryTransport)
+        transport.lose(OSError("unplugged"))
+        while not bus.condition.is_lost:  # noqa: ASYNC110  nobody tells it
+            await asyncio.sleep(0)
+        lost = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert firing(calm) == set()
+    assert firing(lost) == {"busmaster_line_up", "busmaster_node_up", "busmaster_value_good"}
+    named = set(re.findall(r"busmaster_(?!group)\w+|busmaster_group_missed_total", PAGE))
+    assert named <= {name for name, _ in calm}
+
+
+async def never_opens(*_: object, **__: object) -> None:
+    raise LineDown("unplugged")
+
+
+@pytest.mark.parametrize(("value", "number"), [(3, 3.0), (2.5, 2.5), (Health.UP, None), ((1, 2), None), ("on", None)])
+def test_what_is_no_number_is_no_gauge(value: object, number: float | None) -> None:
+    assert number_of(value) == number
+
+
+def threads_of_ours() -> int:
+    return sum(thread.name.startswith("busmaster") for thread in threading.enumerate())
+
+
+@pytest.mark.slow
+@pytest.mark.asyncio
+async def test_a_thousand_half_open_connections_cost_no_threads_and_keep_no_scrape_out(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    async with served() as output:
+        await asyncio.to_thread(scraped, output.port)
+        threads, descriptors = threads_of_ours(), len(os.listdir("/proc/self/fd"))
+        half_open = []
+        try:
+            for _ in range(700):
+                half_open.append(socket.create_connection(("127.0.0.1", output.port), PATIENCE))
+                half_open[-1].sendall(b"GET /metrics HT")
+            await asyncio.to_thread(scraped, output.port)
+            assert threads_of_ours() <= threads
+            assert len(os.listdir("/proc/self/fd")) - descriptors < 700 + 256 + 100
+        finally:
+            for connection in half_open:
+                connection.close()
+        await asyncio.to_thread(scraped, output.port)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.slow
+@pytest.mark.asyncio
+async def test_two_hundred_scrapes_at_once_are_all_answered_by_a_few_threads(capfd: pytest.CaptureFixture[str]) -> None:
+    async def scrape(port: int) -> bytes:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
+        answer = await reader.read()
+        writer.close()
+        return answer
+
+    async with served() as output:
+        await asyncio.to_thread(scraped, output.port)
+        threads = threads_of_ours()
+        async with asyncio.timeout(PATIENCE):
+            answers = await asyncio.gather(*(scrape(output.port) for _ in range(200)))
+        assert threads_of_ours() <= threads
+    assert all(answer.startswith(b"HTTP/1.1 200 OK") and b"busmaster_line_busy" in answer for answer in answers)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("asked", "answered"),
+    [
+        (b"POST /metrics HTTP/1.1\r\n\r\n", b"HTTP/1.1 405"),
+        (b"what is this\r\n\r\n", b"HTTP/1.1 400"),
+        (b"x" * 100_000, b""),
+        (b"", b""),
+    ],
+)
+async def test_what_is_no_scrape_is_refused_and_the_next_one_answered(asked: bytes, answered: bytes) -> None:
+    async with served() as output:
+        reader, writer = await asyncio.open_connection("127.0.0.1", output.port)
+        with suppress(ConnectionError):
+            writer.write(asked)
+            writer.write_eof()
+            assert (await reader.read()).startswith(answered)
+        writer.close()
+        await asyncio.to_thread(scraped, output.port)

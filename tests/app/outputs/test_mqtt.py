@@ -1,0 +1,355 @@
+"""MQTT, to a real mosquitto: values, health, last will, a broker that goes and comes back, and commands in."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from busmaster.app.outputs.base import Happening
+from busmaster.app.outputs.mqtt import MqttOutput
+from busmaster.app.outputs.settings import MqttSettings
+from busmaster.app.service.payload import NoCommand, Payload, read_payload
+from busmaster.bus.bus import Bus
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.errors import InvalidCommand, NoReply
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
+from tests.app.outputs.brokers import Broker, needs_mosquitto
+from tests.app.outputs.cycles import BUS, cycle, until
+from tests.patience import PATIENCE
+from tests.ports import free_port
+
+if TYPE_CHECKING:
+    from aiomqtt import Client
+
+Heard = tuple[str, Any, bool]
+"""Topic, payload, and whether it was retained."""
+
+pytestmark = needs_mosquitto
+
+
+class Seen(MqttOutput):
+    """Whose connection can be cut."""
+
+    client: Client
+
+    def _client(self) -> Client:
+        self.client = super()._client()
+        return self.client
+
+    def cut(self) -> None:
+        connection = self.client._client.socket()
+        assert isinstance(connection, socket.socket)
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+def emulated(handle: type[Hcp2Controller], address: int) -> Bus:
+    return Bus(MemoryPort(Line(handle.profile.line, [make_device("hcp2", address)], paced=False)))
+
+
+@asynccontextmanager
+async def publishing(
+    broker: Broker, bus: Bus = BUS, say: Callable[[str], None] = lambda _: None, **options: Any
+) -> AsyncIterator[Seen]:
+    commands = options.pop("commands", {})
+    settings = MqttSettings(port=broker.port, prefix="line", **options)
+    output = Seen("mqtt", settings, bus, say, commands=commands)
+    output._retry = 0.02
+    output.start()
+    try:
+        yield output
+    finally:
+        await asyncio.to_thread(output.close, PATIENCE)
+
+
+@asynccontextmanager
+async def listening(broker: Broker, *topics: str, **options: Any) -> AsyncIterator[Client]:
+    import aiomqtt
+
+    async with aiomqtt.Client("127.0.0.1", broker.port, **options) as client:
+        for topic in topics:
+            await client.subscribe(topic, qos=1)
+        yield client
+
+
+async def heard(client: Client, count: int) -> list[Heard]:
+    found: list[Heard] = []
+    async with asyncio.timeout(PATIENCE):
+        async for message in client.messages:
+            text = bytes(message.payload).decode()
+            found.append((str(message.topic), json.loads(text) if text[:1] in "{[" else text, message.retain))
+            if len(found) == count:
+                break
+    return found
+
+
+async def settled(output: MqttOutput) -> None:
+    await asyncio.to_thread(until, lambda: output.statistics().waiting == 0)
+
+
+@pytest.mark.asyncio
+async def test_values_and_events_are_published_each_under_its_name(broker: Broker) -> None:
+    async with listening(broker, "line/values/#", "line/events") as client, publishing(broker) as output:
+        output.offer(cycle(1, 12.5, NoReply("no reply")))
+        output.offer(Happening(BUS.wall_time(), "winder", "winder is down"))
+        first, second, event = await heard(client, 3)
+    assert first[0] == "line/values/5/1"
+    assert {key: first[1][key] for key in ("value", "unit", "error", "late")} == {
+        "value": 12.5,
+        "unit": "",
+        "error": None,
+        "late": False,
+    }
+    assert (second[0], second[1]["value"], second[1]["error"]) == ("line/values/5/2", None, "no reply")
+    assert (event[0], event[1]["text"]) == ("line/events", "winder is down")
+    assert output.statistics().written == 3
+
+
+@pytest.mark.asyncio
+async def test_the_last_values_are_retained_and_a_cycle_may_be_one_message(broker: Broker) -> None:
+    async with publishing(broker, messages="cycle") as output:
+        output.offer(cycle(1, 1.0, 2.0))
+        output.offer(cycle(2, 3.0, 4.0))
+        await settled(output)
+    async with listening(broker, "line/cycles/#") as client:
+        [(topic, payload, retained)] = await heard(client, 1)
+    assert (topic, retained, payload["cycle"]) == ("line/cycles/axes", True, 2)
+    assert payload["samples"]["5/2"]["value"] == 4
+
+
+@pytest.mark.asyncio
+async def test_it_says_that_it_is_there_and_the_broker_says_so_when_it_is_not(broker: Broker) -> None:
+    async with listening(broker, "line/status") as client:
+        async with publishing(broker) as output:
+            said = await heard(client, 1)
+            output.cut()
+            said += await heard(client, 2)
+        said += await heard(client, 1)
+    assert [payload for _, payload, _ in said] == ["online", "offline", "online", "offline"]
+
+
+@pytest.mark.asyncio
+async def test_health_of_line_and_nodes_is_retained_and_told_when_it_changes(broker: Broker) -> None:
+    bus = emulated(Hcp2Controller, 5)
+    controller = Hcp2Controller(bus, 5)
+    async with publishing(broker, bus), listening(broker, "line/line", "line/health/#") as client:
+        before = await heard(client, 2)
+        async with bus:
+            await controller.read(1)
+            after = await heard(client, 2)
+    states = [
+        {topic: payload.get("health", payload.get("line")) for topic, payload, _ in found} for found in (before, after)
+    ]
+    assert states == [
+        {"line/line": "offline", "line/health/5": "unknown"},
+        {"line/line": "ready", "line/health/5": "up"},
+    ]
+
+
+@pytest.mark.asyncio
+async def test_a_broker_that_is_down_for_a_while_costs_nothing(broker: Broker) -> None:
+    """Sent again is what it had not acknowledged: values may come twice, in order, but none is missing."""
+    session = {"identifier": "historian", "clean_session": False}
+    said: list[str] = []
+    async with listening(broker, "line/values/#", **session):
+        pass
+    async with publishing(broker, say=said.append) as output:
+        for number in range(1, 31):
+            output.offer(cycle(number, float(number)))
+            if number == 10:
+                await settled(output)
+                await asyncio.to_thread(broker.stop)
+                await asyncio.to_thread(until, lambda: "down" in "".join(said))
+        broker.start()
+        await settled(output)
+    assert (output.written, output.dropped) == (30, 0)
+    assert said[-1] == "mqtt is up again"
+    async with listening(broker, **session) as client:
+        found = [payload["value"] for _, payload, _ in await heard(client, 30)]
+    assert found == list(range(1, 31))
+
+
+@pytest.mark.asyncio
+async def test_without_a_broker_the_oldest_are_dropped_and_counted() -> None:
+    output = MqttOutput("mqtt", MqttSettings(port=free_port(), buffer=10), BUS)
+    output.start()
+    for number in range(100):
+        output.offer(cycle(number, 1.0, 2.0))
+    await asyncio.to_thread(until, lambda: bool(output.error))
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.waiting) == (0, 190, 10)
+    assert "refused" in counts.error
+    await asyncio.to_thread(output.close, PATIENCE)
+    assert output.dropped == 200
+
+
+@contextmanager
+def answering(answer: bytes) -> Iterator[int]:
+    """Something that says this to who connects, and nothing else."""
+
+    def serve() -> None:
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return  # it was shut down
+            with connection:
+                connection.recv(1000)
+                connection.sendall(answer)
+                over.wait()
+
+    over = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield server.getsockname()[1]
+        finally:
+            over.set()
+            server.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+@pytest.mark.slow
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (b"\x20\x02\x00\x01", "does not speak MQTT 5, which this output needs"),  # by 3.1.1
+        (b"\x20\x03\x00\x84\x00", "does not speak MQTT 5, which this output needs"),
+        (b"\x20\x03\x00\x87\x00", "Not authorized"),
+        (b"", "did not answer in 0.1 s; does it speak MQTT 5?"),
+    ],
+)
+async def test_a_broker_that_will_not_do_is_told_in_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, answer: bytes, said: str
+) -> None:
+    if not answer:
+        monkeypatch.setattr("busmaster.app.outputs.mqtt.TIMEOUT", 0.1)
+    told: list[str] = []
+
+    with answering(answer) as port:
+        output = MqttOutput("mqtt", MqttSettings(port=port), BUS, told.append)
+        output.start()
+        await asyncio.to_thread(until, lambda: bool(told))
+        await asyncio.to_thread(output.close, 5)
+    assert told[0].startswith("mqtt is down: ")
+    assert said in told[0]
+
+
+@pytest.mark.asyncio
+async def test_a_command_is_obeyed_where_the_file_allows_it_and_every_one_is_answered(broker: Broker) -> None:
+    bus = emulated(Hcp2Controller, 5)
+    controller = Hcp2Controller(bus, 5)
+    commands = {"5/1": controller.point("1"), "5/100": controller.element(100)}
+    async with listening(broker, "line/result/#") as client:
+        await client.publish("line/set/5/1", "99", qos=1, retain=True)
+        async with bus, publishing(broker, bus, commands=commands):
+            [retained] = await heard(client, 1)
+            await client.publish("line/set/5/1", None, qos=1, retain=True)
+            await heard(client, 1)
+            answers = {}
+            for topic, payload in (("5/1", "12.5"), ("5/2", "1"), ("5/1", "on"), ("5/100", "1")):
+                await client.publish(f"line/set/{topic}", payload, qos=1)
+                [(where, answer, _)] = await heard(client, 1)
+                answers[topic, payload] = (where, answer["ok"], answer.get("error", ""))
+            assert await controller.read(1) == 12.5
+    assert "retained" in retained[1]["error"]
+    assert answers["5/1", "12.5"] == ("line/result/5/1", True, "")
+    assert answers["5/2", "1"][:2] == ("line/result/5/2", False)
+    assert "allow_commands" in answers["5/2", "1"][2]
+    assert "'on' is neither a number" in answers["5/1", "on"][2]
+    assert "refused" in answers["5/100", "1"][2]
+
+
+@pytest.mark.asyncio
+async def test_without_an_allow_list_nobody_listens(broker: Broker) -> None:
+    """Where somebody does, everything is answered."""
+    async with listening(broker, "line/status", "line/result/#") as client:
+        async with publishing(broker):
+            said = await heard(client, 1)
+            await client.publish("line/set/5/1", "1", qos=1)
+        said += await heard(client, 1)
+    assert [payload for _, payload, _ in said] == ["online", "offline"]
+
+
+COMMANDS = [
+    (b"12.5", Payload(12.5)),
+    (b"-1", Payload(-1)),
+    (b" [1, 2.5] ", Payload([1, 2.5])),
+    (bytearray(b"0"), Payload(0)),
+    (b'{"value": 1}', Payload(1)),
+    (b'{"value": [1], "id": "a1", "expires": 17.5}', Payload([1], "a1", 17.5)),
+    (b'{"value": 1, "id": 7}', Payload(1, "7")),
+]
+
+
+@pytest.mark.parametrize(("payload", "said"), COMMANDS)
+def test_a_command_is_a_number_or_a_list_of_numbers_perhaps_with_its_id_and_end(payload: bytes, said: Payload) -> None:
+    assert read_payload(payload) == said
+
+
+NO_COMMANDS = [
+    *(b"", b"on", b"true", b"null", b"NaN", b"[]", b"{}", b'["1"]', b"[true]", b"\xff", None),
+    *(
+        b"1e308",
+        b"1" * 400,
+        b"9" * 5000,
+        b"1" + b" " * 4096,
+        b"[" * 4000,
+        b'{"value": 1, "x": 2}',
+        b'{"value": 1, "expires": "soon"}',
+    ),
+    *(b'{"value": 1e999}', b'{"value": 1, "id": []}', b'{"value": 1, "expires": 1e999}'),
+]
+
+
+@pytest.mark.parametrize("payload", NO_COMMANDS, ids=lambda payload: repr(payload)[:20])
+def test_anything_else_is_refused(payload: bytes | None) -> None:
+    with pytest.raises(InvalidCommand):
+        read_payload(payload)
+
+
+def test_a_number_that_is_too_large_is_not_said_to_be_none() -> None:
+    with pytest.raises(InvalidCommand, match=r"^'\[1, 1e308\]' is larger than 1e\+15"):
+        read_payload(b"[1, 1e308]")
+
+
+@pytest.mark.parametrize(
+    ("payload", "mark"),
+    [
+        (b'{"id": "a", "value": "NaN"}', "a"),
+        (b'{"id": 7, "value": NaN}', "7"),
+        (b'{"id": 7}', "7"),
+        (b'{"id": 7, "value": 1, "x": 2}', "7"),
+        (b'{"id": 7, "value": 1e308}', "7"),
+        (b'{"id": 7, "value": 1, "expires": "soon"}', "7"),
+        (b'{"id": [7], "value": 1}', ""),
+        (b'{"id": "\\ud800", "value": 1}', ""),
+        (b'{"id": "a\\nb", "value": 1}', ""),
+        (b'"id"', ""),
+    ],
+)
+def test_what_is_no_command_keeps_the_id_that_it_has(payload: bytes, mark: str) -> None:
+    with pytest.raises(NoCommand) as caught:
+        read_payload(payload)
+    assert caught.value.id == mark
+
+
+def test_an_end_in_milliseconds_is_refused_since_it_would_never_come() -> None:
+    with pytest.raises(InvalidCommand, match="not in milliseconds"):
+        read_payload(b'{"value": 1, "expires": 1767225600000}')
+
+
+def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InvalidCommand, match="No such file"):
+        MqttOutput("mqtt", MqttSettings(password_file=str(tmp_path / "none")), BUS)

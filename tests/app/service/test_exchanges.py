@@ -1,0 +1,167 @@
+"""What passes on a line, told to programs that look at its wire: by a real socket, on an emulated line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from busmaster import Hcp2Controller, RemoteBus
+from busmaster.app.service.exchanges import HEARD_AT_ONCE, MOST_BYTES, MOST_KEPT, Listener, said_passage
+from busmaster.arbiter.tap import Attempt, Verdict
+from busmaster.errors import NoReply
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, until
+from tests.app.service.schema import check
+from tests.stories import in_use
+
+
+def attempt() -> Attempt:
+    return Attempt("hcp2", 5, hcp2.Read(1), PATIENT)
+
+
+def tapped(line: Served) -> bool:
+    return line.bus._pump.tap is not None
+
+
+class Told(NamedTuple):
+    """An exchange as it is told; times are in microseconds."""
+
+    said: list[tuple[int, str, str]]
+    bytes: int
+    ended: int
+    protocol: str
+    address: int
+    command: str
+    writes: bool
+    purpose: str
+    request: int
+    attempt: int
+    verdict: str
+    result: str
+    late: bool
+    quiet_time: int
+
+    @property
+    def begun(self) -> int:
+        return self.said[0][0]
+
+
+class Heard:
+    """The exchanges that were told and that a caller has asked for."""
+
+    def __init__(self) -> None:
+        self.exchanges: list[Told] = []
+
+    def __call__(self, body: Mapping[str, Any]) -> None:
+        told = [Told(*one) for one in body["exchanges"] if len(one) == len(Told._fields)]
+        self.exchanges += [one for one in told if not one.purpose]
+
+
+def test_each_exchange_is_told_with_what_was_said_and_what_came_of_it(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        heard = Heard()
+        await remote.exchanges(heard)
+        await until(lambda: tapped(line))
+        in_use(line.bus)
+        before = line.bus.now()
+        controller = Hcp2Controller(remote, 5)
+        await controller.write(1, 2.5)
+        await controller.read(1)
+        after = line.bus.now()
+        await until(lambda: len(heard.exchanges) == 2)
+        write, read = heard.exchanges
+        assert (write.protocol, write.command, write.writes, write.verdict) == (
+            "hcp2",
+            "write element 1 = 2.5",
+            True,
+            "ok",
+        )
+        assert (read.address, read.result, read.request, read.attempt, read.late) == (5, "2.5", 2, 1, False)
+        assert write.ended <= read.begun <= read.said[-1][0] <= read.ended
+        assert before <= write.begun / 1e6 <= read.ended / 1e6 <= after
+        assert read.said[0][1] == "master"
+        assert any(who == "node" for _, who, _ in read.said)
+        assert bytes.fromhex(read.said[0][2]) == hcp2.Read(1).open(5, PATIENT).request
+        assert read.bytes == sum(len(bytes.fromhex(data)) for _, _, data in read.said)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_attempts_at_a_node_that_does_not_answer_are_told_and_the_line_resynchronises_between_them(
+    tmp_path: Path,
+) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        heard = Heard()
+        await remote.exchanges(heard)
+        await until(lambda: tapped(line))
+        absent = Hcp2Controller(remote, ABSENT)
+        with pytest.raises(NoReply) as caught:
+            await absent.read(1)
+        await until(lambda: len(heard.exchanges) == caught.value.attempts)
+        first, second, *_ = told = heard.exchanges
+        assert [(one.attempt, one.verdict) for one in told] == [(n + 1, "no reply") for n in range(len(told))]
+        assert {one.request for one in told} == {first.request}
+        assert 0 < second.quiet_time - first.quiet_time <= second.begun - first.ended + 10_000
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_line_is_tapped_only_while_somebody_looks(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        for _ in range(3):
+            assert not tapped(line)
+            stream = await remote.exchanges(Heard())
+            other = await remote.exchanges(Heard())
+            await until(lambda: tapped(line))
+            stream.close()
+            await Hcp2Controller(remote, 5).read(1)
+            assert tapped(line)
+            other.close()
+            await until(lambda: not tapped(line))
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
+    listener, one = Listener(), attempt()
+    listener.received(0.0, b"of an exchange that nobody listened to", None)
+    listener.transmitted(0.0, b"ask", one)
+    one.end(Verdict.OK, None, 0.0)
+    for number in range(3):
+        listener.received(1.5 + number, b"x" * MOST_BYTES, None)
+    [_, passage], _ = listener.take()
+    told = json.loads(json.dumps(said_passage(passage)))
+    check("unexpected", told)
+    assert told == [[[1_500_000, "node", b"x".hex() * MOST_BYTES]], 3 * MOST_BYTES]
+    assert listener.take() == ([], 0)
+
+
+def test_of_a_flood_no_more_is_kept_than_is_told() -> None:
+    listener = Listener()
+    listener.transmitted(0.0, b"ask", attempt())
+    for number in range(10 * HEARD_AT_ONCE):
+        listener.received(float(number), b"x" * 1000, None)
+        assert len(listener._heard) < HEARD_AT_ONCE
+    assert sum(len(passage.said) for passage in listener._passages) <= 2
+
+
+def test_of_too_many_exchanges_the_oldest_are_left_out_and_counted() -> None:
+    listener = Listener()
+    for number in range(MOST_KEPT + 3):
+        listener.transmitted(float(number), b"x", attempt())
+    assert listener.take() == ([], 3)
+
+
+def test_what_closes_an_exchange_belongs_to_it() -> None:
+    listener, one = Listener(), attempt()
+    listener.transmitted(1.0, b"ask", one)
+    listener.received(1.1, b"answer", one)
+    listener.transmitted(1.2, b"ack", None)
+    listener.received(1.3, b"!", None)
+    one.end(Verdict.OK, None, 1.2)
+    passages, _ = listener.take()
+    assert [len(passage.said) for passage in passages] == [3, 1]

@@ -1,0 +1,476 @@
+"""Handles, points, groups and errors on a line that another program owns: as on one's own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster import Hcp2Controller, MicroFlexDrive, Node, Point, Priority, RemoteBus, connect, errors, ext
+from busmaster.app.service import link
+from busmaster.app.service.failures import error_of, said_error
+from busmaster.app.service.link import Link
+from busmaster.errors import (
+    BusClosed,
+    BusError,
+    InvalidCommand,
+    LineDown,
+    NodeDown,
+    NoReply,
+    NotStarted,
+    Refused,
+    Superseded,
+    WriteUnconfirmed,
+)
+from busmaster.events import NodeChanged
+from busmaster.protocols.hcp2 import StatusWord
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, served, until
+
+TAKE = Link._take
+
+
+def test_a_handle_reads_and_writes_on_another_programs_line(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        theirs, ours = Hcp2Controller(remote, 5), Hcp2Controller(line.bus, 5)
+        await theirs.write(1, 123.5, verify=True)
+        assert await ours.read(1) == await theirs.read(1, priority=Priority.URGENT) == 123.5
+        drive = MicroFlexDrive(remote, 7)
+        await drive.enable()
+        status = await drive.status()
+        assert isinstance(status, StatusWord)
+        assert StatusWord.ENABLED in status
+        await drive.disable()
+        assert (remote.line, remote.about["clients"]) == ("the emulated line", 1)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_handles_may_be_made_before_the_bus_is_entered(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with served(tmp_path) as line:
+            ext.rename(Node.of(Hcp2Controller(line.bus, 5)), "winder")
+            remote = connect(line.address)
+            controller = Hcp2Controller(remote, 5)
+            with pytest.raises(BusClosed, match="node 5: the bus is not open"):
+                await controller.read(1)
+            async with remote:
+                await controller.write(1, 1)
+                assert controller.node.label == "winder"
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("name", [name for name in errors.__all__ if name not in ("Addressed", "InvalidCommand")])
+def test_an_error_comes_back_as_the_same_class_with_the_same_fields(name: str) -> None:
+    kind: type[BusError] = getattr(errors, name)
+    error = kind("it went wrong", command="read element 1", attempts=3)
+    error.line, error.label, error.address = "/dev/ttyUSB0", "winder", 5
+    error.__cause__ = NoReply("no reply", hint="look again")
+    again = error_of(json.loads(json.dumps(said_error(error))))
+    assert type(again) is kind
+    assert vars(again) == vars(error)
+    assert str(again) == str(error)
+    assert type(again.__cause__) is NoReply
+    assert again.__cause__.hint == "look again"
+
+
+def test_a_final_refusal_stays_one() -> None:
+    again = error_of(said_error(Refused("a prefix may be stored", confirm=False)))
+    assert isinstance(again, Refused)
+    assert not again.confirm
+
+
+def test_an_error_of_the_line_is_raised_here_with_its_node_and_command(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        with pytest.raises(NoReply, match="no reply") as caught:
+            await Hcp2Controller(remote, ABSENT).read(1, retries=0)
+        error = caught.value
+        assert (error.line, error.address, error.attempts) == ("the emulated line", ABSENT, 1)
+        ends: list[type] = [type(error)]
+        while NodeDown not in ends:  # until the budget for dead nodes is spent
+            [end] = await asyncio.gather(Hcp2Controller(remote, ABSENT).read(1), return_exceptions=True)
+            ends.append(type(end))
+        assert set(ends) == {NoReply, NodeDown}
+        with pytest.raises(InvalidCommand, match="address"):
+            Hcp2Controller(remote, 999)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_times_run_out_as_on_the_line(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        absent = Hcp2Controller(remote, ABSENT, timings=PATIENT)
+        holding = asyncio.ensure_future(absent.read(1, retries=0))
+        await line.sent()
+        present = Hcp2Controller(remote, 5)
+        with pytest.raises(NotStarted):
+            await present.write(1, 1, start_within=0.01)
+        with pytest.raises(NotStarted):
+            await present.write(1, 1, finish_within=0.01)
+        with pytest.raises(NoReply):
+            await holding
+        assert line.audit() == [("5/write element 1 = 1", "not started")] * 2
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_cancelling_here_cancels_there(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        holding = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+        await line.sent()
+        waiting = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 7))
+        await until(lambda: line.bus.statistics().backlog)
+        waiting.cancel()
+        holding.cancel()
+        assert await asyncio.gather(waiting, holding, return_exceptions=True)
+        await until(lambda: len(line.records) == 2)
+        assert sorted(line.audit()) == [
+            ("5/write element 1 = 7", "not started"),
+            ("9/write element 1 = 1", "unconfirmed"),
+        ]
+        assert await Hcp2Controller(line.bus, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_stop_of_one_program_counts_for_all(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with connect(line.address) as other:
+            mine, theirs, own = (MicroFlexDrive(bus, 7) for bus in (remote, other, line.bus))
+            await mine.status()
+            await theirs.status()
+            stops = theirs.node.stops
+            await mine.disable()
+            await until(lambda: theirs.node.stops == stops + 1)
+            assert own.node.stops == mine.node.stops == stops + 1
+            with pytest.raises(Superseded, match="told to stop"):
+                await theirs.node.request(hcp2.Write(5, (1,)), stops_seen=stops)
+            own.node.note_stop()
+            await until(lambda: theirs.node.stops == mine.node.stops == stops + 2)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_stop_of_long_ago_does_not_keep_cancel_errors_from_leaving_the_drive_enabled(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        own = MicroFlexDrive(line.bus, 7)
+        await own.disable()
+        await own.enable()
+        status = await MicroFlexDrive(remote, 7).cancel_errors()  # it names the drive, and asks at once
+        assert StatusWord.ENABLED in status
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_hearing_of_a_node_is_not_naming_it(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        async with connect(line.address) as other:
+            await Hcp2Controller(other, 5).read(1)
+            await anext(events)
+        await until(lambda: not line.bus.nodes)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_handles_of_one_node_agree_on_its_timings(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        first = Hcp2Controller(remote, 5, timings=PATIENT)
+        with pytest.raises(InvalidCommand, match="other timings or retries"):
+            Hcp2Controller(remote, 5, retries=7)
+        Hcp2Controller(remote, 5, timings=PATIENT)
+        assert await first.read(1) == await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_disable_overtakes_what_another_program_waits_to_write(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with connect(line.address) as other:
+            holding = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).read(1, retries=0))
+            await line.sent()
+            enabling = asyncio.ensure_future(MicroFlexDrive(other, 7).enable())
+            await until(lambda: line.bus.statistics().backlog)
+            await MicroFlexDrive(remote, 7).disable()
+            with pytest.raises(Superseded):
+                await enabling
+            await asyncio.gather(holding, return_exceptions=True)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_node_that_only_a_program_named_leaves_the_line_with_it(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        own = Hcp2Controller(line.bus, 5).node
+        async with connect(line.address) as other:
+            for bus, address in ((remote, 5), (other, 5), (remote, 6), (other, 6)):
+                await Hcp2Controller(bus, address).read(1)
+            with pytest.raises(NoReply):
+                await Hcp2Controller(other, ABSENT).read(1, retries=0)
+            assert {node.address for node in line.bus.nodes} == {5, 6, ABSENT}
+        await until(lambda: len(line.bus.nodes) == 2)
+        await remote.__aexit__(None, None, None)
+        await line.alone()
+        assert line.bus.nodes == (own,)
+        assert Node.of(Hcp2Controller(line.bus, 5)).health.value == "up"
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_node_with_other_timings_than_the_owners_is_refused_by_its_first_request(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        Hcp2Controller(line.bus, 5)
+        with pytest.raises(InvalidCommand, match="other timings"):
+            await Hcp2Controller(remote, 5, timings=PATIENT).read(1)
+        assert await Hcp2Controller(remote, 6, timings=PATIENT, retries=1).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_poll_group_of_the_owner_is_read_as_there(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller, absent = Hcp2Controller(line.bus, 5), Hcp2Controller(line.bus, ABSENT)
+        points: list[Point[float]] = [controller.point("1"), absent.point("1")]
+        group = line.bus.poll_group("axes", period=0.02, points=points)
+        assert await remote.groups() == ("axes",)
+        theirs = await remote.group("axes")
+        ours = group.subscribe(1000)
+        async for snapshot in theirs:
+            same = await anext(ours)
+            while same.cycle < snapshot.cycle:
+                same = await anext(ours)
+            good, bad = snapshot[Hcp2Controller(remote, 5).point("1")], snapshot[Hcp2Controller(remote, 9).point("1")]
+            assert good == same[points[0]]
+            assert type(bad.error) is type(same[points[1]].error)
+            assert (snapshot.wall, snapshot.missed) == (same.wall, same.missed)
+            break
+        group.close()
+        assert [snapshot async for snapshot in theirs.subscribe()] == [] if not theirs._over else True
+        with pytest.raises(InvalidCommand, match="no poll group 'axis'; there are: none"):
+            await remote.group("axis")
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_program_polls_its_own_points_until_it_leaves(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with connect(line.address) as other:
+            drive = MicroFlexDrive(other, 7)
+            group = await other.poll_group("mine", period=0.02, points=[drive.status_word])
+            async for snapshot in group:
+                assert isinstance(snapshot[drive.status_word].value, StatusWord)
+                break
+            [name] = await remote.groups()
+            assert name.startswith("mine (")
+        await until(lambda: not (line.bus.groups or line.bus.nodes))
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_events_tell_what_happens_there(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        await remote.groups()  # it is told what happens from before this on
+        controller = Hcp2Controller(remote, 5)
+        await controller.read(1)
+        event = await anext(events)
+        assert isinstance(event, NodeChanged)
+        assert (event.node.label, event.before.value, event.after.value) == (controller.node.label, "unknown", "up")
+        statistics = await remote.statistics()
+        assert (statistics.exchanges, statistics.waits) == (1, line.bus.statistics().waits)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_lost_connection_ends_each_request_truthfully(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+        reading = asyncio.ensure_future(Hcp2Controller(remote, 5).read(1))
+        await line.sent()
+        [visit] = line.service._clients.values()
+        visit.connection.abort()
+        with pytest.raises(WriteUnconfirmed, match="the write may have been sent"):
+            await writing
+        with pytest.raises(LineDown, match="node 5: the connection to the program that owns the line was lost"):
+            await reading
+        with pytest.raises(LineDown, match="connect again"):
+            await Hcp2Controller(remote, 5).write(1, 1)
+        assert [event async for event in events] == []
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_what_was_not_handed_over_when_the_connection_was_lost_was_not_started(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        writing = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 1))
+        remote.link._end(LineDown, "it is lost", "connect again")  # before the loop turned
+        await asyncio.sleep(0)
+        remote2 = connect(line.address)
+        async with remote2:
+            assert remote2.link._connection is not None
+            remote2.link._connection.full = True
+            waiting = asyncio.ensure_future(Hcp2Controller(remote2, 5).write(1, 1))
+            await asyncio.sleep(0)
+            remote2.link._end(LineDown, "it is lost", "connect again")
+            with pytest.raises(NotStarted, match="it is lost"):
+                await waiting
+        with pytest.raises(LineDown):
+            await writing
+        assert line.records == []
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_an_owner_that_ends_tells_what_became_of_each_request(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with served(tmp_path) as line:
+            remote = connect(line.address)
+            async with remote:
+                writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+                await line.sent()
+                waiting = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 1))
+                await until(lambda: line.bus.statistics().backlog)
+                await line.service.__aexit__(None, None, None)
+                with pytest.raises(WriteUnconfirmed, match="the program that owns the line ends"):
+                    await writing
+                with pytest.raises(BusClosed, match="the program that owns the line ends"):
+                    await waiting
+                assert sorted(line.audit())[0][1] == "not started"
+                await line.service.__aenter__()
+
+    asyncio.run(run())
+
+
+def test_nobody_there_is_said_with_what_to_do(tmp_path: Path) -> None:
+    async def run() -> None:
+        with pytest.raises(LineDown, match=r"no program serves .*line.sock: .*; start busmaster run"):
+            async with connect(f"unix:{tmp_path}/line.sock"):
+                pass
+        with pytest.raises(LineDown, match="no program of this user serves 'slitter', and there are the lines: "):
+            async with connect("slitter"):
+                pass
+        with socket.create_server(("127.0.0.1", 0)) as left:
+            port = left.getsockname()[1]
+        with pytest.raises(LineDown, match=f"no program serves 127.0.0.1:{port}: Connection refused; start"):
+            async with connect(f"tcp://127.0.0.1:{port}"):
+                pass
+
+    asyncio.run(run())
+
+
+def test_a_program_that_could_not_connect_leaves_no_error_that_nobody_hears(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[link.Asked] = []
+    make = link.Asked
+
+    def kept(*arguments: Any) -> link.Asked:
+        asked.append(make(*arguments))
+        return asked[-1]
+
+    async def run() -> None:
+        monkeypatch.setattr(link, "Asked", kept)
+        with pytest.raises(LineDown):
+            await connect(f"unix:{tmp_path}/line.sock").__aenter__()
+        assert [one.future.cancelled() for one in asked] == [True]
+
+    asyncio.run(run())
+
+
+def test_an_owner_of_another_version_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(line: Served) -> None:
+        monkeypatch.setattr(link, "VERSIONS", (99,))
+        with pytest.raises(
+            LineDown, match=r"does not let this program in: the service protocol has version 3 here, not \[99\]"
+        ):
+            await connect(line.address).__aenter__()
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_that_has_the_line_and_stands_still_is_told_from_one_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.link.CONNECT_WITHIN", 0.05)
+    path = tmp_path / "line.sock"
+
+    async def run() -> None:
+        with pytest.raises(LineDown, match=r"that serves .*line.sock did not answer in 0.05 s; if it stands still"):
+            async with connect(f"unix:{path}"):
+                pass
+
+    with socket.socket(socket.AF_UNIX) as stopped:
+        stopped.bind(str(path))
+        stopped.listen()  # the system lets others in, and nobody looks
+        asyncio.run(run())
+
+
+def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        Hcp2Controller(line.bus, 5).point("1").limit(maximum=10)
+        controller = Hcp2Controller(remote, 5)
+        with pytest.raises(InvalidCommand, match="10"):
+            await controller.write(1, 11)
+        with pytest.raises(InvalidCommand, match="limits are held by the program that owns the line"):
+            controller.point("1").limit(maximum=20)
+        with pytest.raises(InvalidCommand, match="the safe state is sent by the program that owns the line"):
+            await controller.write(1, 1, safe=True)
+        await controller.write(1, 9)
+        line.bus._take_only_safe_writes()
+        with pytest.raises(Superseded):
+            await controller.write(1, 8)
+        assert [outcome for _, outcome in line.audit()] == ["refused", "written", "not started"]
+
+    on_a_served_line(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        '{"jsonrpc": "2.0", "id": 1, "error": 3}',
+        '{"jsonrpc": "2.0", "id": 1, "error": {"data": {"label": 3}}}',
+        "[]",
+        "{",
+    ],
+)
+def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
+    said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Link, "_take", TAKE)  # it is not held against the schema
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+        await line.sent()
+        remote.link.heard(said.replace('"id": 1', f'"id": {remote.link._count}'))
+        with pytest.raises(WriteUnconfirmed, match="what is not understood"):
+            await writing
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made_it_stale(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        mine, theirs = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(line.bus, 5).point("1")
+        assert await mine.read(max_age=60) == 0
+        group = await remote.poll_group("mine", period=60, points=[mine])
+        cycles = group.subscribe()
+        line.bus.groups[0].demand()
+        snapshot = await anext(cycles)
+        exchanges = line.bus.statistics().exchanges
+        assert mine.node.latest(mine) is snapshot[mine]
+        assert await mine.read(max_age=60) == 0
+        assert line.bus.statistics().exchanges == exchanges
+        await theirs.write(7)
+        assert await Hcp2Controller(remote, 6).read(1) == 0
+        assert mine.node.latest(mine) is None
+        assert await mine.read(max_age=60) == 7
+        group.close()
+        assert remote.latest(mine) is None
+
+    on_a_served_line(tmp_path, story)

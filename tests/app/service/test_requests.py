@@ -1,0 +1,198 @@
+"""What a program may ask of a line that another one owns: message by message, by a real socket."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
+from busmaster.app.service.authorisation import FRESH
+from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS
+from busmaster.errors import BacklogFull
+from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw
+from tests.patience import PATIENCE
+
+READ: dict[str, Any] = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+
+
+def write(*values: float, address: int = 5, **more: Any) -> dict[str, Any]:
+    return {
+        "protocol": "hcp2",
+        "address": address,
+        "command": {"command": "write", "element": 1, "values": list(values)},
+        **more,
+    }
+
+
+def error_of(said: dict[str, Any]) -> str:
+    name: str = said["error"]["data"]["error"]
+    return name
+
+
+@contextlib.asynccontextmanager
+async def busy(line: Served) -> AsyncIterator[None]:
+    """Keep the line busy with a request to a node that is not there."""
+    await Hcp2Controller(line.bus, 6).read(1)  # the line is ready
+    holding = asyncio.ensure_future(Hcp2Controller(line.bus, ABSENT, timings=PATIENT).read(1, retries=0))
+    await asyncio.sleep(0)
+    yield
+    with pytest.raises(NoReply):
+        await holding
+
+
+@pytest.mark.parametrize("values", [(0.0, 11.0), (11.0, 0.0), (1.0,)])
+def test_what_writes_anything_but_zeros_is_no_stop_and_does_not_pass_the_limits(
+    values: tuple[float, ...], tmp_path: Path
+) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        for element in (1, 2):
+            own.element(element).limit(minimum=0, maximum=10)
+        async with raw(line) as client:
+            said = await client.ask("request", **write(*values, stop=True))
+            assert "is no stop, which writes 0 and nothing else" in said["error"]["message"]
+        assert [await own.read(element) for element in (1, 2)] == [0, 0]
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_stop_of_several_values_passes_the_limits(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        await own.write(1, 20.0, 20.0)
+        for element in (1, 2):
+            own.element(element).limit(minimum=10)
+        async with raw(line) as client:
+            assert "minimum of 10" in (await client.ask("request", **write(0.0, 0.0)))["error"]["message"]
+            assert (await client.ask("request", **write(0.0, 0.0, stop=True)))["result"] is None
+        assert [await own.read(element) for element in (1, 2)] == [0, 0]
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("name", ["start_within", "finish_within"])
+@pytest.mark.parametrize("request_", [READ, write(1.0)], ids=["read", "write"])
+def test_what_a_request_took_to_come_is_taken_off_its_times(
+    name: str, request_: dict[str, Any], tmp_path: Path
+) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client, busy(line):
+            asked = line.bus.now() - PATIENCE / 2
+            said = await client.ask("request", **request_, requested=asked, options={name: PATIENCE / 2 - FRESH})
+            assert error_of(said) == "NotStarted"
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("request_", [READ, write(1.0)], ids=["read", "write"])
+def test_a_request_of_the_future_has_no_more_time_than_one_of_now(request_: dict[str, Any], tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client, busy(line):
+            said = await client.ask(
+                "request", **request_, requested=line.bus.now() + PATIENCE, options={"finish_within": 0.01}
+            )
+            assert error_of(said) == "NotStarted"
+
+    on_a_line(tmp_path, story)
+
+
+def test_an_error_says_by_its_code_whether_the_line_or_the_request_is_at_fault(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        Hcp2Controller(line.bus, 5).element(1).limit(maximum=10)
+        async with raw(line) as client:
+            for request, code, kind in (
+                ({**READ, "address": ABSENT, "options": {"retries": 0}}, BUS_ERROR, "NoReply"),
+                (write(11.0), INVALID_PARAMS, "InvalidCommand"),
+                ({**READ, "options": {"retries": -1}}, INVALID_PARAMS, "InvalidCommand"),
+                ({**READ, "options": {"safe": True}}, INVALID_PARAMS, "InvalidCommand"),
+            ):
+                said = await client.ask("request", **request)
+                assert (said["error"]["code"], error_of(said)) == (code, kind)
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_group_of_the_owner_has_all_its_points_there_too(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        own = [Hcp2Controller(line.bus, address).point(item) for address in (5, 6) for item in ("1", "2")]
+        group = line.bus.poll_group("axes", period=0.02, points=own)
+        theirs = await remote.group("axes")
+        snapshot = await anext(aiter(theirs))
+        assert [point.key for point in theirs.points] == ["5/1", "5/2", "6/1", "6/2"]
+        assert tuple(snapshot) == theirs.points
+        group.remove(own[1])
+        async for snapshot in theirs:
+            if len(snapshot.samples) == 3:
+                break
+        assert [point.key for point in theirs.points] == ["5/1", "6/1", "6/2"]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_of_urgent_requests_too_only_so_many_may_be_unanswered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 3)
+    monkeypatch.setattr("busmaster.app.service.requests.MOST_URGENT", 2)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with busy(line):
+            reads = (Hcp2Controller(remote, 5).read(1, priority=Priority.URGENT) for _ in range(7))
+            ended = await asyncio.gather(*reads, return_exceptions=True)
+        assert [type(end) for end in ended if isinstance(end, Exception)] == [BacklogFull] * 2
+        assert ended.count(0) == 5
+
+    on_a_served_line(tmp_path, story)
+
+
+async def asked(client: Raw, number: int, method: str, **params: Any) -> dict[str, Any]:
+    """Return the answer to a question, whatever news come before it."""
+    await client.say(method=method, params=params, id=number)
+    while (said := await client.hear()).get("id") != number:
+        pass
+    return said
+
+
+def polled(stream: int, **more: Any) -> dict[str, Any]:
+    point = {"protocol": "hcp2", "address": 5, "item": "1", "command": {"command": "read", "element": 1}}
+    return {"name": "mine", "period": 60.0, "stream": stream, "points": [point], **more}
+
+
+def test_a_poll_group_that_cannot_be_followed_is_not_polled(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            assert (await asked(client, 1, "poll", **polled(7)))["result"] == {"period": 60.0}
+            said = await asked(client, 2, "poll", **{**polled(7), "name": "another"})
+            assert "each with a number of its own" in said["error"]["message"]
+            assert len(line.bus.groups) == 1
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_polls_at_the_priority_of_a_poll_at_most(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        for asked in Priority:
+            name = asked.name.lower()
+            await remote.poll_group(name, period=60.0, points=[controller.point("1")], priority=asked)
+        found = [group.planned().priority for group in line.bus.groups]
+        assert found == [Priority.POLL, Priority.POLL, Priority.POLL, Priority.BACKGROUND]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_node_that_was_named_wrongly_is_asked_once_it_is_named_rightly(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        Hcp2Controller(line.bus, 5)
+        node = {"protocol": "hcp2", "address": 5}
+        async with raw(line) as client:
+            wrong = await client.ask("node", **node, retries=7)
+            assert "other retries" in wrong["error"]["message"]
+            assert "other retries" in (await client.ask("request", **READ))["error"]["message"]
+            assert (await client.ask("node", **node))["result"]["label"] == "node 5"
+            assert (await client.ask("request", **READ))["result"] == 0
+
+    on_a_line(tmp_path, story)

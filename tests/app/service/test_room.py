@@ -1,0 +1,136 @@
+"""How much one program asks at a time, and how soon it has its answer."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from busmaster import Hcp2Controller, RemoteBus
+from busmaster.app.service.connection import ServedConnection
+from busmaster.app.service.sequences import Room
+from busmaster.bus.requester import ORDINARY, Requester, RequestOptions
+from busmaster.errors import NotStarted
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.testing import run_in_virtual_time
+from busmaster.transport.pump import Pump
+from tests.app.service.lines import Served, on_a_line, on_a_served_line, raw
+
+NODE = cast("Requester", SimpleNamespace(label="node 5", line="line", address=5))
+COMMAND = hcp2.Read(1)
+
+
+def full(monkeypatch: pytest.MonkeyPatch, most: int = 1) -> Room:
+    """A room that is taken."""
+    monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", most)
+    room = Room(lambda: asyncio.get_running_loop().time())
+    assert all(room.take() for _ in range(most))
+    assert not room.take()
+    return room
+
+
+def test_who_waits_longest_is_let_in_first_and_says_how_long_that_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        room, let_in = full(monkeypatch), list[tuple[str, float]]()
+
+        async def wait(name: str) -> None:
+            let_in.append((name, await room.wait(ORDINARY, NODE, COMMAND)))
+
+        waiting = [asyncio.ensure_future(wait(name)) for name in ("first", "second")]
+        for _ in waiting:
+            await asyncio.sleep(1)
+            room.give_back()
+        await asyncio.gather(*waiting)
+        assert let_in == [("first", 1.0), ("second", 2.0)]
+        assert not room.take()
+        room.give_back()
+        assert room.take()
+
+    run_in_virtual_time(run())
+
+
+def test_room_that_is_given_to_one_who_gives_up_just_then_is_anothers(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        room = full(monkeypatch)
+        gone, other = (asyncio.ensure_future(room.wait(ORDINARY, NODE, COMMAND)) for _ in range(2))
+        await asyncio.sleep(0)
+        room.give_back()
+        gone.cancel()
+        assert await other == 0.0
+        assert gone.cancelled()
+        room.give_back()
+        assert room.take()
+
+    run_in_virtual_time(run())
+
+
+def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        room = full(monkeypatch)
+        with pytest.raises(NotStarted, match="1 requests of this program are not answered yet, and its time was over"):
+            await room.wait(RequestOptions(start_within=0.5), NODE, COMMAND)
+        gone = asyncio.ensure_future(room.wait(ORDINARY, NODE, COMMAND))
+        await asyncio.sleep(0)
+        gone.cancel()
+        await asyncio.gather(gone, return_exceptions=True)
+        room.give_back()
+        assert room.take()
+
+    run_in_virtual_time(run())
+
+
+def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+    turn, say = Pump.turn, ServedConnection.say
+
+    def turned(pump: Pump) -> None:
+        seen.append("turn")
+        turn(pump)
+        seen.append("turn over")
+
+    def said(connection: Any, text: str) -> None:
+        seen.append("answer")
+        say(connection, text)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        await controller.read(1)
+        monkeypatch.setattr(Pump, "turn", turned)
+        monkeypatch.setattr(ServedConnection, "say", said)
+        assert await controller.read(1) == 0
+        assert seen[-3:] == ["turn", "answer", "turn over"]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_read_that_its_program_gives_up_waits_for_the_line_no_longer(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        await Hcp2Controller(remote, 5).read(1)
+        [client] = line.service.clients
+        read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+        for number in (70, 71, 72):
+            client.take({"id": number, "method": "request", "params": read})
+        for number in (70, 71, 72):
+            client.take({"method": "cancel", "params": {"id": number}})
+        assert client.errands == ()
+        counts = line.bus.statistics()
+        assert (counts.cancelled, counts.backlog) == (3, 0)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_request_that_could_not_be_begun_leaves_its_number_free(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+            for _ in range(2):
+                said = await client.ask("request", **read, stops_seen=7)
+                assert said["error"]["data"]["error"] == "Superseded"
+            assert (await client.ask("request", **read))["result"] == 0
+
+    on_a_line(tmp_path, story)

@@ -1,0 +1,172 @@
+"""The safe state of a line that is sent because another program asks for it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster import Hcp2Controller, MemoryPort, RemoteBus, Service, connect
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.service.authorisation import SafeWrites
+from busmaster.app.service.permission import Access, Permission
+from busmaster.app.service.record import WriteRecord
+from busmaster.app.service.rights import Role
+from busmaster.app.service.safe import SafeWishes
+from busmaster.emulator.line import Line
+from busmaster.errors import BacklogFull, BusError, InvalidCommand, NoReply, Superseded, WriteUnconfirmed
+from busmaster.registry import make_device
+from tests.app.service.lines import PATIENT, until
+from tests.patience import PATIENCE
+
+TEXT = """
+port = "/dev/ttyUSB0?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 5
+points.speed = { item = "10", minimum = 100, maximum = 500 }
+[nodes.gone]
+protocol = "hcp2"
+address = 9
+points.speed = { item = "10" }
+"""
+SAFE = '[safe]\nwithin = 5.0\nrepeatable = ["winder/speed"]\nwrites = { "winder/speed" = 0 }\n'
+BOTH = """
+[safe]
+within = 0.3
+repeatable = ["winder/speed", "gone/speed"]
+writes = { "winder/speed" = 0, "gone/speed" = 0 }
+"""
+Story = Callable[[ConfiguredLine, Service, RemoteBus, list[WriteRecord]], Awaitable[None]]
+
+
+def on_a_line(folder: Path, text: str, story: Story) -> None:
+    async def run() -> None:
+        port = MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False))
+        line = ConfiguredLine(read(Source("line.toml", text)), port=port, outputs=False)
+        records: list[WriteRecord] = []
+        line.authorisation.record = records.append
+        async with (
+            asyncio.timeout(PATIENCE),
+            line,
+            Service(line.bus, authorisation=line.authorisation, path=folder / "line.sock") as service,
+            connect(service.address) as remote,
+        ):
+            await story(line, service, remote, records)
+
+    asyncio.run(run())
+
+
+def test_it_passes_limits_ends_what_waited_and_leaves_the_line_open(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        controller = Hcp2Controller(remote, 5)
+        await controller.write(10, 300)
+        absent = asyncio.ensure_future(Hcp2Controller(line.bus, 8, timings=PATIENT).read(1))
+        await asyncio.sleep(0)  # the line waits for its answer, and the write for the line
+        waiting = asyncio.ensure_future(Hcp2Controller(line.bus, 5).write(10, 400))
+        await asyncio.sleep(0)
+        assert await remote.enter_safe_state({"winder/speed": 0}) == {"winder/speed": None}
+        with pytest.raises(Superseded):
+            await waiting
+        with pytest.raises(NoReply):
+            await absent
+        assert await controller.read(10) == 0
+        await controller.write(10, 200)
+        assert [(one.interface, one.value) for one in records if one.interface == "safe"] == [("safe", 0)]
+        assert "process" in next(one.by for one in records if one.interface == "safe")
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_what_was_decided_before_does_not_undo_it(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        controller = Hcp2Controller(remote, 5)
+        before = controller.node.stops
+        await remote.enter_safe_state({"winder/speed": 0})
+        command = controller._write_command(10, (400.0,))
+        with pytest.raises(Superseded):
+            await controller.node.request(command, stops_seen=before)
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_a_point_that_is_not_confirmed_is_told_with_its_error(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        outcomes = await remote.enter_safe_state({"winder/speed": 0, "gone/speed": 0})
+        assert list(outcomes) == ["winder/speed", "gone/speed"]
+        assert isinstance(outcomes["gone/speed"], BusError)
+
+    on_a_line(tmp_path, TEXT + BOTH, story)
+
+
+def test_it_is_sent_to_the_end_when_whoever_asked_for_it_has_gone(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        async with connect(service.address) as other:
+            asking = asyncio.ensure_future(other.enter_safe_state({"winder/speed": 0, "gone/speed": 0}))
+            await until(lambda: service.line.safe_wishes.under_way)
+        with pytest.raises(WriteUnconfirmed):
+            await asking
+        await until(lambda: len(records) == 2)
+        assert {record.point for record in records} == {"winder/speed", "gone/speed"}
+        assert service.clients[0].permission.writes  # the other program is where it was
+
+    on_a_line(tmp_path, TEXT + BOTH, story)
+
+
+def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
+    send = SafeWishes._send
+
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        meant = asyncio.Event()
+
+        async def hold(wishes: SafeWishes, state: SafeWrites, by: str) -> dict[str, Any]:
+            await meant.wait()
+            return await send(wishes, state, by)
+
+        monkeypatch.setattr(SafeWishes, "_send", hold)
+        asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
+        await until(lambda: service.line.safe_wishes.under_way)
+        with pytest.raises(BacklogFull, match="1 requests of this program are not answered yet"):
+            await Hcp2Controller(remote, 5).read(10)
+        meant.set()
+        assert await asking == {"winder/speed": None}
+        assert await Hcp2Controller(remote, 5).read(10) == 0
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        with pytest.raises(InvalidCommand, match="has the safe state winder/speed = 0, and not winder/speed = 1"):
+            await remote.enter_safe_state({"winder/speed": 1})
+        for permission, complaint in (
+            (Permission("user me", Role.READ), "user me may read this line"),
+            (Permission("user me", Role.WRITE, {("hcp2", 9): None}), "user me may not write this"),
+        ):
+            line.authorisation.access = Access(users={os.getuid(): permission})
+            with pytest.raises(InvalidCommand, match=complaint):
+                await remote.enter_safe_state({"winder/speed": 0})
+        line.authorisation.access = Access()
+        line.authorisation.read_only = True
+        with pytest.raises(InvalidCommand, match="this line is read-only"):
+            await remote.enter_safe_state({"winder/speed": 0})
+        assert records == []
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_a_line_without_a_safe_state_says_so(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        with pytest.raises(InvalidCommand, match="knows no safe state: end it, then send yours"):
+            await remote.enter_safe_state({"winder/speed": 0})
+
+    on_a_line(tmp_path, TEXT, story)
