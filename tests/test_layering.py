@@ -98,7 +98,7 @@ OPEN: dict[str, set[str]] = {
     "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},
     "app.interfaces": {"following", "opcua", "opcua_access", "web"},
     "app.line": {"", "points_table", "points_taking"},
-    "app.outputs": {"base", "cells", "distributor", "settings"},
+    "app.outputs": {"base", "cells", "distributor", "kinds", "settings"},
     "app.service": {
         *("authorisation", "folder", "messages", "payload", "permission", "picture", "record", "refusals", "remote"),
         *("remote_exchanges", "remote_group", "remote_overview", "rights", "service", "tcp", "touches", "values"),

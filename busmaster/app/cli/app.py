@@ -55,21 +55,25 @@ COMMANDS = (
     "replay",
     "items",
 )
-"""One module of this package each, which defines `command`; imported only when it is asked for."""
+"""One module of this package each, which defines `command`; imported only when it is used."""
+INTERFACES = "busmaster.interfaces"
+"""The group of entry points by which a package brings an interface: each names a click command, whose name is that
+of the entry. docs/adding-an-interface.md shows a whole one."""
 
 
 class Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names of the commands that are there, in the order of the help."""
-        return [name for name in COMMANDS if importlib.util.find_spec(f"busmaster.app.cli.{name}")]
+        """Return the names of all commands, in the order of the help: installed interfaces are the last."""
+        return [*COMMANDS, *(entry.name for entry in installed_interfaces())]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a command and return it; None for a name that is none."""
-        if cmd_name not in self.list_commands(ctx):
-            return None
-        command = importlib.import_module(f"busmaster.app.cli.{cmd_name}").command
-        assert isinstance(command, click.Command)
-        return command
+        """Import a command and return it; None if there is no such command. Raises UsageError for a broken package."""
+        if cmd_name in COMMANDS:
+            command = importlib.import_module(f"busmaster.app.cli.{cmd_name}").command
+            assert isinstance(command, click.Command)
+            return command
+        found = [entry for entry in installed_interfaces() if entry.name == cmd_name]
+        return loaded_interface(found[0]) if found else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -88,6 +92,32 @@ class Commands(click.Group):
             raise
         except BaseException as error:
             return status_of(error)
+
+
+def installed_interfaces() -> list[importlib.metadata.EntryPoint]:
+    """Return the entry points of installed interfaces by name. A name that a command of this package has is ignored."""
+    entries = importlib.metadata.entry_points(group=INTERFACES)
+    return sorted((entry for entry in entries if entry.name not in COMMANDS), key=lambda entry: entry.name)
+
+
+def loaded_interface(entry: importlib.metadata.EntryPoint) -> click.Command:
+    """Import the command of an interface. Raises UsageError if its package is broken.
+
+    `--help` lists all commands: there a broken package has a line that says so.
+    """
+    package = f" of {entry.dist.name}" if entry.dist is not None else ""
+    try:
+        command = entry.load()
+        if not isinstance(command, click.Command):
+            raise TypeError(f"it is not a click command but a {type(command).__name__}")
+    except Exception as error:  # another package can raise anything
+        why = f"the interface {entry.name!r}{package} cannot be used: {error}; fix or uninstall that package"
+
+        def broken() -> None:
+            raise click.UsageError(why)
+
+        return click.Command(entry.name, callback=broken, short_help=why)
+    return command
 
 
 def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> None:

@@ -22,7 +22,6 @@ import anyio
 from busmaster import Node, Point, Quality, Sample, Snapshot, ext
 from busmaster.app.config import LineFile
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.outputs.settings import MqttSettings
 from busmaster.capture import Direction, Frame, Kind
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import Stream
@@ -40,10 +39,7 @@ MOST_OPEN = 1000
 
 def silent(file: LineFile) -> LineFile:
     """Return the file with outputs that take no commands: nothing may be sent."""
-    outputs = {
-        kind: replace(settings, allow_commands=()) if isinstance(settings, MqttSettings) else settings
-        for kind, settings in file.outputs.items()
-    }
+    outputs = {kind: settings.without_commands() for kind, settings in file.outputs.items()}
     return replace(file, outputs=outputs)
 
 

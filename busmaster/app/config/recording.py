@@ -7,14 +7,8 @@ from functools import partial
 from typing import TypeAlias
 
 from busmaster.app.config.table import Readers, Table
-from busmaster.app.outputs.settings import (
-    FileSettings,
-    MetricsSettings,
-    MqttSettings,
-    Settings,
-    SqliteSettings,
-)
-from busmaster.bounds import LONGEST_TOPIC
+from busmaster.app.outputs.kinds import OWN, find, names
+from busmaster.app.outputs.settings import Settings
 from busmaster.ext import meant
 
 Outputs: TypeAlias = dict[str, Settings]
@@ -26,7 +20,8 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
 
     Raises FileError, naming line and key, for what is wrong: also in one that is not enabled.
     """
-    table.only(*KINDS)
+    if not table.data.keys() <= OWN.keys():
+        table.only(*names())
     outputs = dict(_enabled(table, tuple(groups)))
     taken: dict[str, str] = {}
     for kind, settings in outputs.items():
@@ -40,37 +35,24 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
 
 def _enabled(outer: Table, groups: Collection[str]) -> Iterator[tuple[str, Settings]]:
     for table in outer.each():
-        kind = KINDS.get(table.name)
-        if kind is None:
+        if table.name not in OWN and table.name not in names():
             continue  # it was refused above
         with table.part():
-            readers: Readers = {**READERS, "groups": partial(_groups, known=groups)}
-            said = table.typed(kind, "enabled", readers=readers, without=WITHOUT.get(table.name, ()))
             with table.at():
-                settings = kind(**said)
+                kind = find(table.name)
+            readers: Readers = {**READERS, "groups": partial(_groups, known=groups)}
+            said = table.typed(kind.settings, "enabled", readers=readers, without=kind.without)
+            with table.at():
+                settings = kind.settings(**said)
             if table.flag("enabled", True):
                 yield table.name, settings
 
 
-def check_takes(table: Table, settings: Settings, group: str, points: Mapping[str, str]) -> None:
-    """Raise FileError for a group that an output could not take: what its points are, by their keys."""
-    match settings:
-        case MqttSettings(messages="cycle"):
-            _check_topic(table, settings, group, f"the group {group}")
-        case MqttSettings():
-            for key in points:
-                _check_topic(table, settings, key, key)
-        case MetricsSettings() if settings.groups:
-            for key, sort in points.items():
-                if sort in ("run", "set", "text"):
-                    raise table.error(f"cannot take {key}: it is a {sort}, and a gauge is one number", "groups")
-
-
-def _check_topic(table: Table, settings: MqttSettings, name: str, what: str) -> None:
-    if not name.isprintable():
-        raise table.error(f"cannot take {what!r}: a topic has no control characters")
-    if len(f"{settings.prefix}/cycles/{name}".encode()) > LONGEST_TOPIC:
-        raise table.error(f"cannot take {what[:40]}...: its name is longer than a topic may be")
+def check_takes(table: Table, kind: str, settings: Settings, group: str, points: Mapping[str, str]) -> None:
+    """Raise FileError for a group that an output cannot take. `points` has the sort of each point, by its key."""
+    unsuitable = find(kind).unsuitable(settings, group, points)
+    if unsuitable is not None:
+        raise table.error(unsuitable.why, *([unsuitable.key] if unsuitable.key else []))
 
 
 def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
@@ -104,13 +86,6 @@ def _topic(table: Table, key: str) -> str:
     return topic
 
 
-KINDS: Mapping[str, type[Settings]] = {
-    "csv": FileSettings,
-    "jsonl": FileSettings,
-    "sqlite": SqliteSettings,
-    "mqtt": MqttSettings,
-    "metrics": MetricsSettings,
-}
 READERS: Readers = {
     "mode": read_mode,
     "keep_days": _limit,
@@ -118,5 +93,3 @@ READERS: Readers = {
     "prefix": _topic,
 }
 """What is more than its type."""
-WITHOUT = {"metrics": ("buffer",), "csv": ("audit",)}
-"""Keys of its class that an output does not have: metrics hold no values, and CSV no audit entries."""

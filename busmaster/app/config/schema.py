@@ -13,7 +13,7 @@ from busmaster import Meaning, SerialPort, TcpPort
 from busmaster.app.config import emulator, safe, sections, service, templates, timing
 from busmaster.app.config.keys import REQUIRED, Key, TableKeys, keys_of
 from busmaster.app.config.point_section import NOT_SAID, PointSection
-from busmaster.app.config.recording import KINDS, WITHOUT
+from busmaster.app.outputs.kinds import kinds as output_kinds
 from busmaster.emulator import CALM, NAMES, SECONDS, Faults
 from busmaster.ext import MOST_DIGITS
 from busmaster.registry import Option, kinds
@@ -93,13 +93,6 @@ PATHS = {
     "jsonl": "The file. Fields of a date make new ones: `line-%Y-%m-%d.jsonl`.",
     "sqlite": "The database.",
 }
-OUTPUT_ABOUT = {
-    "csv": "Values as lines of a CSV file.",
-    "jsonl": "Values and events as lines of JSON.",
-    "sqlite": "Values and events in a database: the tables points, samples and events, and the view history.",
-    "mqtt": "Values, health and events to an MQTT broker; the extra mqtt.",
-    "metrics": "Counts, and values, for Prometheus; the extra metrics.",
-}
 
 
 def tables() -> Iterator[TableKeys]:
@@ -149,11 +142,11 @@ def _outputs() -> Iterator[TableKeys]:
     enabled = Key("enabled", "flag", OUTPUTS["enabled"], "true")
     mode = {"mode": {"kind": "mode", "default": '"0640"', "least": -math.inf}}
     changes = {"sync_every": {"unit": "s"}, "keep_days": {"unit": "days"}, "keep_mb": {"unit": "MB"}}
-    for name, kind in KINDS.items():
-        about = OUTPUTS | {"path": PATHS.get(name, "")}
-        keys = keys_of(kind, about, without=WITHOUT.get(name, ()), **mode, **changes)
+    for kind in output_kinds():
+        about = OUTPUTS | {"path": PATHS.get(kind.name, "")}
+        keys = keys_of(kind.settings, about, without=kind.without, **mode, **changes)
         keys = tuple(sorted(keys, key=lambda key: key.default != REQUIRED))  # what must be there first
-        yield TableKeys(f"[outputs.{name}]", OUTPUT_ABOUT[name], (enabled, *keys))
+        yield TableKeys(f"[outputs.{kind.name}]", kind.about, (enabled, *keys))
 
 
 def _emulator() -> Iterator[TableKeys]:

@@ -11,17 +11,18 @@ import os
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 
 from busmaster.app.config.emulated import emulated_line
 from busmaster.app.config.names import expanded, listed
 from busmaster.app.config.sections import LineFile, read
 from busmaster.app.config.source import FileError, Key, Source
+from busmaster.app.config.table import Table
 from busmaster.app.line.configured_line import ConfiguredLine
-from busmaster.app.outputs.settings import MqttSettings
 from busmaster.errors import InvalidCommand
 
 
@@ -62,16 +63,19 @@ def _made(source: Source) -> tuple[LineFile | None, ConfiguredLine | None]:
             if file.service.enabled:
                 file.service.secrets()
         for kind, settings in file.outputs.items():
-            if isinstance(settings, MqttSettings):
-                table = file.table.table("outputs").table(kind)
-                with table.part(), table.at("password_file"):
-                    settings.password()
-                with table.part(), table.at("ca_file"):
-                    settings.tls_context()
+            table = file.table.table("outputs").table(kind)
+            settings.check_files(partial(_part_at, table))
     except FileError as error:  # one that leaves nothing to read on with
         source.keep((), error)
         return None, None
     return file, line
+
+
+@contextmanager
+def _part_at(table: Table, key: str) -> Iterator[None]:
+    """Report a problem at a key of a table, and go on behind it."""
+    with table.part(), table.at(key):
+        yield
 
 
 def _told(source: Source, line: ConfiguredLine | None) -> Iterator[FileError]:

@@ -20,15 +20,12 @@ from busmaster.app.line.access import access_of
 from busmaster.app.line.kept_times import KeptTimes
 from busmaster.app.line.safe_state import SafeState, SafeWrite
 from busmaster.app.outputs.distributor import Distributor, Wanted
-from busmaster.app.outputs.settings import MqttSettings
+from busmaster.app.outputs.kinds import find
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.bounds import MOST_MEMBERS
 from busmaster.errors import InvalidCommand
 from busmaster.ext import Handle, Limit, NodeSource, Send, Tap, WriteOptions, guess, is_decimal, meant
 from busmaster.planning import Plan, PlannedGroup
-
-KEEPING_AUDIT = ("jsonl", "sqlite", "mqtt")
-"""The outputs that keep an audit log."""
 
 
 class ConfiguredLine:
@@ -177,7 +174,7 @@ class ConfiguredLine:
         """
         audit = Distributor(self.bus, tell, in_charge=False)
         for kind, settings in self.file.outputs.items():
-            if kind in KEEPING_AUDIT:
+            if find(kind).keeps_audit:
                 with self.file.table.table("outputs").table(kind).at():
                     audit.add(kind, settings)
         return audit
@@ -360,12 +357,12 @@ class ConfiguredLine:
             with table.part():
                 for group in settings.groups or self._wanted:
                     points = self._wanted.get(group, ())  # a group with a problem has none
-                    check_takes(table, settings, group, {point.key: self._sort(point) for point in points})
+                    check_takes(table, kind, settings, group, {point.key: self._sort(point) for point in points})
                 writable: dict[str, Point[Any]] = {}
-                if isinstance(settings, MqttSettings):
-                    for number, text in enumerate(settings.allow_commands):
-                        with table.at("allow_commands", number):
-                            writable |= {point.key: point for point in map(self._writable, self._names(text))}
+                key, texts = settings.writable
+                for number, text in enumerate(texts):
+                    with table.at(key, number):
+                        writable |= {point.key: point for point in map(self._writable, self._names(text))}
                 yield kind, Wanted(settings, writable)
 
     def _sort(self, point: NamedPoint) -> str:

@@ -16,12 +16,13 @@ import re
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
-from busmaster import Snapshot
+from busmaster import Bus, Point, Snapshot
 from busmaster.app.outputs.settings import Settings
+from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.record import WriteRecord
 from busmaster.errors import InvalidCommand
 
@@ -233,6 +234,27 @@ class Output(ABC):
         except IndexError:
             return None
 
+    def drain(self, send: Callable[[Item], None]) -> None:
+        """Send items one by one until the output is stopped and none waits.
+
+        If `send` raises, the item waits again, in front of the others, and the error is raised on.
+        """
+        while True:
+            stopped = self._stop.is_set()  # before the queue is looked at: what was offered until then is sent
+            item = self.take()
+            if item is None:
+                if stopped:
+                    return
+                self._stop.wait(TICK)
+                continue
+            try:
+                send(item)
+            except BaseException:
+                self._waiting.appendleft(item)
+                raise
+            self.written += size_of(item)
+            self.up()
+
     def up(self) -> None:
         """Note that the output works, and say so if it was down."""
         self._retry = FIRST_RETRY
@@ -266,3 +288,52 @@ class Output(ABC):
                 return
             self.rest(self._retry)
             self._retry = min(2 * self._retry, LAST_RETRY)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputLine:
+    """The line that an output belongs to. An output uses as much of it as it needs.
+
+    `say` reports an event of the output, from any thread. `commands` are the points, by their keys, that the output may
+    write for others, through `authorisation`. `statistics` returns the counts of all outputs of the line. An output
+    whose process is not `in_charge` of the line must not report the line's state. Where the process only listens,
+    `polls` is False.
+    """
+
+    bus: Bus
+    authorisation: Authorisation
+    say: Callable[[str], None] = lambda _: None
+    commands: Mapping[str, Point[Any]]
+    statistics: Callable[[], Sequence[OutputStatistics]] = tuple
+    in_charge: bool = True
+    polls: bool = True
+
+
+class Unsuitable(NamedTuple):
+    """Why an output cannot take a group, and the key of the output's table at which that is reported."""
+
+    why: str
+    key: str | None = None
+
+
+def takes_all(settings: Any, group: str, points: Mapping[str, str]) -> None:
+    """Accept every group."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputKind:
+    """A kind of output: the table `[outputs.NAME]` of a LINE.toml enables one.
+
+    `settings` declares the keys of the table, and `make` makes the output of them. `about` is the sentence of the
+    reference page. `keeps_audit`: commands that only write, and poll nothing, give their audit entries to it. `without`
+    names keys of `settings` that this kind does not have. `unsuitable` returns why the output cannot take a group,
+    given the sorts of its points by their keys, or None.
+    """
+
+    name: str
+    settings: type[Settings]
+    make: Callable[[Any, OutputLine], Output]
+    about: str
+    keeps_audit: bool = False
+    without: tuple[str, ...] = ()
+    unsuitable: Callable[[Any, str, Mapping[str, str]], Unsuitable | None] = takes_all

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple, Protocol
 import anyio
 
 from busmaster import Bus, Point, Snapshot, ext
-from busmaster.app.outputs.base import Happening, Output, OutputStatistics
+from busmaster.app.outputs.base import Happening, Output, OutputLine, OutputStatistics
 from busmaster.app.outputs.exceptions import News
-from busmaster.app.outputs.files import CsvOutput, JsonlOutput
-from busmaster.app.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
-from busmaster.app.outputs.sqlite import SqliteOutput
+from busmaster.app.outputs.kinds import find
+from busmaster.app.outputs.settings import Settings
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import event_text, micros
@@ -236,30 +235,16 @@ class Distributor:
                 pass
 
     def _make(self, kind: str, settings: Settings, commands: Mapping[str, Point[Any]]) -> Output:
-        match settings:
-            case FileSettings():
-                return (CsvOutput if kind == "csv" else JsonlOutput)(kind, settings, self._say)
-            case SqliteSettings():
-                return SqliteOutput(kind, settings, self._say)
-            case MqttSettings():
-                from busmaster.app.outputs.mqtt import MqttOutput
-
-                return MqttOutput(
-                    kind,
-                    settings,
-                    self._bus,
-                    self._say,
-                    commands=commands,
-                    authorisation=self.authorisation,
-                    in_charge=self._in_charge,
-                    asks=self._asks,
-                )
-            case MetricsSettings():
-                from busmaster.app.outputs.metrics import MetricsOutput
-
-                return MetricsOutput(kind, settings, self._bus, self._say, self.statistics, self.authorisation.refusals)
-            case _:
-                raise AssertionError(settings)
+        line = OutputLine(
+            bus=self._bus,
+            authorisation=self.authorisation,
+            say=self._say,
+            commands=commands,
+            statistics=self.statistics,
+            in_charge=self._in_charge,
+            polls=self._asks,
+        )
+        return find(kind).make(settings, line)
 
 
 async def close_all(outputs: Collection[Output]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from busmaster import Sample, Snapshot
-from busmaster.app.outputs.base import Item, check_folder
+from busmaster.app.outputs.base import Item, OutputKind, check_folder
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.cells import csv_lines, no_formula
 from busmaster.app.outputs.growing_file import GrowingFile
@@ -100,3 +100,19 @@ def value_cell(sample: Sample[Any]) -> str:
         return ""
     text = value_text(sample.value)
     return no_formula(text) if isinstance(sample.value, str) else text
+
+
+CSV = OutputKind(
+    name="csv",
+    settings=FileSettings,
+    make=lambda settings, line: CsvOutput("csv", settings, line.say),
+    about="Values as lines of a CSV file.",
+    without=("audit",),
+)
+JSONL = OutputKind(
+    name="jsonl",
+    settings=FileSettings,
+    make=lambda settings, line: JsonlOutput("jsonl", settings, line.say),
+    about="Values and events as lines of JSON.",
+    keeps_audit=True,
+)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import asyncio
 import enum
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from busmaster import Bus, Health, Node, Priority, ext
-from busmaster.app.outputs.base import Output, OutputStatistics, check_extra
+from busmaster.app.outputs.base import Output, OutputKind, OutputLine, OutputStatistics, Unsuitable, check_extra
 from busmaster.app.outputs.scrapes import listening, page, serve
 from busmaster.app.outputs.settings import MetricsSettings
 from busmaster.app.service.refusals import INTERFACES, TOO_FAST, Refusals
@@ -341,3 +341,26 @@ def add_histogram(family: HistogramMetricFamily, node: str, buckets: Sequence[tu
         counts[bisect_left(EDGES, upper)] += count
     edges = (*map(str, EDGES), "+Inf")
     family.add_metric([node], list(zip(edges, accumulate(counts), strict=True)), total)
+
+
+def make(settings: MetricsSettings, line: OutputLine) -> MetricsOutput:
+    """Make the output of a line."""
+    return MetricsOutput("metrics", settings, line.bus, line.say, line.statistics, line.authorisation.refusals)
+
+
+def unsuitable(settings: MetricsSettings, group: str, points: Mapping[str, str]) -> Unsuitable | None:
+    """Return why a point of a group cannot be a gauge, or None. Without `groups`, only counts are served."""
+    for key, sort in points.items() if settings.groups else ():
+        if sort in ("run", "set", "text"):
+            return Unsuitable(f"cannot take {key}: it is a {sort}, and a gauge is one number", "groups")
+    return None
+
+
+METRICS = OutputKind(
+    name="metrics",
+    settings=MetricsSettings,
+    make=make,
+    about="Counts, and values, for Prometheus; the extra metrics.",
+    without=("buffer",),
+    unsuitable=unsuitable,
+)

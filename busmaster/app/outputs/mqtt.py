@@ -40,7 +40,7 @@ import anyio
 from anyio.abc import TaskStatus
 
 from busmaster import Bus, LineState, Point, Sample, Snapshot, ext
-from busmaster.app.outputs.base import PAUSE, TICK, Item, check_extra, size_of
+from busmaster.app.outputs.base import PAUSE, TICK, Item, OutputKind, OutputLine, Unsuitable, check_extra, size_of
 from busmaster.app.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.app.outputs.mqtt_connection import secrets, taking_in, topic_part, unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
@@ -50,6 +50,7 @@ from busmaster.app.outputs.spool import Record
 from busmaster.app.service.authorisation import Authorisation, Wish
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import cycle_fields, json_line, micros, sample_fields, write_fields
+from busmaster.bounds import LONGEST_TOPIC
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message
@@ -442,3 +443,38 @@ class MqttOutput(SpillingOutput):
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")
         await self._send(client, [Outgoing(topic, json_line(**answer.fields))])
+
+
+def make(settings: MqttSettings, line: OutputLine) -> MqttOutput:
+    """Make the output of a line."""
+    return MqttOutput(
+        "mqtt",
+        settings,
+        line.bus,
+        line.say,
+        commands=line.commands,
+        authorisation=line.authorisation,
+        in_charge=line.in_charge,
+        asks=line.polls,
+    )
+
+
+def unsuitable(settings: MqttSettings, group: str, points: Mapping[str, str]) -> Unsuitable | None:
+    """Return why a name cannot be a part of a topic, or None."""
+    names = {group: f"the group {group}"} if settings.messages == "cycle" else {key: key for key in points}
+    for name, what in names.items():
+        if not name.isprintable():
+            return Unsuitable(f"cannot take {what!r}: a topic has no control characters")
+        if len(f"{settings.prefix}/cycles/{name}".encode()) > LONGEST_TOPIC:
+            return Unsuitable(f"cannot take {what[:40]}...: its name is longer than a topic may be")
+    return None
+
+
+MQTT = OutputKind(
+    name="mqtt",
+    settings=MqttSettings,
+    make=make,
+    about="Values, health and events to an MQTT broker; the extra mqtt.",
+    keeps_audit=True,
+    unsuitable=unsuitable,
+)

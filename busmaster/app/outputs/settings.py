@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias
 
 from busmaster.bounds import MOST_BUFFERED, MOST_SPILLED
 from busmaster.errors import InvalidCommand
@@ -38,6 +40,18 @@ class Settings:
     def destination(self) -> str:
         """Return where values go, as messages name it: a file, or host and port; "" for what has no name."""
         return ""
+
+    @property
+    def writable(self) -> tuple[str, tuple[str, ...]]:
+        """Return the key that names the points which others may write through the output, and those names."""
+        return "", ()
+
+    def without_commands(self) -> Self:
+        """Return the settings of an output that lets others write nothing."""
+        return self
+
+    def check_files(self, at: Callable[[str], AbstractContextManager[object]]) -> None:
+        """Read the files that the settings name, each within `at(key)`, and raise InvalidCommand for a bad one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,6 +136,22 @@ class MqttSettings(SpillingSettings):
     def destination(self) -> str:
         """Return the broker."""
         return f"{self.host}:{self.port}"
+
+    @property
+    def writable(self) -> tuple[str, tuple[str, ...]]:
+        """Return the points that commands may write."""
+        return "allow_commands", self.allow_commands
+
+    def without_commands(self) -> Self:
+        """Return the settings without `allow_commands`."""
+        return replace(self, allow_commands=())
+
+    def check_files(self, at: Callable[[str], AbstractContextManager[object]]) -> None:
+        """Read the password and the certificates. Raises InvalidCommand."""
+        with at("password_file"):
+            self.password()
+        with at("ca_file"):
+            self.tls_context()
 
     def password(self) -> str | None:
         """Read the password. Raises InvalidCommand for a file that cannot be read."""

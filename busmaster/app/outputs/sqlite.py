@@ -11,7 +11,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
-from busmaster.app.outputs.base import Happening, Item, check_folder
+from busmaster.app.outputs.base import Happening, Item, OutputKind, check_folder
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.damaged import is_damaged, move_aside
 from busmaster.app.outputs.growing_file import is_at
@@ -245,3 +245,12 @@ def column(value: Any) -> Any:
     if isinstance(plain, list):
         return json.dumps(plain)
     return plain if plain is None or isinstance(plain, int | float | str) else str(plain)
+
+
+SQLITE = OutputKind(
+    name="sqlite",
+    settings=SqliteSettings,
+    make=lambda settings, line: SqliteOutput("sqlite", settings, line.say),
+    about="Values and events in a database: the tables points, samples and events, and the view history.",
+    keeps_audit=True,
+)

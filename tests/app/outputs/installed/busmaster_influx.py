@@ -1,0 +1,60 @@
+"""An output that another package brings: values as InfluxDB lines in UDP packets, for a socket_listener of Telegraf."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from typing import Annotated
+
+from busmaster import Snapshot
+from busmaster.app.outputs.base import Item, Output, OutputKind, OutputLine
+from busmaster.app.outputs.settings import Settings
+from busmaster.ext import Between
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InfluxSettings(Settings):
+    """The keys of `[outputs.influx]`, beside `enabled`, `groups` and `buffer`."""
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Between(1, 65535)] = 8094
+
+    @property
+    def destination(self) -> str:
+        """Return the address, as messages name it."""
+        return f"{self.host}:{self.port}"
+
+
+class InfluxOutput(Output):
+    """Sends each cycle as one packet."""
+
+    def __init__(self, settings: InfluxSettings, line: OutputLine) -> None:
+        super().__init__("influx", settings, line.say)
+        self._address = settings.host, settings.port
+
+    def work(self) -> None:
+        """Send what is offered, in the output's own thread. It is called again, after a pause, if it raises."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            out.connect(self._address)
+            self.drain(lambda item: self._send(out, item))
+
+    def _send(self, out: socket.socket, item: Item) -> None:
+        if isinstance(item, Snapshot):  # the others are events and audit entries
+            out.send("\n".join(lines(item)).encode())
+
+
+def lines(cycle: Snapshot) -> list[str]:
+    """Return a line for each good value that is a number."""
+    return [
+        f"busmaster,point={point.key} value={sample.value} {int(sample.wall * 1e9)}"
+        for point, sample in cycle.samples.items()
+        if sample.error is None and isinstance(sample.value, int | float)
+    ]
+
+
+INFLUX = OutputKind(
+    name="influx",
+    settings=InfluxSettings,
+    make=InfluxOutput,
+    about="Values as InfluxDB lines in UDP packets.",
+)
