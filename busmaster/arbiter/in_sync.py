@@ -63,12 +63,13 @@ MOST_OVERDUE = 400
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """Of a reply that may still be on time: what it answers, the learned `window` after which the line went on, and the
-    `silence` after which it is over, as the document says; in seconds."""
+    """A reply that may still be on time: the command that it answers, the learned `window` after which the line went
+    on, the `silence` after which it is over, as the document says, and how long it `lasts` at most; in seconds."""
 
     command: Command[Any]
     window: float
     silence: float
+    lasts: float = 0.0
 
 
 @dataclass(slots=True)
@@ -169,8 +170,10 @@ class InSync:
         until = -inf
         for overdue in self.overdue_replies:
             if overdue.awaited is not None and (answers is None or _could_be(overdue, answers)):
-                over = overdue.over
-                until = max(until, over, last_byte + overdue.awaited.silence if last_byte < over else over)
+                # A reply can begin at the last moment and pause for longer than the learned silence: its end is known
+                # only by the document's silence. A write that left in such a pause met the rest of the reply.
+                over, awaited = overdue.over, overdue.awaited
+                until = max(until, over, last_byte + awaited.silence if last_byte < over + awaited.lasts else over)
         return until
 
     def nodes_overdue(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:

@@ -79,7 +79,8 @@ class Trust:
             # its node goes on by itself with the steps that need no word from the host (MSC: the packet after its ACK)
             over += sum(later.timing.max_reply_delay for later in exchange.later if not later.sent)
             silence = max(QUIET, transaction.node.timings.read.inter_byte_timeout) + step.latency + step.byte_time
-            awaited = Awaited(transaction.command, step.timing.window, silence)
+            lasts = step.longest * step.byte_time + silence  # with one pause
+            awaited = Awaited(transaction.command, step.timing.window, silence, lasts)
         # The ACK that began a packet's step (MSC) may have been an overdue one: this request's own is then still to
         # come
         ack_in_doubt = exchange.later and self._in_sync.lone_byte_is_overdue()

@@ -163,3 +163,13 @@ def test_r15_what_came_around_a_reply_that_was_sent_twice_may_have_been_a_part_o
     overdue.heard(b"\xff\x02reply", 1.0)
     assert overdue.has_ambiguity(1.0)
     assert overdue.clashes((b"\x06",), 1.0), "a single byte may still come"
+
+
+def test_a_reply_that_begins_at_the_last_moment_is_over_by_the_documents_silence_alone() -> None:
+    in_sync = InSync()
+    awaited = Awaited(hcp2.Read(1), window=0.010, silence=0.050, lasts=0.080)
+    in_sync.add_overdue((b"\x02\x05",), None, 0.0, 0.2, awaited)
+    assert in_sync.awaited_until(last_byte=0.1) == 0.2
+    assert in_sync.awaited_until(last_byte=0.19) == pytest.approx(0.24)
+    assert in_sync.awaited_until(last_byte=0.21) == pytest.approx(0.26)  # it began before 0.2
+    assert in_sync.awaited_until(last_byte=0.29) == 0.2  # too late to be a part of it
