@@ -14,7 +14,11 @@ OUTWARD: tuple[str, ...] = ()
 """The addresses beyond the repository to which pages link. No test asks whether they are still there: look yourself."""
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=name_of)
+BESIDE = [ROOT / name for name in ("CHANGELOG.md", "CODE_OF_CONDUCT.md", "SECURITY.md")]
+"""Pages whose links are checked, and nothing else."""
+
+
+@pytest.mark.parametrize("page", [*PAGES, *BESIDE], ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
     for link in links(page):
         path, _, anchor = link.partition("#")
@@ -67,6 +71,15 @@ def test_pre_commit_runs_what_the_extras_install_and_fetches_nothing() -> None:
     hooks = re.findall(r"entry: \.venv/bin/(.*?)(?: --force-exclude)?$", text, re.MULTILINE)
     assert set(hooks) == {"ruff check", "ruff format --check", "mypy"}
     assert re.findall(r"repo: (.*)", text) == ["local"]
+
+
+def test_workflows_run_the_checks_and_build_the_site_as_a_maintainer_does() -> None:
+    workflows = ROOT / ".github" / "workflows"
+    checks = (ROOT / ".ci" / "run").read_text()
+    assert "- run: .ci/run\n" in (workflows / "ci.yml").read_text()
+    [build] = re.findall(r"python -m (sphinx .*) site\"", checks)
+    assert f"python -m {build} site\n" in (workflows / "docs.yml").read_text()
+    assert f'python -m {build} "$READTHEDOCS_OUTPUT/html"\n' in (ROOT / ".readthedocs.yaml").read_text()
 
 
 # what is cited

@@ -1,0 +1,101 @@
+"""List words and patterns that the style rules out (CONTRIBUTING.md), and sentences of more than 30 words.
+
+`python -m tests.language [PATHS] [--counts]` checks Markdown prose, docstrings, comments and messages. It only reports.
+`tests/test_language.py` keeps the paths of `CLEAN` free of findings. Add a path when you have revised it.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
+CLEAN = ("README.md", "docs/README.md")  # files and folders
+LONGEST = 30
+RULES = {  # name: what to look for, in any case
+    "person": r"\b(?:no|some)(?:body| one)\b|\bwho(?:m|ever|se)\b|\bhis\b|\bhe\b|\bhim\b",
+    "say": r"\b(?:sa(?:y|ys|id|ying)|t(?:ell|ells|old|elling))\b",
+    "ask": r"\bask(?:s|ed|ing)?\b",
+    "hear": r"\bhea(?:r|rs|rd|ring)\b",
+    "owe": r"\bow(?:e|es|ed|ing)\b|\bdebts?\b|\bstragglers?\b",
+    "reckon": r"\breckon\w*|\bmend(?:s|ed|ing|ings)?\b|\bfor the sake of\b",
+    "believe": r"\bbeliev\w+|\bdoubt(?:s|ed)\b|\bt(?:ake|akes|aken|aking) (?:\w+ ){0,3}for (?:an?|the|one)\b",
+    "door": r"\b(?:doors?|gates?|rooms?)\b(?! to 1)",
+    "old term": r"\b(?:lateness|nominal|byte gaps?|settl(?:e|es|ed|ing)|unasked|legs?|in step)\b",
+    "answer": r"\b(?:an?|the|its?|no|each|every|first|late|whose|what) answers?\b|\bresponses?\b",
+    "is no": r"(?<!\bthere )\b(?:is|are|was|were|be) no\b(?! longer| more| less)",
+    "what": r"\bwhat(?:ever)? (?:is|are|was|were|ha[sd]|have|it|they|you|comes?|goes|can|must|to|this)\b(?![^.!?]*\?)",
+    "be": r"\bto be \w+ed (?:before|for)\b|\bthat there (?:is|are)\b|\bbut for\b|\bhardly\b|\ball else\b",
+}
+EXCEPTIONS: dict[tuple[str, str], str] = {  # (path, rule): the reason
+    ("docs/explanation/words.md", "answer"): "the glossary lists the terms of other programs",
+    ("docs/explanation/words.md", "door"): "the glossary lists earlier terms",
+    ("docs/explanation/words.md", "old term"): "the glossary lists earlier terms",
+    ("docs/explanation/words.md", "owe"): "the glossary lists earlier terms",
+}
+
+
+def markdown(text: str) -> Iterator[tuple[int, str]]:
+    """Paragraphs, list items and table cells with their line; code becomes one word."""
+    text = re.sub(r"^( *)(`{3,}).*?^\1\2$|<!--.*?-->", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S)
+    text = re.sub(r"`[^`]+`", "CODE", re.sub(r"(!?\[[^\]]*\])\([^)]*\)", r"\1", text))
+    start, parts = 1, list[str]()
+    for number, line in enumerate([*text.splitlines(), ""], 1):
+        begins = re.match(r"\s*(?:[-*|#>]|\d+\.|$)", line)
+        if begins and parts:
+            yield start, " ".join(parts)
+            parts = []
+        if line.lstrip().startswith("|"):
+            yield from ((number, cell) for cell in line.split("|"))
+        elif line.strip():
+            start, parts = (number, [line]) if not parts else (start, [*parts, line])
+
+
+def python(text: str) -> Iterator[tuple[int, str]]:
+    """Docstrings, comments, and strings of three words and more."""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string.lstrip("# ")
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and len(node.value.split()) > 2:
+            for paragraph in re.split(r"\n\s*\n", re.sub(r"`[^`]+`", "CODE", node.value)):
+                yield node.lineno, " ".join(paragraph.split())
+
+
+def findings(path: Path, *, all_of_them: bool = False) -> Iterator[tuple[int, str, str]]:
+    """The line, the rule and the words of each finding without an exception, or of all."""
+    name = "" if all_of_them else path.relative_to(ROOT).as_posix()
+    for number, text in (markdown if path.suffix == ".md" else python)(path.read_text()):
+        for rule, pattern in RULES.items():
+            if (name, rule) not in EXCEPTIONS:
+                yield from ((number, rule, found[0]) for found in re.finditer(pattern, text.strip(" #*-"), re.I))
+        for sentence in re.split(r"(?<=[.!?])[)*\"]*\s+", text):
+            words = re.findall(r"[^\W_]\S*", sentence)
+            if len(words) > LONGEST and (name, "long") not in EXCEPTIONS:
+                yield number, "long", f"{len(words)} words: {' '.join(words[:8])} ..."
+
+
+def files(paths: Iterable[str]) -> list[Path]:
+    return sorted(
+        file for path in map(ROOT.joinpath, paths) for file in ([path] if path.is_file() else path.rglob("*.[mp][dy]"))
+    )
+
+
+def main(arguments: list[str]) -> None:
+    counts = Counter[str]()
+    for path in files([word for word in arguments if word != "--counts"] or CHECKED):
+        for number, rule, words in findings(path):
+            counts[rule] += 1
+            if "--counts" not in arguments:
+                sys.stdout.write(f"{path.relative_to(ROOT)}:{number}: {rule}: {words}\n")
+    counts["in all"] = counts.total()
+    sys.stdout.write("".join(f"{count:6} {rule}\n" for rule, count in reversed(counts.most_common())))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
