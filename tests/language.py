@@ -15,17 +15,20 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
-CLEAN = ("README.md", "docs/README.md")  # files and folders
+CLEAN = (  # files and folders
+    *("README.md", "docs/README.md", "docs/tutorial.md", "docs/questions.md", "docs/explanation/words.md"),
+    *("docs/public-api.md", "docs/upgrading.md"),
+)
 LONGEST = 30
 RULES = {  # name: what to look for, in any case
-    "person": r"\b(?:no|some)(?:body| one)\b|\bwho(?:m|ever|se)\b|\bhis\b|\bhe\b|\bhim\b",
+    "person": r"\b(?:no|some)(?:body| one)\b|\bwho(?:m|ever)\b|\bhis\b|\bhe\b|\bhim\b",
     "say": r"\b(?:sa(?:y|ys|id|ying)|t(?:ell|ells|old|elling))\b",
     "ask": r"\bask(?:s|ed|ing)?\b",
     "hear": r"\bhea(?:r|rs|rd|ring)\b",
     "owe": r"\bow(?:e|es|ed|ing)\b|\bdebts?\b|\bstragglers?\b",
     "reckon": r"\breckon\w*|\bmend(?:s|ed|ing|ings)?\b|\bfor the sake of\b",
     "believe": r"\bbeliev\w+|\bdoubt(?:s|ed)\b|\bt(?:ake|akes|aken|aking) (?:\w+ ){0,3}for (?:an?|the|one)\b",
-    "door": r"\b(?:doors?|gates?|rooms?)\b(?! to 1)",
+    "door": r"\b(?:doors?|gates?|rooms)\b(?! to 1)",
     "old term": r"\b(?:lateness|nominal|byte gaps?|settl(?:e|es|ed|ing)|unasked|legs?|in step)\b",
     "answer": r"\b(?:an?|the|its?|no|each|every|first|late|whose|what) answers?\b|\bresponses?\b",
     "is no": r"(?<!\bthere )\b(?:is|are|was|were|be) no\b(?! longer| more| less)",
@@ -34,6 +37,7 @@ RULES = {  # name: what to look for, in any case
 }
 EXCEPTIONS: dict[tuple[str, str], str] = {  # (path, rule): the reason
     ("docs/explanation/words.md", "answer"): "the glossary lists the terms of other programs",
+    ("docs/explanation/words.md", "believe"): "the glossary lists earlier terms",
     ("docs/explanation/words.md", "door"): "the glossary lists earlier terms",
     ("docs/explanation/words.md", "old term"): "the glossary lists earlier terms",
     ("docs/explanation/words.md", "owe"): "the glossary lists earlier terms",
