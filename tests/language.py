@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
 CLEAN = (  # files and folders
     *("README.md", "docs/README.md", "docs/tutorial.md", "docs/questions.md", "docs/explanation/words.md"),
-    *("docs/public-api.md", "docs/upgrading.md"),
+    *("docs/public-api.md", "docs/upgrading.md", "docs/howto", "CONTRIBUTING.md"),
 )
 LONGEST = 30
 RULES = {  # name: what to look for, in any case
@@ -46,8 +46,8 @@ EXCEPTIONS: dict[tuple[str, str], str] = {  # (path, rule): the reason
 
 def markdown(text: str) -> Iterator[tuple[int, str]]:
     """Paragraphs, list items and table cells with their line; code becomes one word."""
-    text = re.sub(r"^( *)(`{3,}).*?^\1\2$|<!--.*?-->", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S)
-    text = re.sub(r"`[^`]+`", "CODE", re.sub(r"(!?\[[^\]]*\])\([^)]*\)", r"\1", text))
+    text = re.sub(r"^( *)(`{3,}).*?^\1\2$", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S)
+    text = re.sub(r"<!--.*?-->", "", re.sub(r"`[^`]+`", "CODE", re.sub(r"(\[[^\]]*\])\([^)]*\)", r"\1", text)))
     start, parts = 1, list[str]()
     for number, line in enumerate([*text.splitlines(), ""], 1):
         begins = re.match(r"\s*(?:[-*|#>]|\d+\.|$)", line)
