@@ -36,6 +36,7 @@ html_theme = "furo"
 
 root_doc = "docs/README"
 include_patterns = ["docs/**.md", "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md"]
+include_patterns += ["CODE_OF_CONDUCT.md", "SECURITY.md"]
 exclude_patterns = [".*", "build", "dist", "busmaster", "examples", "tests"]  # not walked through at all
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 myst_heading_anchors = 4  # a heading is linked to as on a code host

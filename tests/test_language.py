@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests import language
-from tests.language import CLEAN, EXCEPTIONS, ROOT, files, findings
+from tests.language import CLEAN, EXCEPTIONS, ROOT, RULES, files, findings
 
 REVISED = files(CLEAN)
 
@@ -20,6 +20,31 @@ def test_revised_page_has_no_finding(path: Path) -> None:
 @pytest.mark.parametrize(("name", "rule"), [(name, rule) for name, (rules, _) in EXCEPTIONS.items() for rule in rules])
 def test_each_exception_is_needed(name: str, rule: str) -> None:
     assert rule in {found for _, found, _ in findings(ROOT / name, exceptions=False)}
+
+
+BAD = {
+    "person": "Somebody reads it.",
+    "say": "The page tells it.",
+    "ask": "It asked twice.",
+    "hear": "It was never heard.",
+    "owe": "A reply is owed.",
+    "reckon": "It reckons the load.",
+    "believe": "It believes the reply.",
+    "door": "A door to the line.",
+    "old term": "The lateness is long.",
+    "answer": "It is the answer.",
+    "is no": "This is no number.",
+    "what": "It depends on what is sent.",
+    "be": "Read all else.",
+    "long": "word " * 31,
+}
+
+
+@pytest.mark.parametrize("rule", [*RULES, "long"])
+def test_each_rule_finds_a_bad_sentence(rule: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(language, "ROOT", tmp_path)
+    (tmp_path / "page.md").write_text(BAD[rule])
+    assert [found for _, found, _ in findings(tmp_path / "page.md")] == [rule]
 
 
 @pytest.mark.parametrize(
