@@ -271,8 +271,7 @@ async def traced_read(trace: Trace) -> None:
 
 async def traced_write(owner: Trace, client: Trace) -> None:
     """Trace one remote write: the owner's side, and the client's."""
-    from busmaster import Bus, Hcp2Controller, connect
-    from busmaster.app.service.service import Service
+    from busmaster import Bus, Hcp2Controller, Service, connect
 
     with tempfile.TemporaryDirectory() as folder:
         async with Bus(emulated_line()) as bus:
