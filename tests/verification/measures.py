@@ -48,6 +48,9 @@ COMPREHENSIONS = {"<listcomp>", "<genexpr>", "<dictcomp>", "<setcomp>"}
 """Functions to the interpreter, of some versions, not to a reader."""
 WARM = 20
 """Calls before the one that is traced: what is made once is made by then."""
+OPENED = 0.5
+"""Seconds between two such rounds of calls: for the maximum reply delay after a line is opened, replies to requests of
+an earlier master are expected, and every reply is examined more closely."""
 
 
 # the sources
@@ -264,8 +267,10 @@ async def traced_read(trace: Trace) -> None:
 
     async with Bus(emulated_line()) as bus:
         controller = Hcp2Controller(bus, 5)
-        for _ in range(WARM):
-            await controller.read(1)
+        for pause in (OPENED, 0.0):
+            for _ in range(WARM):
+                await controller.read(1)
+            await asyncio.sleep(pause)
         await trace.of(lambda: controller.read(1))
 
 
@@ -285,8 +290,10 @@ async def traced_write(owner: Trace, client: Trace) -> None:
                 async def write() -> None:
                     async with connect(service.address) as remote:
                         controller = Hcp2Controller(remote, 5)
-                        for _ in range(WARM):
-                            await controller.write(1, 7.0)
+                        for pause in (OPENED, 0.0):
+                            for _ in range(WARM):
+                                await controller.write(1, 7.0)
+                            await asyncio.sleep(pause)
                         loop.call_soon_threadsafe(warm.set)
                         await asyncio.to_thread(traced.wait)
                         await client.of(lambda: controller.write(1, 7.0))
