@@ -36,6 +36,7 @@ from busmaster.errors import (
 )
 from busmaster.renames import ROOT
 from busmaster.transport.endpoints import Endpoint, endpoint
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -90,6 +91,7 @@ __all__ = [
     "Refused",
     "RemoteBus",
     "ReplyTiming",
+    "Rfc2217Port",
     "Sample",
     "SerialPort",
     "Service",

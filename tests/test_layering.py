@@ -87,7 +87,7 @@ OPEN: dict[str, set[str]] = {
     "renames": {""},
     "statistics": {""},
     "transport": {
-        *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
+        *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "rfc2217", "serial_port", "tcp"),
     },
     "wire": {"characters", "checks", "numbers", "readers"},
     "app.cli": {""},

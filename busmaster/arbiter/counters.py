@@ -186,6 +186,16 @@ class DriverErrors:
     overruns: int
     buffer_overruns: int
 
+    def since(self, before: DriverErrors) -> DriverErrors:
+        """Return what was counted after `before`."""
+        return DriverErrors(
+            self.framing - before.framing,
+            self.parity - before.parity,
+            self.breaks - before.breaks,
+            self.overruns - before.overruns,
+            self.buffer_overruns - before.buffer_overruns,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class LineStatistics:

@@ -73,7 +73,7 @@ class Bus:
         capacity = whole_number(capacity, 1, MOST_CAPACITY, "a bus's capacity")
         if isinstance(endpoint, str):
             raise InvalidCommand(
-                f"a bus needs an endpoint, not text: Bus(endpoint({endpoint!r})), or SerialPort, TcpPort"
+                f"a bus needs an endpoint, not text: Bus(endpoint({endpoint!r})), or SerialPort, TcpPort, Rfc2217Port"
             )
         self.endpoint = endpoint
         self._wait_for_port = wait_for_port

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -25,13 +26,13 @@ def check_company(profile: Profile, present: Iterable[Profile]) -> None:
 def check_settings(profile: Profile, endpoint: Endpoint) -> None:
     """Warn of line settings that are none of the protocol's.
 
-    A line in memory has no settings that could be wrong; behind a TCP port the framing is the server's.
+    A line in memory has no settings that could be wrong; behind a port of raw TCP the framing is the server's.
     """
     settings = endpoint.settings
     if settings is None or not isinstance(endpoint, SerialPort | TcpPort):
         return
     framings = dict.fromkeys(line.framing for line in (profile.line, *profile.other_lines))
-    if isinstance(endpoint, SerialPort) and settings.framing not in framings:
+    if isinstance(endpoint, SerialPort | Rfc2217Port) and settings.framing not in framings:
         usual = " or ".join(framings)
         warnings.warn(
             f"{profile.name} is meant for {usual}, but {endpoint.name} is {settings.framing}",

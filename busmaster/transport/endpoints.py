@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import asdict
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
@@ -12,6 +13,7 @@ from busmaster.contract.arguments import meant
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.identity import USB, Identity
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -78,7 +80,8 @@ def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
 def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
     """Return the endpoint that `url` names: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
 
-    `defaults` fills the line settings that a serial port's URL leaves open; behind a TCP port they are the server's.
+    `defaults` fills the line settings that the URL of a serial port or of an RFC 2217 port leaves open; behind a TCP
+    port they are the server's.
     Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
     """
     if not isinstance(url, str):
@@ -92,16 +95,17 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
         path, _, query = url.partition("?")
         if HOST_PORT.fullmatch(path) and not path.startswith(USB):  # usb:12345678 looks like a host and its port
             raise InvalidCommand(f"{path!r} is no device path; a TCP port is written socket://{path}")
-        return _serial_port(path, _options(query, SERIAL_OPTIONS), defaults)
-    scheme, _, rest = url.partition("://")
+        return SerialPort(path, **_with_line(path, _options(query, SERIAL_OPTIONS), defaults))
+    scheme = url.partition("://")[0]
     if scheme == "rfc2217":
-        raise InvalidCommand(
-            "rfc2217:// does not work with any asyncio serial library: let the server pass raw TCP with the line "
-            f"settings fixed there, and use socket://{rest}"
-        )
+        host, port, query = _address(url)
+        return Rfc2217Port(host, port, **_with_line(url, _options(query, RFC2217_OPTIONS), defaults))
     if scheme != "socket":
-        raise InvalidCommand(f"no such kind of port: {scheme}://; use a device path, usb:SERIAL or socket://HOST:PORT")
-    return _tcp_port(url)
+        raise InvalidCommand(
+            f"no such kind of port: {scheme}://; use a device path, usb:SERIAL, socket://HOST:PORT or rfc2217://HOST:PORT"
+        )
+    host, port, query = _address(url)
+    return TcpPort(host, port, **_options(query, TCP_OPTIONS))
 
 
 def is_served(address: str) -> bool:
@@ -109,25 +113,25 @@ def is_served(address: str) -> bool:
     return address.startswith(("unix:", "tcp://"))
 
 
-def _serial_port(path: str, options: dict[str, Any], defaults: LineSettings | None) -> SerialPort:
+def _with_line(name: str, options: dict[str, Any], defaults: LineSettings | None) -> dict[str, Any]:
+    """Return the options, and the defaults for line settings that they leave open. Raises InvalidCommand."""
     if defaults is not None:
-        for key in ("baudrate", "bytesize", "parity", "stopbits"):
-            options.setdefault(key, getattr(defaults, key))
+        options = asdict(defaults) | options
     if "baudrate" not in options:
-        raise InvalidCommand(f"{path}: no baud rate given; write for example {path}?baudrate=57600")
-    return SerialPort(path, **options)
+        raise InvalidCommand(f"{name}: no baud rate given; write for example {name.partition('?')[0]}?baudrate=57600")
+    return options
 
 
-def _tcp_port(url: str) -> TcpPort:
+def _address(url: str) -> tuple[str, int, str]:
+    """Return host, port and query of a serial server's URL. Raises InvalidCommand."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
         host, port = None, None
     if not host or port is None or parts.path not in ("", "/"):
-        raise InvalidCommand(f"{url!r} is not of the form socket://HOST:PORT")
-    options = _options(parts.query, TCP_OPTIONS)
-    return TcpPort(host, port, **options)
+        raise InvalidCommand(f"{url!r} is not of the form {url.partition('://')[0]}://HOST:PORT")
+    return host, port, parts.query
 
 
 def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[str, Any]:
@@ -174,6 +178,19 @@ SERIAL_OPTIONS: dict[str, Callable[[str], object]] = {
 
 TCP_OPTIONS: dict[str, Callable[[str], object]] = {
     "baudrate": int,
+    "echo": _flag,
+    "receive_latency": float,
+    "paced": _flag,
+}
+
+RFC2217_OPTIONS: dict[str, Callable[[str], object]] = {
+    "baudrate": int,
+    "bytesize": int,
+    "parity": _parity,
+    "stopbits": _stopbits,
+    "rtscts": _flag,
+    "dtr": _flag,
+    "rts": _flag,
     "echo": _flag,
     "receive_latency": float,
     "paced": _flag,

@@ -153,11 +153,21 @@ class Socket(_Descriptor):
     def __init__(self, transport: asyncio.Transport, sock: socket.socket) -> None:
         super().__init__(transport, sock.fileno())
         self._socket = sock
+        self._remote: Callable[[], DriverErrors | None] | None = transport.get_extra_info("line_errors")
+        self.reset()
 
     def unsent(self, waited: float) -> int | None:
         """Count what is under way only if its acknowledgement is later than is usual on this path."""
         under_way = waited >= DELAYED_ACK and waited >= self._usual_acknowledgement()
         return (super().unsent(waited) or 0) + self._count(termios.TIOCOUTQ if under_way else SIOCOUTQNSD)
+
+    def errors(self) -> DriverErrors | None:
+        """Return what the remote port has counted, where the server reports it (RFC 2217)."""
+        now = None if self._remote is None else self._remote()
+        return now if now is None or self._before is None else now.since(self._before)
+
+    def reset(self) -> None:
+        self._before = None if self._remote is None else self._remote()
 
     def discard_unsent(self) -> None:
         """Have the connection reset: closing would leave it to the kernel, which goes on sending."""

@@ -202,11 +202,11 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        """Take a byte that the UART found damaged."""
+        """Take a byte that the UART found damaged; none where a serial server reports the error apart from its byte."""
         now = self.clock()
         if mark is Mark.BREAK and self._port is not None and not self._port.is_break():
             mark = Mark.DAMAGED
-        if self.tap is not None:
+        if self.tap is not None and byte:
             self.tap.received(now, byte, self.arbiter.attempt)
         self.arbiter.byte_marked(mark, now)
         self.turn()

@@ -8,7 +8,7 @@ from itertools import product
 
 import pytest
 
-from busmaster import Bus, Endpoint, InvalidCommand, LineSettings, MemoryPort, SerialPort, TcpPort
+from busmaster import Bus, Endpoint, InvalidCommand, LineSettings, MemoryPort, Rfc2217Port, SerialPort, TcpPort
 from busmaster.emulator.line import Line
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.mentor import codec as mentor
@@ -90,5 +90,7 @@ def test_a_protocol_with_a_choice_of_rates_takes_any() -> None:
 
 
 def test_another_framing_on_a_serial_port_is_warned_about() -> None:
+    with pytest.warns(UserWarning, match=r"mentor is meant for 7E1, but server:4001 is 8N1"):
+        Bus(Rfc2217Port("server", 4001, baudrate=9600)).node(mentor.PROFILE, 14)
     with pytest.warns(UserWarning, match=r"mentor is meant for 7E1, but /dev/ttyS0 is 8N1"):
         Bus(SerialPort("/dev/ttyS0", baudrate=9600)).node(mentor.PROFILE, 14)

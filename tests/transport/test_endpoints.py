@@ -7,6 +7,7 @@ import pytest
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.endpoints import Endpoint, endpoint
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -44,6 +45,26 @@ MENTOR = LineSettings(9600, 7, "E", 1)
             "socket://server:4001?baudrate=9600&receive_latency=0.0033&echo=1&paced=1",
             TcpPort("server", 4001, baudrate=9600, receive_latency=0.0033, echo=True, paced=True),
         ),
+        ("rfc2217://server:4001?baudrate=9600", Rfc2217Port("server", 4001, baudrate=9600)),
+        (
+            "rfc2217://[::1]:4001/?baudrate=9600&bytesize=7&parity=E&stopbits=2&rtscts=1&dtr=0&echo=1&receive_latency=0.01",
+            Rfc2217Port(
+                "::1",
+                4001,
+                baudrate=9600,
+                bytesize=7,
+                parity="E",
+                stopbits=2,
+                rtscts=True,
+                dtr=False,
+                echo=True,
+                receive_latency=0.01,
+            ),
+        ),
+        (
+            "rfc2217://server:4001?baudrate=9600&rts=1&paced=1",
+            Rfc2217Port("server", 4001, baudrate=9600, rts=True, paced=True),
+        ),
     ],
 )
 def test_a_url_says_what_the_constructor_says(url: str, port: Endpoint) -> None:
@@ -58,6 +79,9 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
         "/dev/ttyUSB0", baudrate=4800, bytesize=7, parity="O"
     )
     assert endpoint("socket://server:4001", defaults=MENTOR) == TcpPort("server", 4001)
+    assert endpoint("rfc2217://server:4001?baudrate=4800", defaults=MENTOR) == Rfc2217Port(
+        "server", 4001, baudrate=4800, bytesize=7, parity="E"
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,8 +108,11 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
         ("127.0.0.1:4001", "'127.0.0.1:4001' is no device path; a TCP port is written socket://127.0.0.1:4001"),
         ("tcp://server:4001", "a line that a busmaster serves, .* a serial server is written socket://"),
         ("unix:/run/line.sock", "unix:/run/line.sock is a line that a busmaster serves, .* here a port is needed"),
-        ("udp://server:4001", "no such kind of port: udp://; use a device path, usb:SERIAL or socket://HOST:PORT"),
-        ("rfc2217://server:4001", "does not work with any asyncio serial library: .* use socket://server:4001"),
+        ("udp://server:4001", "no such kind of port: udp://; use a device path, usb:SERIAL, socket://HOST:PORT or rfc"),
+        ("rfc2217://server", "'rfc2217://server' is not of the form rfc2217://HOST:PORT"),
+        ("rfc2217://server:4001", r"no baud rate given; write for example rfc2217://server:4001\?baudrate=57600"),
+        ("rfc2217://server:4001?baudrate=9600&rs485=1", "no such port option 'rs485'; there are baudrate, bytesize"),
+        ("rfc2217://server:4001?baudrate=9600&stopbits=3", "stopbits='3': use 1, 1.5 or 2"),
     ],
 )
 def test_what_is_not_understood_is_named_with_what_would_do(url: str, says: str) -> None:

@@ -137,7 +137,8 @@ def cli() -> None:
     """One master for many drives on one serial line.
 
     PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E); usb:SERIAL for the USB
-    adapter with that serial number, whatever its path; or socket://HOST:PORT for a serial server that passes raw TCP.
+    adapter with that serial number, whatever its path; socket://HOST:PORT for a serial server
+    that passes raw TCP; or rfc2217://HOST:PORT for one whose line settings are set from here.
     A PORT that another busmaster owns is used through its owner; `busmaster status` lists those. `read`, `write`,
     `poll` and `scan` take the address of an owner too: unix:PATH, or tcp://HOST:PORT with a token in BUSMASTER_TOKEN.
     """

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from busmaster import LineSettings, SerialPort, TcpPort, endpoint
+from busmaster import LineSettings, Rfc2217Port, SerialPort, TcpPort, endpoint
 from busmaster.app.cli.arguments import nodes_option
 from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.ending import until_ended
@@ -95,7 +95,7 @@ def what_to_try(
         raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
     wanted: Sequence[NodeKind] = list(dict.fromkeys(find(name) for name in names)) or usual_kinds()
     where = endpoint(port, defaults=USUAL)
-    if isinstance(where, TcpPort):
+    if isinstance(where, TcpPort) and not isinstance(where, Rfc2217Port):
         return where, untuned_steps(wanted, nodes)
     options = port.partition("?")[2]
     framing = any(f"{key}=" in options for key in ("bytesize", "parity", "stopbits"))

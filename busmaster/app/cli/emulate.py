@@ -10,7 +10,7 @@ from math import inf
 
 import click
 
-from busmaster import SerialPort, TcpPort
+from busmaster import Rfc2217Port, SerialPort, TcpPort
 from busmaster.app.cli.arguments import line_settings, nodes_option, seconds_option, single_nodes
 from busmaster.app.cli.lines import file_argument, load
 from busmaster.app.cli.output import emit
@@ -107,7 +107,12 @@ def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: 
 
 
 def own_port(port: SerialPort | TcpPort) -> tuple[str | None, tuple[str, int] | None]:
-    """Return the link, or the address, by which `busmaster run` with the same file will find the line."""
+    """Return the link, or the address, by which `busmaster run` with the same file will find the line.
+
+    Raises UsageError for a port of RFC 2217.
+    """
+    if isinstance(port, Rfc2217Port):
+        raise click.UsageError(f"{port.name}: an emulated line does not speak RFC 2217; use --tcp or --pty")
     if isinstance(port, TcpPort):
         return None, (port.host, port.port)
     is_device = port.path.startswith(USB) or os.path.abspath(port.path).startswith("/dev/")

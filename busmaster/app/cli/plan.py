@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from busmaster import Endpoint, LineSettings, Priority, SerialPort
+from busmaster import Endpoint, LineSettings, Priority, Rfc2217Port, SerialPort
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import json_option
 from busmaster.app.cli.lines import file_argument, load
@@ -121,7 +121,7 @@ def port_text(endpoint: Endpoint, line: LineSettings) -> str:
 
     Behind a TCP port the framing is the server's business.
     """
-    framing = f" {line.framing}" if isinstance(endpoint, SerialPort) else ""
+    framing = f" {line.framing}" if isinstance(endpoint, SerialPort | Rfc2217Port) else ""
     return f"{endpoint.name}, {line.baudrate} baud{framing}"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 
-from busmaster import LineSettings, SerialPort, ext
+from busmaster import LineSettings, Rfc2217Port, SerialPort, ext
 from busmaster.app.config.names import expanded
 from busmaster.app.config.point_section import PointSection
 from busmaster.app.config.points import Scale
@@ -33,11 +33,11 @@ def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None
 
 
 def line_settings(file: LineFile) -> LineSettings:
-    """Return the settings of the serial port.
+    """Return the settings of the serial port, of this machine or of an RFC 2217 server.
 
-    Behind a TCP port they are those of the first node's protocol, at the port's baud rate.
+    Behind a port of raw TCP they are those of the first node's protocol, at the port's baud rate.
     """
-    if isinstance(file.port, SerialPort):
+    if isinstance(file.port, SerialPort | Rfc2217Port):
         return file.port.settings
     own = next(iter(file.nodes.values())).profile.line
     return replace(own, baudrate=file.port.baudrate or own.baudrate)

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
-from busmaster import Meaning, SerialPort, TcpPort
+from busmaster import Meaning, Rfc2217Port, SerialPort, TcpPort
 from busmaster.app.config import emulator, safe, sections, service, templates, timing
 from busmaster.app.config.keys import REQUIRED, Key, TableKeys, keys_of
 from busmaster.app.config.point_section import NOT_SAID, PointSection
@@ -42,6 +42,15 @@ TCP = {
     "echo": ECHO,
     "paced": "Whether what comes is no quicker than the baud rate allows.",
 }
+RFC2217 = SERIAL | {
+    "host": TCP["host"],
+    "port": "Its TCP port, on which it takes line settings by RFC 2217.",
+    "rtscts": "Whether RTS and CTS of the remote port hold up what is sent.",
+    "dtr": "Sets (true) or clears (false) the line DTR of the remote port. Left to the server by default.",
+    "rts": "The same for RTS.",
+    "paced": TCP["paced"],
+}
+WITH_RFC2217 = Key("rfc2217", "flag", "Whether the server takes the line settings by RFC 2217.", "false")
 POINT = {
     "item": "The ITEM that it is, as on the command line. The point's own name by default.",
     "unit": "The unit of its value: a name, which nothing is calculated with.",
@@ -104,7 +113,10 @@ def tables() -> Iterator[TableKeys]:
     serial = keys_of(SerialPort, SERIAL, rs485={"kind": "flag"}, **framing, **bounds)
     yield TableKeys("[port]", "A serial port as a table.", serial)
     tcp = keys_of(TcpPort, TCP, port={"least": 1, "most": 65535}, baudrate={"least": 1}, **bounds)
-    yield TableKeys("[port] with host", "A serial server as a table.", tcp)
+    yield TableKeys("[port] with host", "A serial server as a table.", (*tcp, WITH_RFC2217))
+    remote = keys_of(Rfc2217Port, RFC2217, port={"least": 1, "most": 65535}, **framing, **bounds)
+    about = "A serial server whose line settings are set from here."
+    yield TableKeys("[port] with rfc2217 = true", about, remote)
     common = "What holds for all nodes of one protocol that do not say otherwise. Its options may stand here too."
     yield TableKeys("[protocols.NAME]", common, sections.SHARED_KEYS)
     yield TableKeys("[nodes.NAME]", "A node; several where NAME is a range, as drive4-7.", sections.NODE_KEYS)

@@ -38,7 +38,8 @@ KEYS = (
     Key(
         "port",
         "port",
-        "The PORT, as on the command line: a device path, `usb:SERIAL`, or `socket://HOST:PORT`; or a table: `[port]`.",
+        "The PORT, as on the command line: a device path, `usb:SERIAL`, `socket://HOST:PORT` or `rfc2217://HOST:PORT`; "
+        "or a table: `[port]`.",
         REQUIRED,
     ),
     Key(

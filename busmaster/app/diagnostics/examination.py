@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,7 @@ from typing import Protocol, TypeAlias
 
 import anyio.to_thread
 
-from busmaster import Endpoint, LineSettings, SerialPort, TcpPort, Timings
+from busmaster import Endpoint, LineSettings, Rfc2217Port, SerialPort, TcpPort, Timings
 from busmaster.app.diagnostics import adapters, diagnosis, uart
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.diagnosis import Record
@@ -127,13 +128,15 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
     assert wire.transport is not None
     profile = None if patient.protocol is None else patient.profile
     advice = "" if profile is None or where.settings is None else profile.wrong_rate(where.settings.baudrate)
-    if where.settings is None or isinstance(where, TcpPort):
+    if where.settings is None or (isinstance(where, TcpPort) and not isinstance(where, Rfc2217Port)):
         yield Finding("open", True, "it opens", advice)
         return
     if profile is not None and where.settings != profile.line:
         advice = advice or f"{profile.title} usually has {diagnosis.speed(profile.line)}"
     yield Finding("open", True, f"it opens at {diagnosis.speed(where.settings)}", advice)
     device = wire.transport.get_extra_info("serial")
+    if isinstance(where, Rfc2217Port):
+        yield from remote_port(wire.transport)
     if device is not None:
         yield from rate(device.fileno(), where.settings.baudrate)
         yield from driver(device.fileno(), where.low_latency if isinstance(where, SerialPort) else None)
@@ -147,6 +150,19 @@ def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
         yield Finding(
             "rate", False, what, "use a rate that it can make, or another adapter: both ends may differ by 2%"
         )
+
+
+def remote_port(transport: asyncio.Transport) -> Iterator[Finding]:
+    """Say what an RFC 2217 server reports of its port."""
+    if transport.get_extra_info("line_errors")() is None:
+        advice = "parity and framing errors are not counted: each shows as a garbled reply, if its checksum finds it"
+        yield Finding("line errors", True, "the server has not confirmed that it reports line errors", advice)
+    else:
+        yield Finding("line errors", True, "the server reports line errors")
+    lines = transport.get_extra_info("modem_lines")
+    if lines is not None:
+        states = ", ".join(f"{name.upper()} {'on' if on else 'off'}" for name, on in lines._asdict().items())
+        yield Finding("modem lines", True, f"the server reports {states}")
 
 
 def driver(descriptor: int, wanted: bool | None = None) -> Iterator[Finding]:
@@ -238,10 +254,11 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
 
 async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell) -> None:
     """Try, as nobody answers, whether somebody would at another rate or framing. The port is left as it was."""
-    settings = patient.endpoint.settings
+    where = patient.endpoint
+    settings = where.settings
     if not wire.tunable or settings is None:
         return
-    if not wire.paced:
+    if not wire.paced and not isinstance(where, Rfc2217Port):
         tell(Finding("settings", True, "a pseudo-terminal has no baud rate: no other was tried"))
         return
     asked = patient.addresses[:STRANGERS]

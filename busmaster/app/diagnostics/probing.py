@@ -70,7 +70,8 @@ class Wire(asyncio.Protocol):
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
         """Hear what is damaged all the same: whoever looks for what is wrong wants to see it."""
         self.marked[mark] += 1
-        self.data_received(byte)
+        if byte:
+            self.data_received(byte)
 
     def data_received(self, data: bytes) -> None:
         now = self.clock()
@@ -96,7 +97,7 @@ class Wire(asyncio.Protocol):
 
     @property
     def tunable(self) -> bool:
-        """Return whether the port can be set to other rates: a serial server's cannot, from here."""
+        """Return whether the port can be set to other rates: that of a serial server in raw TCP cannot, from here."""
         return hasattr(self.transport, "tune")
 
     async def tune(self, settings: LineSettings) -> None:

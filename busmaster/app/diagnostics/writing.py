@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from statistics import median
 
-from busmaster import LineSettings, SerialPort, TcpPort
+from busmaster import LineSettings, Rfc2217Port, SerialPort, TcpPort
 from busmaster.app.config.rewriting import toml_text
 from busmaster.app.diagnostics.diagnosis import milliseconds, percentile, rounded_up, speed
 from busmaster.app.diagnostics.search import Discovery, Found
@@ -92,10 +92,12 @@ def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
         for field in dataclasses.fields(port)
         if field.default is dataclasses.MISSING or getattr(port, field.name) != field.default
     }
-    if discovery.settings is not None and isinstance(port, SerialPort):
+    if discovery.settings is not None and isinstance(port, SerialPort | Rfc2217Port):
         said |= dataclasses.asdict(discovery.settings)
     if discovery.echo:
         said["echo"] = True
+    if isinstance(port, Rfc2217Port):
+        said = {"rfc2217": True} | said
     yield "[port]"
     yield from (f"{key} = {toml_text(value)}" for key, value in said.items())
 

@@ -109,7 +109,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "0"), "a time is above 0"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and ei-bisynch"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
-        (("read", "rfc2217://host:1", *HCP2, "--node", "1", "1"), "use socket://host:1"),
+        (("read", "rfc2217://host", *HCP2, "--node", "1", "1"), "is not of the form rfc2217://HOST:PORT"),
         (("read", "host:5020", *HCP2, "--node", "1", "1"), "a TCP port is written socket://host:5020"),
         (("read", "PORT", *HCP2, "--node", "one", "1"), "'one' is not a valid whole number"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "9e9"), "at most 60000 ms"),

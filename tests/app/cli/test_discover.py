@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.app.cli.discover import what_to_try
 from busmaster.app.config import load
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, serve_pty, serve_tcp
 from busmaster.registry import find, make_device
+from busmaster.transport.rfc2217 import Rfc2217Port
 from tests.app.cli.conftest import Command, ended_once
 
 HCP2 = ("--protocol", "hcp2", "--nodes", "1-3")
@@ -59,6 +61,14 @@ def test_every_node_of_the_protocol_is_found(
     assert found == dict.fromkeys(nodes, name)
     assert "the other addresses are asked too" in done.err
     assert "not asked" not in done.err
+
+
+def test_behind_rfc_2217_the_settings_of_the_line_are_tried_as_on_a_serial_port() -> None:
+    port, tried = what_to_try("rfc2217://server:4001?dtr=0", ["hcp2"], None)
+    assert port == Rfc2217Port("server", 4001, baudrate=9600, dtr=False)
+    assert len({step.settings for step in tried}) == 5
+    _, tried = what_to_try("rfc2217://server:4001?baudrate=9600&parity=N", ["hcp2"], None)
+    assert [step.settings for step in tried] == [LineSettings(9600)]
 
 
 @pytest.mark.slow

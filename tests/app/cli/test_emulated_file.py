@@ -10,14 +10,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 
+from busmaster.app.cli.emulate import own_port
 from busmaster.app.cli.lines import other_port
 from busmaster.app.config import load
 from busmaster.app.line import ConfiguredLine
 from busmaster.bus.node import Node
 from busmaster.bus.samples import Sample
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
 from tests.app.cli.conftest import ROOT, started
 from tests.app.config.test_emulated import HEAD, VALUES
 from tests.patience import PATIENCE
@@ -116,6 +120,12 @@ def test_emulate_says_where_the_file_asks_for_what_no_device_has(tmp_path: Path)
     assert f"{path}:7: emulator.nodes.n.values.outptus: " in err
     assert "did you mean 'outputs'?" in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_line_behind_rfc_2217_is_emulated_only_on_a_port_that_is_named() -> None:
+    with pytest.raises(click.UsageError, match="does not speak RFC 2217; use --tcp or --pty"):
+        own_port(Rfc2217Port("server", 4001, baudrate=9600))
+    assert own_port(TcpPort("server", 4001)) == (None, ("server", 4001))
 
 
 def test_another_port_for_a_file_with_a_tcp_port_is_framed_as_its_protocol_wants(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import Priority, SerialPort, TcpPort
+from busmaster import Priority, Rfc2217Port, SerialPort, TcpPort
 from busmaster.app.config import FileError, LineFile, emulated_line, load
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
@@ -74,6 +74,17 @@ def test_a_tcp_port_is_a_url_or_a_table() -> None:
     wanted = TcpPort("10.0.0.5", 4001, baudrate=57600)
     assert parse(f'port = "socket://10.0.0.5:4001?baudrate=57600"\n{NODE}').port == wanted
     assert parse(f'[port]\nhost = "10.0.0.5"\nport = 4001\nbaudrate = 57600\n{NODE}').port == wanted
+
+
+def test_an_rfc_2217_port_is_a_url_or_a_table_and_has_the_protocols_line_settings() -> None:
+    wanted = Rfc2217Port("10.0.0.5", 4001, baudrate=57600)
+    assert parse(f'port = "rfc2217://10.0.0.5:4001"\n{NODE}').port == wanted
+    table = '[port]\nhost = "10.0.0.5"\nport = 4001\nrfc2217 = '
+    assert parse(f"{table}true\n{NODE}").port == wanted
+    assert parse(f"{table}false\n{NODE}").port == TcpPort("10.0.0.5", 4001)
+    said = f'{table}true\nbaudrate = 9600\nparity = "E"\nstopbits = 2\ndtr = false\nrtscts = true\n'
+    wanted = Rfc2217Port("10.0.0.5", 4001, baudrate=9600, parity="E", stopbits=2, dtr=False, rtscts=True)
+    assert parse(f"{said}{NODE}").port == wanted
 
 
 def test_protocols_that_cannot_share_a_line_are_refused_where_the_second_stands() -> None:
@@ -237,7 +248,9 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (f"{HEAD}prot = 1", "line.toml:2: prot: no such key; did you mean 'port'?"),
         ("port = 5", "line.toml:1: port: must be a table: [port], not 5"),
         (f"{HEAD}{NODE}points.a = {{ factor = inf }}", "nodes.winder.points.a.factor: must be finite, not inf"),
-        ('port = "rfc2217://h:1"', "line.toml:1: port: rfc2217:// does not work"),
+        ('port = "rfc2217://h:1"', "line.toml:1: port: rfc2217://h:1: no baud rate given"),
+        ('[port]\nhost = "h"\nport = 1\nparity = "E"', "line.toml:4: port.parity: no such key"),
+        ('[port]\nhost = "h"\nport = 1\nrfc2217 = 1', "line.toml:4: port.rfc2217: must be true or false, not 1"),
         ('[port]\npath = "/dev/ttyS0"\nbaud = 9600', "line.toml:3: port.baud: no such key; did you mean 'baudrate'?"),
         (f'[port]\npath = "/dev/ttyS0"\nparity = "Q"\n{NODE}', "line.toml:1: port: no such framing: 8Q1"),
         (f"{HEAD}[nodes.a]\naddress = 1", "line.toml:2: nodes.a: 'protocol' is missing"),

@@ -60,6 +60,8 @@ def placed(table: TableKeys) -> tuple[dict[str, Any], tuple[str, ...]]:
     header, _, kind = table.header.partition(" of ")
     if table.header == "[port] with host":
         return BASE | {"port": {"host": "127.0.0.1", "port": 5020, "baudrate": 9600}}, ("port",)
+    if table.header == "[port] with rfc2217 = true":
+        return BASE | {"port": {"host": "127.0.0.1", "port": 5020, "rfc2217": True}}, ("port",)
     if not kind:
         return BASE, PLACES[header]
     address = {"address": 11} if kinds()[kind].profile.addressed else {}

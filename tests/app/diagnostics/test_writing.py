@@ -15,6 +15,7 @@ from busmaster.bus.node import Node
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings
 from busmaster.registry import Protocol, find, protocols
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -64,6 +65,13 @@ def test_a_device_servers_port_is_as_it_was_said(tmp_path: Path) -> None:
     found = Discovery(None, found=[node_of(protocols()[0])])
     said = TcpPort("::1", 4001, receive_latency=0.02)
     assert line_of(found, said, tmp_path).bus.endpoint == said
+
+
+def test_an_rfc_2217_port_keeps_what_was_said_and_gets_the_settings_that_were_found(tmp_path: Path) -> None:
+    found = Discovery(LineSettings(19200, 7, "E"), found=[node_of(find("ct-ansi").protocol)])
+    said = Rfc2217Port("::1", 4001, baudrate=9600, dtr=False)
+    port = line_of(found, said, tmp_path).bus.endpoint
+    assert port == replace(said, baudrate=19200, bytesize=7, parity="E")
 
 
 def test_a_slow_node_gets_a_window_that_it_can_keep(tmp_path: Path) -> None:
