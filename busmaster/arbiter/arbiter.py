@@ -1,12 +1,11 @@
-"""The one place where the state of a line changes.
+"""The state machine of one line.
 
-Theory of operation
--------------------
-One half-duplex line, many nodes, anonymous replies: at most one exchange is on the line (R1), and no byte of an earlier
-one can come when the next begins (R3), unless its window was learned (R15). It is told the time and sends nothing: its
-owner pumps `poll_transmit`, then `poll_event`, and arms a timer for `poll_timeout`. Calls too early change nothing.
+The line is half-duplex, has many nodes, and replies are anonymous. At most one exchange is on the line (R1). No byte of
+an earlier exchange can arrive when the next one begins (R3), unless its window was learned (R15). The arbiter does no
+I/O and reads no clock: the caller passes the time and the received bytes, then calls `poll_transmit`, then
+`poll_event`, and sets a timer for `poll_timeout`. A call that is too early changes nothing.
 
-The line is in one of five states; `_deadlines.line` is when the state ends by itself.
+The line is in one of five states. `_deadlines.line` is the time at which the state ends without further input.
 
 ===============  =====================  ========================  =======================  =====================
 state            data received          its deadline              line_up / line_down      submit, poll due
@@ -27,15 +26,17 @@ RESYNCHRONISING  unexpected: silence    READY                     down: OFFLINE,
                  NOISY, all fail
 ===============  =====================  ========================  =======================  =====================
 
-READY never lasts while something waits: whatever leads to READY starts the next transaction in the same call.
-An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it, or
-a NAK to a write. Everything else resynchronises, to silence and past the maximum reply delay (times: on_wire.py).
+The line never stays in READY while a request is queued: each transition to READY starts the next transaction in the
+same call. An exchange ends in READY or HOLDOFF only if its outcome is certain: a matching reply with no further bytes,
+or a NAK to a write. After every other outcome the line resynchronises: it waits for silence and for the maximum reply
+delay (on_wire.py).
 
-Time starts when bytes have left. `poll_transmit` hands them over; `transmitted` says when the port had taken them, and
-`unsent`, asked for when a deadline of the line falls due, how many have not left yet: until then, nothing runs out.
+Reply times start when the bytes have left the port. `poll_transmit` hands the bytes over. `transmitted` reports when
+the port has taken them. `unsent` reports, when a deadline of the line expires, how many bytes have not left yet. Until
+they have left, no deadline expires.
 
-What goes next is chosen in choice.py, by what is overdue (in_sync.py). What becomes of a failed attempt is
-dispatcher.py's business.
+choice.py selects the next request, depending on the overdue replies (in_sync.py). dispatcher.py handles failed
+attempts.
 """
 
 from __future__ import annotations
@@ -76,17 +77,18 @@ from busmaster.errors import BusClosed, BusError, LineDown, LineNoisy, Refused
 
 
 class Arbiter:
-    """The arbiter of one line: its states, and the commands of its owner.
+    """The arbiter of one line: its states and the operations of its caller.
 
-    `byte_time` is tau, in seconds. `echo`: what is sent is received too. `receive_latency`: seconds that received bytes
-    may lie in an adapter. `capacity`: requests of one class that may wait. `jitter` returns numbers from 0 to 1, by
-    which probes are spread. `strict`: answers that could be another's are held until that one would have come (R15).
+    `byte_time`: tau, in seconds per byte. `echo`: the port receives its own transmissions. `receive_latency`: seconds
+    for which an adapter can hold received bytes. `capacity`: maximum number of queued requests per class. `jitter`:
+    returns numbers from 0 to 1, used to spread probes. `strict`: hold every ambiguous reply until the other possible
+    reply would have arrived (R15).
     """
 
     name = ""
-    """What errors call the line."""
+    """Name of the line, used in error messages."""
     longest_hold = 0.0
-    """Of the sequences that were begun, the longest time, in seconds, for which one may hold the line."""
+    """Longest `max_hold` of any exclusive sequence so far, in seconds."""
 
     def __init__(
         self,
@@ -127,8 +129,10 @@ class Arbiter:
     # inputs
 
     def line_up(self, now: float, *, paced: bool = False) -> None:
-        """Note that the port is open, and resynchronise first: what an earlier master asked may still be answered. If
-        `paced`, bytes leave at the baud rate, so that a reply that comes earlier cannot be one (R4)."""
+        """Handle an opened port. Resynchronises first, because replies to an earlier master may still arrive.
+
+        If `paced`, bytes leave at the baud rate, so bytes that arrive too early cannot be a reply (R4).
+        """
         if self.state is not OFFLINE or self._closed:
             return
         self._step.paced = paced and not self._echo.declared
@@ -141,7 +145,7 @@ class Arbiter:
         self._resynchronise(now)
 
     def line_down(self, cause: str, now: float) -> None:
-        """Fail everything, for the port is gone, and send nothing any more of what waited (R13)."""
+        """Handle a lost port: fail all requests and discard what is queued (R13)."""
         # A port that fails while it is being closed reports its loss twice.
         if self.state is OFFLINE:
             return
@@ -154,19 +158,20 @@ class Arbiter:
         self.dispatcher.fail_all(now)
 
     def still_down(self, cause: str, hint: str) -> None:
-        """Note why the port does not come back: a request that fails says that, which is news, and not the loss."""
+        """Store why the port cannot be reopened. Requests that fail report this cause instead of the original loss."""
         self._cause, self._hint = cause, hint
 
     def data_received(self, data: bytes, now: float) -> None:
-        """Take bytes as they come: an echo, a reply, or what nobody asked for."""
-        # Before anything else: on an echoing port the first bytes are always our own.
+        """Process received bytes: an echo, a reply, or unexpected bytes."""
+        # The echo first: on an echoing port the first bytes received are always our own.
         if self._echo.pending:
             data = self._strip_echo(data, now)
             if not data:
                 return
         if self.state is not EXCHANGE:
             self._take_unexpected(data, now)
-        elif self._trust.held is not None:  # two answers where one is due: neither is believed
+        # A second reply while one is held: it is not known which of them is right, so neither is delivered.
+        elif self._trust.held is not None:
             self._disbelieve(TWO_ANSWERS, Done(None, data, self._trust.held.send), now)
         elif self._step.begun:
             self._unexpected.last_byte = now
@@ -175,7 +180,7 @@ class Arbiter:
             self._begin_reply(data, now)
 
     def byte_marked(self, mark: Mark, now: float) -> None:
-        """Note that the UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
+        """Handle a UART report of a break or a damaged byte. The byte is not accepted as part of any reply."""
         self._counters.mark(mark)
         self._unexpected.last_byte = now
         self._echo.forget()
@@ -186,13 +191,16 @@ class Arbiter:
             self._take_unexpected(b"\0", now)
 
     def transmitted(self, now: float) -> None:
-        """Note that the port took what `poll_transmit` gave only now: whoever held the process up meanwhile."""
+        """Shift the reply times if the port took the bytes later than `poll_transmit` handed them over.
+
+        The process may have been suspended in between. The clock is read after the write (R2).
+        """
         output = self._wire.output
         said_at = output.said_at
         late = now - said_at
         if late > 0.0:
             output.said_at = now
-            step = self._step  # as step.shift does: this is done for every request
+            step = self._step  # Same as `step.shift`, written out: this runs for every request.
             step.end += late
             step.out += late
             if step.paced:
@@ -200,27 +208,30 @@ class Arbiter:
             self._deadlines.line += late
             if self.state is RESYNCHRONISING:
                 self._silent_at += late
-            # Not for an ACK within the exchange: the request left before, and its answer may be as old as that.
+            # Not for an ACK within the exchange: its request left earlier, and the overdue reply can be as old as that
+            # request.
             asked = self._wire.transaction
             if late > LOOK_SLACK and output.begins and asked is not None and asked.started == said_at:
                 asked.started = now
 
     def line_due(self, now: float) -> bool:
-        """Return whether a deadline of the line falls due: `unsent` is to be told first, where it is known."""
+        """Return True if a deadline of the line has expired. If the port can report unsent bytes, call `unsent`
+        first."""
         return now >= self._deadlines.line
 
     def unsent(self, count: int, now: float) -> None:
-        """Note that so many of the bytes said have not left: until they have, nothing runs out, nothing else is said
-        and nothing is their answer. The caller tells it again, then, before the bytes that come.
+        """Report how many handed-over bytes have not left the port.
 
-        A line that is being closed does not wait for them: that they have not left is noted, for the error.
+        Until all have left, no deadline expires, no further request is sent, and received bytes are not accepted as the
+        reply. The caller must report the count again before it passes received bytes. A line that is being closed does
+        not wait for unsent bytes; they are only mentioned in the error.
         """
         again = self._wire.output.unsent(count, now)
         if again is not None and (again == inf or not self._closed):
             self._deadlines.line = self._due_anew(now) if again == inf else again
 
     def _due_anew(self, now: float) -> float:
-        """Return the deadline of the line, from the end of what has only just left."""
+        """Return the deadline of the line, counted from the end of bytes that have just left."""
         if self.state is EXCHANGE:
             return self._wire.due_anew(now)
         if self.state is RESYNCHRONISING:
@@ -229,13 +240,16 @@ class Arbiter:
         return now + self._step.timing.driver_release_time if self.state is HOLDOFF else inf
 
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
-        """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
+        """Run the timers that have expired. `unread`: received bytes were not passed on yet, so silence is not
+        known."""
         deadlines = self._deadlines
         if now >= deadlines.earliest_other:
             self.dispatcher.handle_timeout(now, unread)
             if now >= deadlines.health:
                 self._enter(self.state, now)
                 self.dispatcher.probe(now, self.state is READY)
+        # While input is unread, the line timer does not run: after the loop was blocked, a reply that arrived in time
+        # would otherwise count as missing (tests/transport/test_blocked_loop.py).
         if now >= deadlines.line and not unread:
             if self.state is EXCHANGE:
                 if self._trust.held is not None:
@@ -252,7 +266,9 @@ class Arbiter:
     # one exchange
 
     def _advance(self, now: float) -> bool:
-        """Start the next transaction, right behind our own last byte. Returns False if none waits."""
+        """Start the next transaction, directly behind the last transmitted byte. Returns False if none is queued."""
+        # Nothing is sent while the reply to an earlier master, or an overdue reply that was waited for, can still
+        # begin.
         if now < self._quarantine:
             self._resynchronise(now)
             return True
@@ -274,10 +290,12 @@ class Arbiter:
         return True
 
     def _begin_reply(self, data: bytes, now: float) -> None:
-        """Take the first bytes of a step: those of them that may be its reply begin it."""
+        """Process the first bytes received in a step. Bytes that can belong to the reply start it."""
         wire, step = self._wire, self._step
         transaction = wire.transaction
         assert transaction is not None
+        # R4: bytes that arrive before 90 % of the request is on the wire, or while the port still holds part of it,
+        # cannot be its reply.
         if now < step.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._unexpected.last_byte = now
@@ -291,7 +309,7 @@ class Arbiter:
             heard, data = data, wire.without_noise(data)
             self._counters.noise_bytes += len(heard) - len(data)
             if not data:
-                self._unexpected.last_byte = now  # noise that is passed over breaks a silence all the same
+                self._unexpected.last_byte = now  # noise that is skipped still interrupts the silence
                 return
         step.begun = True
         step.begun_at = now
@@ -306,20 +324,20 @@ class Arbiter:
         self._take(data, now)
 
     def _take(self, data: bytes | None, now: float) -> None:
-        """Hand the reader these bytes, or the news (None) that none came in time, and do what it makes of them."""
+        """Pass bytes to the protocol's reader, or None if the deadline expired, and act on its result."""
         no_reply = data is None and not self._step.begun
         try:
             exchange = self._wire.exchange
             assert exchange is not None
             progress = exchange.expired(self._step.begun) if data is None else exchange.feed(data)
             if type(progress) is Expect:
-                self._watch_max_reply_delay()  # now: the next step takes the place of this one's times
+                self._watch_max_reply_delay()  # before `follow`: the next step overwrites this one's times
                 progress = self._wire.follow(progress, now)
         except FrameError as error:
             self._attempt_failed(error, now, no_reply=no_reply)
         except Refused as refusal:
             self._refused(refusal, now)
-        # A bug in one protocol must not end the line of all other nodes; it is reported with the request.
+        # A bug in one protocol must not stop the line for all other nodes. The request fails with it.
         except Exception as bug:
             self._attempt_failed(FrameError(f"a bug in the protocol's reader: {bug!r}"), now, bug=bug)
         else:
@@ -329,17 +347,17 @@ class Arbiter:
                 self._deadlines.line = self._wire.gap_over(now)
 
     def _awaits_late_reply(self, now: float) -> bool:
-        """Wait on for a reply that has not begun in its window, and return whether it may still begin.
+        """Continue to wait for a reply that has not begun within its window. Returns True if it can still begin.
 
-        The line would resynchronise until then anyway (R3), so a late reply that is right is worth waiting for, and
-        costs nothing. A learned window ends the wait: the line goes on, and the reply is overdue (R15).
+        The line would resynchronise until then anyway (R3), so waiting for a late correct reply costs no line time. A
+        learned window ends the wait: the line continues, and the reply becomes overdue (R15).
         """
         wire, step, unexpected = self._wire, self._step, self._unexpected
         if step.begun or not wire.answered or step.timing.silence is not None:
             return False
         if (
             self._closed or self._echo.pending
-        ):  # who leaves waits for a window (R8); an echo that is lost hides the reply
+        ):  # Closing waits for the window only (R8). If an echo was lost, the reply cannot be separated from it.
             return False
         # R2: no reply can begin after the maximum reply delay, so no caller waits longer for one.
         until = step.last_begin()
@@ -351,16 +369,16 @@ class Arbiter:
         return True
 
     def _watch_max_reply_delay(self) -> None:
-        """Tell of a node whose reply to this step began after its window; raise its maximum reply delay if that was
-        near (R3)."""
+        """Report a reply that began after its window, and raise the node's maximum reply delay if it was close to it
+        (R3)."""
         step, transaction = self._step, self._wire.transaction
         assert transaction is not None
-        # an earlier step may have been the late one
+        # `overdue` may have been set by an earlier step of the exchange
         if transaction.overdue and step.begun and step.begun_at > step.end + step.timing.window + step.latency:
             self._unexpected.note_late(transaction.node, step.timing, step.end, step.begun_at)
 
     def _complete(self, progress: Done[Any], now: float) -> None:
-        """Deliver a value: the line is free when the closing ACK has left and the node has let go of the line."""
+        """Deliver a value. The line is free when the closing ACK has left and the node has released the line."""
         wire, step = self._wire, self._step
         transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
@@ -373,25 +391,29 @@ class Arbiter:
             if alert or rest:
                 verdict = self._trust.weigh(wire, progress, now)
                 if isinstance(verdict, str):
-                    self._disbelieve(verdict, progress, now)  # before what follows: it proves not that its request left
+                    # An ambiguous reply does not prove that the request has left, so the times below stay unchanged.
+                    self._disbelieve(verdict, progress, now)
                     return
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
             begun_at = step.begun_at
-            if transaction.overdue:  # asked here, too: this is done for every reply
+            if transaction.overdue:  # checked here as well, to save a call: this runs for every reply
                 self._watch_max_reply_delay()
-            if step.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+            # Unpaced port: a request that was answered has left, even if the configured baud rate is lower than the
+            # real one.
+            if step.end > begun_at:
                 step.end = step.out = begun_at
             transaction.node.note_reply(exchange.answers, transaction.command, begun_at - step.end)
             if transaction.node.learning is not None:
                 wire.learn(now)
         if progress.send:
             wire.say(progress.send, now)
-        wire.transaction = wire.exchange = None  # and nothing is held: what was has been weighed again
+        wire.transaction = wire.exchange = None  # `trust.held` is None here: a held reply has been evaluated again
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, progress.value, now)
-        if rest or wire.came_unexpected or (self._echo.pending and not answered):  # a broadcast's echo may never come
+        # the echo of a broadcast may never arrive
+        if rest or wire.came_unexpected or (self._echo.pending and not answered):
             if rest:
                 self._unexpected.note(rest, now, step.quiet())
             self._resynchronise(now)
@@ -402,7 +424,8 @@ class Arbiter:
     def _disbelieve(self, what: str, progress: Done[Any], now: float) -> None:
         self._counters.ambiguous += 1
         if self._wire.transaction is not None:
-            self._wire.transaction.node.unheard = 0  # heard, if not believed: what it owes it is asked for itself
+            # The node is alive although its reply is not delivered: a sync read can clear its overdue reply.
+            self._wire.transaction.node.unheard = 0
         if progress.rest:
             self._unexpected.note(progress.rest, now, self._step.quiet())
         self._attempt_failed(FrameError(what, send=progress.send), now, ambiguous=True)
@@ -423,20 +446,22 @@ class Arbiter:
             unexpected.unanswered(transaction.node, step.end, step.timing.max_reply_delay)
             if error.what == NO_REPLY:
                 timing = step.timing
-                early = timing.silence is not None or self._closed or self._echo.pending  # see _awaits_late_reply
+                # same conditions as in _awaits_late_reply
+                early = timing.silence is not None or self._closed or self._echo.pending
                 awaited = timing.window if early else timing.max_reply_delay
                 error.what = f"no reply within {awaited * 1000:g} ms"
             if self._echo.pending:
                 error.what += ", and no echo of the request: if the adapter has none, leave echo out"
         else:
             if transaction.overdue:
-                unexpected.answered()  # what came late and is wrong may be noise: it makes no node slower
+                # Late and wrong bytes may be noise, so they do not raise the maximum reply delay.
+                unexpected.answered()
             if error.heard:
                 unexpected.came(now)
                 unexpected.run[:] = error.heard
         spared = error.whole and not self._in_sync.is_overdue(
             now
-        )  # its reply has begun: the silence alone is waited for (R3)
+        )  # The reply has begun (bad checksum), so only silence is awaited and not the maximum reply delay (R3).
         both = error.what is TWO_ANSWERS
         if both:
             self._in_sync.said_twice(now)
@@ -451,9 +476,9 @@ class Arbiter:
         self._resynchronise(now, begun=spared)
 
     def _refused(self, refusal: Refused, now: float) -> None:
-        """Take a refusal: a NAK to a write is certain; a NAK to a read may be noise before the true reply (R7).
+        """Handle a refusal. A NAK to a write is certain; a NAK to a read may be noise before the true reply (R7).
 
-        While something is overdue, no refusal is certain: it may be an earlier request's (R15).
+        While a reply is overdue, no refusal is certain, because it may belong to an earlier request (R15).
         """
         transaction = self._wire.transaction
         assert transaction is not None
@@ -467,13 +492,13 @@ class Arbiter:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, certain, now)
         if transaction.writes and certain:
-            self._step.answered()  # what was refused has left, as what was answered has
+            self._step.answered()  # a refused request has left the port, like an answered one
             self._release(self._step.timing.driver_release_time, now)
         else:
             self._resynchronise(now, begun=confirmed and certain)
 
     def _first_frame_ended(self) -> None:
-        """Tell R15 when no node can reply to the first frame any more, whether or not it was sent to that node."""
+        """Set the time after which no node can still reply to the first frame (R15)."""
         max_reply_delay = max((node.max_reply_delay for node in self.dispatcher.nodes), default=UNKNOWN_MAX_REPLY_DELAY)
         self._in_sync.lone_bytes_until = self._step.out + max_reply_delay + self._step.latency + self._step.byte_time
 
@@ -485,23 +510,27 @@ class Arbiter:
             self._step.give_up(wire.exchange.later)
             self._step.came_unexpected(
                 self._unexpected.last_byte
-            )  # what came in place of the reply may have been it, damaged
+            )  # the unexpected bytes may have been the reply, damaged
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
     # the line between exchanges
 
     def _release(self, hold: float, now: float) -> None:
-        """Let the next request follow `hold` seconds behind our own last byte: the outcome was certain."""
+        """Allow the next request `hold` seconds after the last transmitted byte. The outcome was certain."""
         if self._closed:
             self._go_offline(now)
-        elif hold or not self._advance(now):  # behind a closing ACK, in the same write: waiting for it took a timer
+        # The request follows the closing ACK in the same write: a wait for the ACK would need a timer.
+        elif hold or not self._advance(now):
             free = hold + (self._step.out if self._step.out > now else now)  # a call of `max` takes three times as long
             self._enter(HOLDOFF if free > now else READY, now)
             self._deadlines.line = free if free > now else inf
 
     def _resynchronise(self, now: float, begun: bool = False) -> None:
-        """Discard until the line was silent long enough, and nothing can come any more (R3) unless it has `begun`."""
+        """Discard input until the line is silent and the maximum reply delay has passed (R3).
+
+        If the reply has `begun`, only the silence is required.
+        """
         if self._closed:
             self._go_offline(now)
             return
@@ -509,9 +538,11 @@ class Arbiter:
             self._counters.resyncs += 1
             self._enter(RESYNCHRONISING, now)
         self._echo.forget()
-        last = max(self._unexpected.last_byte, self._step.out)  # ours, too: who speaks on two wires does not hear
+        # Our own bytes count as well: a two-wire adapter does not receive while it transmits.
+        last = max(self._unexpected.last_byte, self._step.out)
         silent = max(last + self._step.quiet(), self._quarantine, now)
-        goes_on = begun or self._step.timing.silence is not None  # learned: what may still come is overdue (R15)
+        # After a learned window the line continues: the reply that may still arrive is tracked as overdue (R15).
+        goes_on = begun or self._step.timing.silence is not None
         self._silent_at = silent if goes_on else max(silent, self._step.past())
         self._deadlines.line = self._unexpected.look_before(self._silent_at, now)
 
@@ -531,7 +562,7 @@ class Arbiter:
         self._advance(now)
 
     def _take_unexpected(self, data: bytes, now: float) -> None:
-        """Take bytes that nobody asked for."""
+        """Process bytes that belong to no request."""
         unexpected = self._unexpected
         unexpected.note(data, now, self._step.quiet())
         self._step.came_unexpected(now)
@@ -547,26 +578,26 @@ class Arbiter:
             self.dispatcher.fail_all(now)
 
     def _hear_out(self, run: bytes, now: float) -> None:
-        """Take what came before this silence: whoever said it, and overdue it, is alive (R11, R15)."""
+        """Process the bytes received before this silence. A node whose overdue reply is found is alive (R11, R15)."""
         node = self._trust.hear(self._wire, run, self._unexpected, now, self._echo.astray) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 
     def _answer_unexpected(self, send: bytes, now: float) -> bool:
-        """Return True if an answer was overdue: then the line resynchronises again, and what was said just now
-        echoes."""
+        """Send an acknowledgement for an unexpected packet (MSC). Returns True if `send` is not empty; then the line
+        resynchronises."""
         if send:
             self._wire.say(send, now)
             overdue = self._echo.pending
             self._resynchronise(now)
-            self._echo.pending = overdue  # which the resynchronisation forgot: this is echoed, too
+            self._echo.pending = overdue  # the resynchronisation cleared it, but these bytes are echoed too
         return bool(send)
 
     def _strip_echo(self, data: bytes, now: float) -> bytes:
-        """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
+        """Remove the echo of sent bytes from the input, byte by byte. A mismatch is a collision."""
         rest = self._echo.strip(data)
-        self._unexpected.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
-        if self.state is RESYNCHRONISING:  # an ACK, then, before its packet (MSC)
+        self._unexpected.last_byte = now  # if the echo was lost, these bytes may be another node's that look like it
+        if self.state is RESYNCHRONISING:  # an ACK may precede its packet (MSC)
             self._silent_at = max(self._silent_at, self._step.came_unexpected(now))
         if rest is None:
             self._counters.collisions += 1
@@ -577,13 +608,13 @@ class Arbiter:
                 self._resynchronise(now)
             return b""
         if not self._echo.pending and self.state is EXCHANGE and not self._step.begun:
-            self._wire.output.held = False  # it is heard, so it has left
+            self._wire.output.held = False  # the echo has arrived, so the request has left
             due = self._step.echoed(now)
             self._deadlines.line = due if self._wire.answered else now + self._step.timing.driver_release_time
         return rest
 
     def _go_offline(self, now: float) -> None:
-        """Cut off whatever is on the wire."""
+        """Abort the exchange on the wire and enter OFFLINE."""
         transaction = self._wire.transaction
         self._enter(OFFLINE, now)
         self.noisy = False
@@ -621,12 +652,12 @@ class Arbiter:
 
     @property
     def attempt(self) -> Attempt | None:
-        """What is on the wire, on a line that is tapped."""
+        """The attempt on the wire, if the line is tapped."""
         tapped = self.dispatcher.tapped
         return None if tapped is None else tapped.attempt
 
     def set_tapped(self, tapped: bool) -> None:
-        """Have `attempt` say what is on the wire, and the end of each attempt be an event, from now on, or no more."""
+        """Turn the tap on or off. While it is on, `attempt` is set and the end of each attempt is an event."""
         self.dispatcher.tapped = Tapped(self.events, self._counters) if tapped else None
 
     def add_node(
@@ -639,8 +670,8 @@ class Arbiter:
     ) -> NodeRecord:
         """Add a node and return its record.
 
-        Raises InvalidCommand for an address that the protocol does not have, and for learned windows where they cannot
-        be learned (HCP).
+        Raises InvalidCommand if the protocol does not have this address, or if learned windows are requested and the
+        protocol does not support them (HCP).
         """
         profile.check_address(address)
         if isinstance(timings, Learned):
@@ -658,82 +689,84 @@ class Arbiter:
         # One listener per line: only one protocol of a line has replies to what nobody requested (MSC).
         if profile.listen is not None and self._unexpected.listener is None:
             self._unexpected.listener = profile.listen()
-        # An earlier master may have asked this node just before the port was opened: that reply is waited out (R3).
+        # R3: an earlier master may have sent this node a request just before the port was opened. Wait for that reply.
         self._quarantine = max(
             self._quarantine, self._up_at + node.max_reply_delay + self._step.latency + self.byte_time
         )
         return node
 
     def remove_node(self, node: NodeRecord) -> None:
-        """Remove a node: the line sends it no probe and no sync read any more.
+        """Remove a node. The line sends it no further probe or sync read.
 
-        An exchange with it that is on the wire runs out. Its overdue replies stay overdue (R15): another node's reply
-        clears them, as it does for a node that is silent.
+        An exchange with the node that is on the wire is finished. Its overdue replies stay overdue (R15). Another
+        node's reply clears them, as for a silent node.
         """
-        # Its record lives on in what is overdue and in statistics that callers hold.
+        # The record is still referenced by overdue replies and by statistics that callers hold.
         node.removed = True
         self.dispatcher.nodes.remove(node)
         self.dispatcher.writes.forget_empty()
         self.dispatcher.probes.plan()
 
     def ask_within_budget(self, node: NodeRecord, now: float) -> None:
-        """Treat a new node as down until its first reply: it is asked within the budget of probes only (R11)."""
+        """Treat a new node as DOWN until its first reply, so that requests to it use only the probe budget (R11)."""
         node.health, node.budgeted, node.probe_at = DOWN, True, now
         self.dispatcher.probes.plan()
 
     def name_node(self, node: NodeRecord, label: str) -> None:
-        """Have messages call the node by this label."""
+        """Set the label of a node, used in messages."""
         node.label = label
 
     def change_profile(self, node: NodeRecord, profile: Profile) -> None:
-        """Go by another profile of the node's protocol from now on: one that merges otherwise."""
+        """Replace a node's profile by another one of the same protocol, for example one that merges reads
+        differently."""
         node.profile = profile
 
     def expect_hook(self, node: NodeRecord, expected: bool) -> None:
-        """Hold the node's polls when it comes back until `Dispatcher.release_node`, or do not, as `expected` says."""
+        """Enable or disable holding the polls of a returning node until `Dispatcher.release_node`."""
         node.has_hook = expected
 
     def note_stop(self, node: NodeRecord) -> None:
-        """Count that the node is told to stop."""
+        """Count a stop command to this node."""
         node.stops += 1
 
     def answer_counts(self, now: float) -> bool:
-        """Return whether a caller's time is over while something is on the wire: what has come is handed over first."""
-        # A loop that stood still may look at its timers before it reads: what lies unread came in time.
+        """Return True if a caller's deadline has passed during an exchange. The owner must pass on received bytes
+        first."""
+        # A loop that was blocked may run its timers before it reads. Bytes that lie unread arrived in time.
         return self.state is EXCHANGE and now >= self._deadlines.expiry
 
     def add_client(self, share: float = 1.0, owner_time: float = 0.0, user: Hashable = None) -> LineClient:
-        """Return a client with whom the line's owner and other clients take turns from now on (R9)."""
+        """Add a client that takes turns with the line's owner and with the other clients (R9)."""
         client = LineClient(share, user=user)
         self.dispatcher.share().admit(client, owner_time)
         return client
 
     def change_client(self, client: LineClient, owner_time: float) -> None:
-        """Give a client another `owner_time`, as its role has changed."""
+        """Set a client's `owner_time`, after its role has changed."""
         self.dispatcher.share().admit(client, owner_time)
 
     def remove_client(self, client: LineClient) -> None:
-        """Forget a client, who has nothing waiting; what it may still have on the wire runs out."""
+        """Remove a client that has no queued requests. Its exchange on the wire, if any, is finished."""
         client.over = True
         self.dispatcher.share().forget(client)
 
     def exclusive(self, node: NodeRecord, client: LineClient | None, longest: float) -> Hold:
-        """Return what requests name as their client that are one sequence: see `Hold`. It ends with `release`."""
+        """Return a `Hold` that the requests of one sequence use as their client. End it with `release`."""
         self.dispatcher.share()
         self.longest_hold = max(self.longest_hold, longest)
         return Hold(node, OWN if client is None else client, longest)
 
     def release(self, hold: Hold, now: float) -> None:
-        """End a sequence: the line is free for others; what of it was not sent ends as HoldEnded."""
+        """End a sequence. Its unsent requests fail with HoldEnded, and the line is free for other clients."""
         if not hold.over:
             self.dispatcher.end_hold(now, hold)
         if self.state is READY:
             self._advance(now)
 
     def submit(self, transaction: Transaction, now: float) -> bool:
-        """Queue a transaction, or end it at once.
+        """Queue a transaction, or end it immediately.
 
-        Returns False if it waits and nothing else has changed: then there is nothing to pump.
+        Returns False if it was queued and nothing else changed: there is no output or event to fetch.
         """
         changed = self.dispatcher.submit(transaction, now)
         if self.state is READY:
@@ -742,53 +775,54 @@ class Arbiter:
         return changed
 
     def cancel(self, transaction: Transaction, now: float) -> None:
-        """Cancel a transaction, synchronously and without ever touching the line (R6)."""
+        """Cancel a transaction. Takes effect immediately and does not touch the line (R6)."""
         self.dispatcher.cancel(transaction, now)
 
     def supersede_writes(self, now: float) -> None:
-        """End whatever waits to be written as Superseded: the line is taken to its safe state."""
+        """Fail all queued writes with Superseded, before the safe state is sent."""
         self.dispatcher.supersede_writes(now)
 
     def add_poll(self, poll: Poll, now: float) -> None:
-        """Run a poll from now on; its first cycle waits until a line that has just been opened can be used."""
+        """Start a poll. Its first cycle waits until a line that has just been opened is usable."""
         self.dispatcher.add_poll(poll, max(now, self._quarantine))
 
     def remove_poll(self, poll: Poll, now: float) -> None:
-        """End a poll: what it has queued is never sent, and what it has on the wire goes unheard."""
+        """Remove a poll. Its queued requests are discarded; the reply of one on the wire is ignored."""
         self.dispatcher.remove_poll(poll, now)
 
     def demand(self, poll: Poll, now: float) -> None:
-        """Run one cycle of a poll now, off the grid."""
+        """Run one cycle of a poll now, outside its grid."""
         self.dispatcher.demand(poll, now)
         if self.state is READY:
             self._advance(now)
 
     def close(self, now: float) -> None:
-        """Fail whatever waits with BusClosed. The exchange on the wire runs out; then the line is OFFLINE.
+        """Fail all queued requests with BusClosed. After the exchange on the wire has finished, the line is OFFLINE.
 
-        `failing` says whether some of it has not ended yet.
+        `failing` is True while some of these requests have not ended yet.
         """
         if self._closed:
             return
         self._closed = True
         self.dispatcher.fault = lambda: BusClosed("the bus was closed")
-        # Polls first: a cycle that is released between two pieces would fail one by one.
+        # Remove polls first: a cycle that is released between two batches of failures would fail request by request.
         for poll in list(self.dispatcher.schedule.polls):
             self.dispatcher.remove_poll(poll, now)
         self.dispatcher.fail_all(now)
-        # The exchange on the wire runs out: its reply would otherwise meet the next master of the line.
+        # Finish the exchange on the wire: its reply would otherwise reach the next master of this line.
         if self.state is not EXCHANGE:
             self._go_offline(now)
 
     @property
     def failing(self) -> bool:
-        """Whether some of what failed with the line has not ended yet: further calls of `handle_timeout` end it."""
+        """True while requests that failed with the line have not ended yet. Further calls of `handle_timeout` end
+        them."""
         return len(self.dispatcher.failing) > 0
 
     # outputs, pumped in this order
 
     def poll_transmit(self) -> bytes | None:
-        """Return the bytes that are to be sent now, which are handed over once, or None."""
+        """Return the bytes to send now, or None. Each byte is returned once."""
         output = self._wire.output
         data = output.waiting
         if not data:
@@ -798,27 +832,28 @@ class Arbiter:
 
     @property
     def said_until(self) -> float:
-        """When all that was said is on the wire, in seconds on the caller's clock, if the port holds none of it."""
+        """Time at which all sent bytes are on the wire, in seconds on the caller's clock, if the port holds none
+        back."""
         return self._step.out
 
     def poll_event(self) -> Event | None:
-        """Take out the next event, in the order of `events`, or return None."""
+        """Remove and return the next event, in the order of `events`, or None."""
         if self.dispatcher.unnoted is not None:
-            self.dispatcher.note_success()  # only now: the next request has left
+            self.dispatcher.note_success()  # deferred until here, so that the next request leaves first
         return self.events.popleft() if self.events else None
 
     def poll_timeout(self) -> float:
-        """Return when `handle_timeout` is to be called, in seconds on the caller's clock; inf if nothing is due."""
-        # It is asked after every byte that comes. A call of `min` takes more than twice as long.
+        """Return when to call `handle_timeout`, in seconds on the caller's clock; inf if no deadline is set."""
+        # Called after each received byte. A call of `min` takes more than twice as long.
         line, other = self._deadlines.line, self._deadlines.earliest_other
         return line if line < other else other
 
     def reset_statistics(self, now: float) -> None:
-        """Begin the counts of the line and of its nodes anew."""
+        """Reset the counters of the line and of its nodes."""
         self._counters.reset(self.state, now)
         for node in self.dispatcher.nodes:
             node.counters.reset()
 
     def statistics(self, now: float) -> LineStatistics:
-        """Return an immutable snapshot of the line's counts since the last reset; its times are in seconds."""
+        """Return an immutable snapshot of the line's counters since the last reset. Times are in seconds."""
         return self._counters.snapshot(self.state, now, len(self.dispatcher.backlog))

@@ -1,6 +1,7 @@
-"""What waits for the line: four strict classes, and one slot in eight for the lower ones (R9). A class is in order of
-arrival or of deadlines. The writes to each node are in order: none overtakes another of the same program, retries
-included (R7).
+"""The queues of one line: four strict classes, with one slot in eight for the lower ones (R9).
+
+A class is ordered by arrival or by deadline. The writes to each node are ordered too: none overtakes another of the
+same program, retries included (R7).
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import BACKGROUND, PARKED, POLL, QUEUED, Phase, Priority, Transaction
 
 SLACK = 64
-"""Entries of ended transactions that a queue may hold beside as many live ones."""
+"""Entries of ended transactions that a queue may hold in addition to as many live ones."""
 LOOKED_AT = 8
-"""Waiting transactions of a class among which one is picked that may go before the first (R15)."""
+"""Queued transactions of a class that are examined for one that can go before the first (R15)."""
 
 
 class Queue(Protocol):
-    """Transactions that wait, in the order in which they are to go. Ended ones are skipped."""
+    """Queued transactions, in the order in which they are to be sent. Ended ones are skipped."""
 
     live: int
-    """How many wait."""
+    """Number of queued transactions."""
 
     def push(self, transaction: Transaction, /) -> None: ...
     def push_front(self, transaction: Transaction, /) -> None: ...
@@ -38,7 +39,7 @@ class Queue(Protocol):
 
 
 class Fifo:
-    """First in, first out. Ended transactions are skipped, and swept out before they pile up."""
+    """First in, first out. Ended transactions are skipped, and removed in bulk."""
 
     __slots__ = ("_entries", "live")
 
@@ -57,7 +58,7 @@ class Fifo:
         self.live += 1
 
     def pop(self) -> Transaction:
-        """Take out the first that waits. Raises IndexError if none does."""
+        """Remove and return the first transaction. Raises IndexError if there is none."""
         while True:
             transaction = self._entries.popleft()
             if transaction.phase is QUEUED:
@@ -65,10 +66,10 @@ class Fifo:
                 return transaction
 
     def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few that suits, or return None."""
+        """Remove and return the first suitable one among the first LOOKED_AT, or None."""
         passed: list[Transaction] = []
         found = None
-        # Only the first few: equal polls by the hundred must not be searched for an unlike one at every exchange.
+        # Only the first few: with hundreds of equal polls queued, a full search at every exchange would be too slow.
         while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
             transaction = self._entries.popleft()
             if transaction.phase is not QUEUED:
@@ -82,21 +83,20 @@ class Fifo:
         return found
 
     def discard(self, transaction: Transaction) -> None:
-        """Give up the place of a transaction that waits no longer; it is swept out later."""
-        # A caller that gives up must be free at once, however long the queue is, so its place is only given up, and
-        # swept later. Without the sweep, callers that always give up would fill the memory of a line that never gets
-        # to them.
+        """Release the place of a transaction that has left the queue. The entry is removed later."""
+        # A cancelled caller must be free at once, however long the queue is, so the entry is removed later in bulk.
+        # Without that, callers that always cancel would fill the memory.
         self.live -= 1
         if len(self._entries) > 2 * self.live + SLACK:
             self._entries = deque(self)
 
     def remove(self, transaction: Transaction) -> None:
-        """Take out this transaction at once, wherever in the queue it is."""
+        """Remove this transaction immediately, wherever it is in the queue."""
         self._entries.remove(transaction)
         self.live -= 1
 
     def entries(self) -> Iterator[Transaction]:
-        """Return all that is in the queue, ended ones too, in no order."""
+        """Return all entries, including ended ones, in any order."""
         return iter(self._entries)
 
     def __iter__(self) -> Iterator[Transaction]:
@@ -104,7 +104,7 @@ class Fifo:
 
 
 class EarliestDeadlineFirst:
-    """By `Transaction.deadline`, then in the order of arrival."""
+    """Ordered by `Transaction.deadline`, then by arrival."""
 
     __slots__ = ("_entries", "_order", "live")
 
@@ -114,21 +114,21 @@ class EarliestDeadlineFirst:
         self.live = 0
 
     def push(self, transaction: Transaction) -> None:
-        """Add a transaction at its deadline, behind those that have the same one."""
+        """Add a transaction at its deadline, behind those with the same deadline."""
         heapq.heappush(self._entries, (transaction.deadline, next(self._order), transaction))
         self.live += 1
 
     def push_front(self, transaction: Transaction) -> None:
         """Add a transaction before all others, and give it the deadline of the first."""
-        # The first of all whatever its deadline, or a write would go behind what it had its turn before. The negative
-        # number puts it before the one that has the same deadline, and the last one put back before the others.
+        # First whatever its deadline, or a write would be sent after a write that it preceded. The negative number puts
+        # it before equal deadlines, and the last one put back before the others.
         transaction.deadline = self._entries[0][0] if self._entries else transaction.deadline
         heapq.heappush(self._entries, (transaction.deadline, -next(self._order), transaction))
         self.live += 1
 
     def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few that suits, or return None."""
-        # What does not suit is put back with its old key, and so keeps its place among equals.
+        """Remove and return the first suitable one among the first LOOKED_AT, or None."""
+        # Unsuitable ones are put back with their old key, so they keep their place among equals.
         passed: list[tuple[float, int, Transaction]] = []
         found = None
         while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
@@ -145,7 +145,7 @@ class EarliestDeadlineFirst:
         return found
 
     def pop(self) -> Transaction:
-        """Take out the one with the earliest deadline. Raises IndexError if none waits."""
+        """Remove and return the transaction with the earliest deadline. Raises IndexError if there is none."""
         while True:
             transaction = heapq.heappop(self._entries)[2]
             if transaction.phase is QUEUED:
@@ -153,21 +153,21 @@ class EarliestDeadlineFirst:
                 return transaction
 
     def discard(self, transaction: Transaction) -> None:
-        """Give up the place of a transaction that waits no longer; it is swept out later."""
+        """Release the place of a transaction that has left the queue. The entry is removed later."""
         self.live -= 1
-        # Swept in bulk: to remove each cancelled request from the middle of the heap would cost a search each time.
+        # Removed in bulk: removing each cancelled request from the middle of the heap would cost a search each time.
         if len(self._entries) > 2 * self.live + SLACK:
             self._entries = [entry for entry in self._entries if entry[2].phase is QUEUED]
             heapq.heapify(self._entries)
 
     def remove(self, transaction: Transaction) -> None:
-        """Take out this transaction at once, wherever in the queue it is."""
+        """Remove this transaction immediately, wherever it is in the queue."""
         self._entries = [entry for entry in self._entries if entry[2] is not transaction]
         heapq.heapify(self._entries)
         self.live -= 1
 
     def entries(self) -> Iterator[Transaction]:
-        """Return all that is in the queue, ended ones too, in no order."""
+        """Return all entries, including ended ones, in any order."""
         return (transaction for _, _, transaction in self._entries)
 
     def __iter__(self) -> Iterator[Transaction]:
@@ -177,19 +177,19 @@ class EarliestDeadlineFirst:
 SHARE = 7
 """Consecutive exchanges of higher classes after which a waiting lower class gets one slot."""
 SEARCHED = 256
-"""Entries of a class among which one is searched that serves as a check (R15)."""
+"""Entries of a class that are searched for a read that can replace a sync read (R15)."""
 Queues: TypeAlias = tuple[Queue, Queue, Queue, Queue]
 
 
 class Backlog:
-    """The waiting transactions of all classes. A transaction in it has the phase QUEUED."""
+    """The queued transactions of all classes. Each has the phase QUEUED."""
 
     __slots__ = ("_rotated", "_rotated_before", "_streak", "_streak_before", "_urgent_yields", "queues")
 
     def __init__(self) -> None:
         self.queues: Queues = new_queues()
         self._urgent_yields = False
-        """Whether a lower class goes before what waits in URGENT, which is other programs' alone."""
+        """True if a lower class goes before URGENT, which then holds only requests of other programs."""
         self._streak = 0
         self._rotated = BACKGROUND
         self._streak_before, self._rotated_before = 0, BACKGROUND
@@ -199,42 +199,43 @@ class Backlog:
         return urgent.live + command.live + poll.live + background.live
 
     def waiting(self, priority: Priority) -> int:
-        """Return how many transactions of this class wait."""
+        """Return the number of queued transactions of this class."""
         return self.queues[priority].live
 
     def waiting_of(self, priority: Priority, client: LineClient | None) -> int:
-        """Return how many transactions of this class wait that are this client's."""
+        """Return the number of queued transactions of this class and client."""
         return self.queues[priority].live
 
     def push(self, transaction: Transaction) -> None:
-        """Put a transaction at the back of its class (of its deadline, in POLL and BACKGROUND)."""
+        """Append a transaction to its class (by deadline in POLL and BACKGROUND)."""
         transaction.phase = QUEUED
         self.queues[transaction.priority].push(transaction)
 
     def push_front(self, transaction: Transaction) -> None:
-        """Put a transaction at the front of its class, as a write whose turn came while an earlier one was not over."""
+        """Put a transaction at the front of its class, for example a write that waited for an earlier write."""
         transaction.phase = QUEUED
         self.queues[transaction.priority].push_front(transaction)
 
     def discard(self, transaction: Transaction, phase: Phase) -> None:
-        """Take a queued transaction out and give it another phase."""
+        """Remove a queued transaction and set its phase."""
         transaction.phase = phase
         self.queues[transaction.priority].discard(transaction)
 
     def restore(self, transaction: Transaction) -> None:
-        """Put back what was popped last: it is the next to be popped, and its class keeps its turn."""
+        """Put back the transaction that was popped last. It is popped next, and its class keeps its turn."""
         self._streak, self._rotated = self._streak_before, self._rotated_before
         self.push_front(transaction)
 
     def keep_turn(self, transaction: Transaction) -> None:
-        """Note that what was popped last is not sent: where clients take turns, it was no turn of its client."""
+        """Note that the transaction popped last is not sent. Used if clients take turns: its client keeps its turn."""
 
     def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few of a class that suits, or return None; the others keep their places."""
+        """Remove and return the first suitable one among the first of a class, or None. The others keep their
+        places."""
         return self.queues[priority].pick(suits)
 
     def take(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out one that suits, of whatever class, or return None: for what has to be asked now in any case."""
+        """Remove and return a suitable transaction of any class, or None. For a request that must be sent now."""
         for queue in self.queues:
             # Bounded: with ten thousand requests waiting, an unbounded search would take longer than an exchange.
             found = next((t for t in islice(queue.entries(), SEARCHED) if t.phase is QUEUED and suits(t)), None)
@@ -244,30 +245,30 @@ class Backlog:
         return None
 
     def promote(self, transaction: Transaction, priority: Priority) -> None:
-        """Move a transaction to the front of a higher class: a write that a write of that class must not overtake."""
-        # Not discarded and left to be swept: it is QUEUED all the time, and would be served from its old place too.
+        """Move a transaction to the front of a higher class, because a write of that class must not overtake it."""
+        # Removed immediately: it stays QUEUED, so an entry left behind would be served a second time.
         self.queues[transaction.priority].remove(transaction)
         transaction.priority = priority
         self.push_front(transaction)
 
     def let_pass(self, transaction: Transaction) -> None:
-        """Have one that waits be sent although its sequence may not begin: a stop waits behind it."""
+        """Send a transaction although its sequence may not begin: a stop is queued behind it."""
 
     def pop(self, now: float) -> Transaction | None:
-        """Take out the next to go at the time `now`, or return None.
+        """Remove and return the next transaction at the time `now`, or None.
 
-        URGENT goes first, always; below it a waiting lower class gets every eighth slot.
+        URGENT always goes first. Below it, a waiting lower class gets every eighth slot.
         """
         urgent, command, poll, background = self.queues
         self._streak_before = self._streak
         self._rotated_before = self._rotated
         if urgent.live and not self._urgent_yields:
-            # Not counted as a higher class that had its turn: a stop waits for nobody's fairness. R9's bounds of the
-            # lower classes therefore hold below sustained urgent traffic only.
+            # Not counted as a slot of a higher class: a stop must not wait for fairness. R9's bounds for the lower
+            # classes therefore hold only below sustained urgent traffic.
             return urgent.pop()
         if command.live:
             if not poll.live and not background.live:
-                self._streak = 0  # nobody was kept waiting, so nobody is overdue a slot
+                self._streak = 0  # no lower class was waiting, so none is due a slot
             elif self._streak >= SHARE:
                 return self._lower_slot()
             else:
@@ -286,7 +287,7 @@ class Backlog:
         return background.pop() if background.live else None
 
     def _lower_slot(self) -> Transaction:
-        """Take out the next of POLL and BACKGROUND, which have turns if both wait."""
+        """Remove and return the next of POLL and BACKGROUND, which alternate if both have requests."""
         self._streak = 0
         _, _, poll, background = self.queues
         if poll.live and (self._rotated is BACKGROUND or not background.live):
@@ -296,7 +297,7 @@ class Backlog:
         return background.pop()
 
     def drain(self) -> list[Transaction]:
-        """Take out everything that waits, in order of class; the backlog is empty afterwards."""
+        """Remove and return all transactions, in order of class."""
         drained = [transaction for queue in self.queues for transaction in queue]
         self.queues = new_queues()
         return drained
@@ -308,9 +309,10 @@ def new_queues() -> Queues:
 
 
 class Writes:
-    """Of one line. `queues` holds each node's writes that are not over; those behind the first of a client are parked.
+    """The writes of one line. `queues`: the unfinished writes of each node. Those behind the first of a client are
+    parked.
 
-    A sequence that holds the line is a client of its own.
+    A sequence that holds the line counts as a client of its own.
     """
 
     def __init__(self, backlog: Backlog) -> None:
@@ -318,7 +320,7 @@ class Writes:
         self.backlog = backlog
 
     def is_first(self, write: Transaction) -> bool:
-        """Return whether no earlier write of its client to its node is under way."""
+        """Return True if no earlier write of its client to its node is unfinished."""
         return self.queues[write.node][0] is write or self.first_of(write.node, turn_of(write.client)) is write
 
     def first_of(self, node: NodeRecord, client: LineClient) -> Transaction | None:
@@ -326,7 +328,7 @@ class Writes:
         return next((write for write in self.queues.get(node, ()) if turn_of(write.client) is client), None)
 
     def waiting_of(self, transaction: Transaction) -> int:
-        """Return how many like this one wait that are its client's: no client has another's room (R12)."""
+        """Return how many queued transactions count against the same limit. Each client has its own limit (R12)."""
         waiting = self.backlog.waiting_of(transaction.priority, transaction.client)
         if transaction.writes:
             client = turn_of(transaction.client)
@@ -334,28 +336,28 @@ class Writes:
         return waiting
 
     def parked_of(self, node: NodeRecord, hold: Hold) -> Iterator[Transaction]:
-        """Yield the writes of a sequence that are parked."""
+        """Yield the parked writes of a sequence."""
         return (write for write in self.queues.get(node, ()) if write.client is hold and write.phase is PARKED)
 
     def park(self, write: Transaction) -> None:
-        """Have the write wait behind an earlier write to its node, and lend that one its class."""
+        """Park a write behind an earlier write to its node, and raise that one to its class."""
         write.phase = PARKED
-        # The one that it waits for has been queued before it, so it is still there.
+        # the earlier write was queued before, so it is still there
         first = self.first_of(write.node, turn_of(write.client))
         assert first is not None
-        # They may not change places (R7), and the higher class is not to wait until the lower one has its turn.
+        # R7: they must keep their order, and the write of the higher class must not wait for a turn of the lower class.
         if first.priority > write.priority and first.phase is QUEUED:
             self.backlog.promote(first, write.priority)
         if write.stop and first.phase is QUEUED:
             self.backlog.let_pass(first)
 
     def forget_empty(self) -> None:
-        """Keep no queue of a node to which nothing is written: it may be gone. One that is asked gets a new one."""
+        """Remove empty queues, which may belong to removed nodes. A node gets a new one with its next write."""
         for node in [node for node, waiting in self.queues.items() if not waiting]:
             del self.queues[node]
 
     def over(self, write: Transaction) -> None:
-        """Note that the write has ended: the next one of its client to its node may go."""
+        """Handle the end of a write: the next write of its client to its node may be sent."""
         writes = self.queues[write.node]
         if writes and writes[0] is write:
             writes.popleft()
@@ -365,7 +367,7 @@ class Writes:
             self.wake(write.node, turn_of(write.client))
 
     def wake(self, node: NodeRecord, client: LineClient) -> None:
-        """Have the first write of a client to a node go next, if it is parked."""
+        """Queue the first write of a client to a node, if it is parked."""
         first = self.first_of(node, client)
         if first is not None and first.phase is PARKED:
             self.backlog.push_front(first)

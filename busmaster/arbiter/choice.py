@@ -1,28 +1,26 @@
-"""What goes next, where answers could be taken for one another (R15).
+"""Selects the next request if replies could be mistaken for one another (R15).
 
-Most of the time nothing is overdue, and the first that waits goes. Otherwise it goes only if its answer cannot be one
-that is overdue; else another of its class whose answer cannot, or a *check*: a read whose right answer proves that the
-line is in sync. An urgent write is never held back; its answer may then be ambiguous.
+Usually no reply is overdue, and the first queued request is sent. Otherwise it is sent only if its reply cannot be
+mistaken for an overdue one. If it can, another request of the same class goes first, or a *sync read*: a read whose
+correct reply proves that the line is in sync. An urgent write is never held back; its ACK may then be ambiguous.
 
-The run of answers that are alike, and when one too many would have shown in it (R15).
+This module also limits runs of exchanges with similar replies, in which one reply too many would not show.
 
-Where everything that is asked is answered alike, one doubled reply leaves every later answer one exchange behind: it is
-taken for the answer to the next request, whose own is taken for that of the one after it, and so on, with nothing
-overdue and no unexpected byte to be seen. A read whose answer is unlike shows it, and costs an exchange; a pause shows
-it.
+If all replies look alike, one duplicate shifts every later reply by one exchange: it is taken for the reply to the next
+request, whose own reply is taken for that of the one after it, and so on. No reply is overdue and no unexpected byte is
+received. A read with a different reply reveals the shift and costs one exchange. A pause reveals it too.
 
-Times show it too, on a port whose bytes leave at the baud rate. In sync, a node has heard its request when it begins to
-think of the answer. One exchange behind, what comes is the answer to the request before, and that node was free to
-think of it no later than when the answer before was taken: at which moment this request began to leave. So what comes
-is sooner than it would be in sync, by the time that the request needs on the wire. Nodes with delays of their own show
-each other's; over a run that cancels out, and the answers are sooner by that time on average.
+On a port whose bytes leave at the baud rate, reply times reveal it as well. In sync, a node begins to prepare its reply
+after it has received the request. If replies are shifted by one exchange, the received reply belongs to the request
+before, and its node could begin to prepare it when the previous reply was accepted, which is when the current request
+began to leave. So a shifted reply arrives earlier, by the wire time of the request. Nodes with different delays show
+each other's delays; over a run these cancel out.
 
-So an answer is *untimely* if it differs from its node's usual one by more than half of that time. A run in which one
-was is checked as if there were no times: one that came sooner may have been the one before's; one that came later says
-that the usual times are not what they were, or that the process or a driver stood still, which hides how soon an answer
-was. It hides that of one answer, not of those behind it: nothing is concluded from how long an answer took, and none
-vouches for another. A run of timely answers alone is checked too, in the end: a device that waits for a silent line,
-and only then begins to think, answers no sooner one exchange behind.
+So a reply is *untimely* if it differs from its node's usual reply time by more than half of that wire time. A run with
+an untimely reply is checked as if there were no times. A reply that is too early may belong to the previous request. A
+reply that is too late means that the usual time has changed, or that the process or a driver was stopped, which hides
+how early the reply was. A run of timely replies is checked after a longer time: a device that waits for a silent line
+before it prepares its reply is not earlier when shifted.
 """
 
 from __future__ import annotations
@@ -39,15 +37,15 @@ from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.contract.exchange import Command, Exchange
 
 LONGEST_ALIKE = 31
-"""Answers alike behind a first one, some of them untimely, after which an unlike one is asked: 32 in all."""
+"""Similar replies after the first, some of them untimely, before a read with a different reply is sent: 32 in all."""
 LONGEST_STEADY = 127
-"""As many where all of them were timely."""
+"""The same limit if all of them were timely."""
 USUAL_SHARE = 1 / 8
-"""How much of a node's usual time the last answer is."""
+"""Weight of the last reply in a node's usual reply time."""
 
 
 class Alike:
-    """Of one line. `node` is the one that was asked last."""
+    """Counts the exchanges with similar replies on one line. `node` received the last request."""
 
     __slots__ = ("_untimely", "_wire", "count", "node")
 
@@ -55,34 +53,36 @@ class Alike:
         self._wire = wire
         self._untimely = False
         self.count = 0
-        """Exchanges in a row, before the last, whose answers are like its."""
+        """Consecutive exchanges before the last one whose replies are like its reply."""
         self.node: NodeRecord | None = None
 
     def another(self, exchange: Exchange[Any], last_byte: float, now: float) -> bool:
-        """Count one more exchange, and return whether one that is unlike is to go first.
+        """Count one exchange, and return True if a read with a different reply must go first.
 
-        `last_byte` is when the last byte of the last answer came, in seconds.
+        `last_byte`: when the last byte of the last reply was received, in seconds.
         """
         step = self._wire.step
-        # in a pause that is longer than its reply can be awaited an answer too many would have come
+        # In a pause longer than its reply is awaited, a duplicate would have arrived as unexpected bytes.
         if now - last_byte - step.latency > exchange.timing.awaited:
             self.count = 0
             return False
         self.count += 1
-        if not step.paced:  # where bytes leave when they like, times show nothing
+        if not step.paced:  # on an unpaced port reply times show nothing
             return self.count >= LONGEST_ALIKE
         untimely = self._was_untimely(last_byte - step.end, len(exchange.request) * step.byte_time)
-        if self.count == 1:  # the one before it was unlike: whatever its time, it was its own
+        if self.count == 1:  # the reply before it was different, so it belonged to its own request
             self._untimely = False
         elif untimely:
             self._untimely = True
         return self.count >= (LONGEST_ALIKE if self._untimely else LONGEST_STEADY)
 
     def _was_untimely(self, took: float, asking: float) -> bool:
-        """Return whether times fail to show that the last answer was its own request's. It came `took` seconds after
-        that request, which needed `asking` seconds on the wire."""
+        """Return True if the reply time does not prove that the last reply belongs to its own request.
+
+        `took`: seconds from the end of that request. `asking`: its wire time in seconds.
+        """
         node = self.node
-        if node is None or took < 0:  # below 0: there was none
+        if node is None or took < 0:  # below 0: no reply was received
             return True
         usual = node.usual
         if usual is None:
@@ -93,8 +93,8 @@ class Alike:
 
 
 MOST_BEFORE = 3
-"""Exchanges that may go before one that is held back; then it goes, and its answer is ambiguous. The bounds of R9, in
-planning, count them."""
+"""Exchanges that may go before a request that is held back. Then it is sent, and its reply is ambiguous. The bounds of
+R9 in planning include them."""
 
 
 class Send(NamedTuple):
@@ -111,19 +111,18 @@ class WaitUntil(NamedTuple):
 
 
 class Idle:
-    """Nothing waits."""
+    """No request is queued."""
 
 
 IDLE = Idle()
 Action: TypeAlias = Send | WaitUntil | Idle
-"""What the line does next."""
+"""The next action of the line."""
 Unfit: TypeAlias = Callable[[Sequence[bytes], NodeRecord], bool]
-"""Whether what would answer an exchange of that node proves nothing."""
+"""Returns True if a reply with these keys from that node proves nothing."""
 
 
 class Choice:
-    """Chooses for one line, from what its dispatcher has waiting, by what `in_sync` says is overdue; `wire` has
-    times."""
+    """Selects the next request of one line from the dispatcher's queues, depending on the overdue replies."""
 
     def __init__(self, dispatcher: Dispatcher, in_sync: InSync, wire: OnWire) -> None:
         self._dispatcher = dispatcher
@@ -131,11 +130,11 @@ class Choice:
         self._alike = Alike(wire)
         self._gone_before = 0
         self._held_since = -inf
-        """When the first went before the one that is held back."""
+        """When the first request was sent before the one that is held back."""
         self._last_byte = -inf
 
     def next(self, now: float, last_byte: float) -> Action:
-        """Return what the line does now. `last_byte` is when the last byte came, in seconds."""
+        """Return the next action. `last_byte`: when the last byte was received, in seconds."""
         dispatcher = self._dispatcher
         # A transaction that its protocol cannot encode must not stop the line: it fails, and the next one is tried.
         while (transaction := dispatcher.next(now)) is not None:
@@ -143,7 +142,7 @@ class Choice:
             try:
                 timings = node.timings if node.learning is None else transaction.timings()
                 exchange = transaction.command.open(node.address, timings)
-                answers = exchange.answers  # a protocol may lack it: found out here, it fails this one alone
+                answers = exchange.answers  # a protocol may not implement it: then only this transaction fails
             except Exception as bug:
                 dispatcher.unsendable(transaction, bug, now)
             else:
@@ -152,7 +151,7 @@ class Choice:
             return IDLE
         in_sync, alike = self._in_sync, self._alike
         last = in_sync.last
-        # An exchange with several steps (MSC) shows a shift by itself: an ACK does not look like a packet.
+        # An exchange with several steps (MSC) reveals a shift by itself: an ACK does not look like a packet.
         if answers == last and not exchange.later:
             too_many = alike.another(exchange, last_byte, now)
             if too_many or in_sync.alert:
@@ -167,7 +166,7 @@ class Choice:
         return Send(transaction, exchange)
 
     def _carefully(self, first: Send, now: float, last_byte: float, too_many: bool = False) -> Send | WaitUntil:
-        """Choose as `next` does, where something is overdue or ambiguous, or `too_many` answers were alike."""
+        """Select as `next` does, while a reply is overdue or ambiguous, or `too_many` replies were alike."""
         in_sync = self._in_sync
         self._last_byte = last_byte
         in_sync.lapse(now)
@@ -178,7 +177,8 @@ class Choice:
         def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
             return other == answers or in_sync.clashes(other, now, node)
 
-        # Only its first attempt: a late answer to that one is not the retry's, which needs proof as any other does.
+        # R9: an urgent write waits for nothing. This applies to its first attempt only: a late reply to that one could
+        # be taken for the retry's, which needs proof like any other request.
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
         elif transaction.writes and now < in_sync.lone_bytes_until and any(len(key) == 1 for key in answers):
@@ -186,7 +186,7 @@ class Choice:
         elif _is_decisive(first) and now < in_sync.awaited_until(self._last_byte):
             chosen = self._while_awaited(first, now) or WaitUntil(in_sync.awaited_until(self._last_byte))
         elif transaction.probe and in_sync.clashes(answers, now, transaction.node):
-            # The reply to the probe before may still come, and would be taken for this one's.
+            # The reply to the previous probe may still arrive and would be taken for this one's.
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_sync.clashes(answers, now):
             chosen = self._instead_of(first, now)
@@ -213,7 +213,7 @@ class Choice:
         return chosen
 
     def _instead_of(self, first: Send, now: float) -> Send | WaitUntil:
-        """Return what goes in place of one whose answer could be one that is overdue."""
+        """Return a substitute for a request whose reply could be mistaken for an overdue one, or until when to wait."""
         in_sync, answers = self._in_sync, first.exchange.answers
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
@@ -222,7 +222,7 @@ class Choice:
         awaited = in_sync.awaited_until(self._last_byte, answers)
         if now < awaited:
             return self._while_awaited(first, now, answers) or WaitUntil(awaited)
-        # R9 bounds the wait: after three others it is sent anyway, and its reply is weighed with more care.
+        # R9 bounds the wait: after three others the request is sent anyway, and its reply is checked more strictly.
         if self._gone_before >= MOST_BEFORE:
             return first
 
@@ -233,22 +233,25 @@ class Choice:
         other = None
         if self._gone_before < MOST_BEFORE - 1:
             node = first.transaction.node
-            of = node if node in nodes_overdue else None  # only its own answer proves that it owes no more
+            # only a reply of the node itself proves that its reply is not overdue
+            of = node if node in nodes_overdue else None
             other = self._another(first, now, clashes, of)
         if other is None:
             ends = in_sync.ends(answers, now)
-            if ends < inf:  # what its own node owes has to be asked for then, too
+            if ends < inf:  # the overdue reply of its own node needs a sync read even then
                 own = in_sync.clashes(answers, ends, first.transaction.node)
                 return (self._ask_itself(first, now) if own else None) or WaitUntil(ends)
             asked, silent = self._whom_to_ask(now)
             worth_it = first.transaction.writes or not first.transaction.attempts
             if worth_it and not (
                 nodes_overdue or asked
-            ):  # all are silent: a check of its own node costs no more than it would
+            ):  # All nodes are silent: a sync read of its own node costs no more than the request would.
                 asked = [first.transaction.node]
-            # Who owes goes first: its answer pays at once, another node's only when the maximum reply delay is over.
+            # Nodes with an overdue reply first: their reply clears it at once, another node's only after the maximum
+            # reply delay.
             other = self._ask_sync_read([*nodes_overdue, *asked], now, clashes)
-            if other is None and not any(_fit_checks(silent, proves_nothing)):  # there is nothing unlike to ask
+            # no node has a sync read with a different reply
+            if other is None and not any(_fit_checks(silent, proves_nothing)):
                 over = in_sync.over(answers)
                 if now < over:
                     return WaitUntil(over)
@@ -259,9 +262,11 @@ class Choice:
         return other
 
     def _before_first_write(self, first: Send, now: float) -> Send | WaitUntil:
-        """Return what goes before the first write on a line that came up: a read, which ends what a node holds of an
-        earlier master's frame; then the time until which that node may reply. A write that is refused by such a node's
-        NAK would be sent again, and be carried out twice."""
+        """Return what goes before the first write on a new line: a read, then the time until which a NAK may arrive.
+
+        The read ends the unfinished frame that a node may hold from an earlier master. Without it, a write that this
+        node's NAK seems to refuse would be sent again, and be carried out twice.
+        """
         in_sync, transaction = self._in_sync, first.transaction
         node = transaction.node
 
@@ -275,14 +280,16 @@ class Choice:
             return WaitUntil(in_sync.lone_bytes_until)
         alive, silent = self._whom_to_ask(now)
         own = [] if node.address == node.profile.broadcast else [node]
-        # Without a read to send, the write goes: its refusal is then not believed.
+        # If no read is available, the write is sent: its refusal is not trusted.
         return self._ask_sync_read(dict.fromkeys([*own, *alive, *silent]), now, clashes) or first
 
     def _while_awaited(self, first: Send, now: float, answers: Sequence[bytes] | None = None) -> Send | None:
-        """Return what goes while an overdue answer (that could look so) may still be on time, though the line went on:
-        a check of the node that owes it, which shows that it is not to come; else another. After two, only checks,
-        which are short where times are learned, and only for a maximum reply delay: with the wait that is left that is
-        no longer than MOST_BEFORE exchanges can last. Then returns None."""
+        """Return what goes while an overdue reply may still be on time, or None if the request must wait.
+
+        First choice is a sync read of the node, which shows that its reply will not arrive; then another request. After
+        two of them only sync reads follow, which are short if times are learned, for one maximum reply delay. Together
+        with the remaining wait this is no longer than MOST_BEFORE exchanges.
+        """
         if not self._gone_before:
             self._held_since = now
         two_gone = self._gone_before >= MOST_BEFORE - 1
@@ -302,17 +309,17 @@ class Choice:
         return other
 
     def _of_these(self, nodes: Container[NodeRecord], now: float, unfit: Unfit) -> Send | None:
-        """Take out a read of one of these nodes that waits anyway, of whatever class: unlike a check, it is free."""
+        """Take a queued read of one of these nodes, of any class. Unlike a sync read, it costs nothing extra."""
         opened: list[Exchange[Any]] = []
 
         def suits(other: Transaction) -> bool:
             node = other.node
             if other.writes or node not in nodes or not self._dispatcher.proves(other, now):
                 return False
-            if self._dispatcher.writes.queues.get(node):  # no read overtakes a write to its node
+            if self._dispatcher.writes.queues.get(node):  # R7: no read overtakes a write to its node
                 return False
             exchange = _opened(other)
-            # A last attempt must not go while something is awaited, not even in place of a check.
+            # A last attempt must not be sent while a reply is awaited, not even in place of a sync read.
             if exchange is None or _is_decisive(Send(other, exchange)) or unfit(exchange.answers, node):
                 return False
             opened.append(exchange)
@@ -322,23 +329,22 @@ class Choice:
         return None if transaction is None else Send(transaction, opened[0])
 
     def _ask_itself(self, first: Send, now: float) -> Send | None:
-        """Return a check of a node that owes what it is to be asked for: its answer would not be believed. Returns None
-        for a node that is likely to be dead."""
+        """Return a sync read of the node itself, whose reply to this request would be ambiguous. None if it is likely
+        dead."""
         node = first.transaction.node
-        # A death would cost the living an exchange. Where times are learned that is a short one.
+        # A request to a dead node delays the others. If times are learned, the delay is short.
         brief = node.learning is not None and not node.failures
         dead = node.unheard > MOST_UNHEARD if brief else node.silent
-        # A node that does not reply would cost a whole maximum reply delay, and its silence proves nothing.
+        # A dead node costs a whole maximum reply delay, and its silence proves nothing.
         if dead or self._gone_before >= MOST_BEFORE:
             return None
         self._gone_before += 1
         return self._ask_sync_read([node], now, lambda answers, node: self._in_sync.clashes(answers, now, node))
 
     def _other_probe(self, probe: Transaction, now: float) -> Send | None:
-        """Have a probe ask the same dead node for something that is not overdue. Returns None where there is
-        nothing."""
+        """Change a probe's command to a read that is not overdue. Returns None if there is none."""
         node = probe.node
-        # The probe itself changes its command: a second probe would not be paid for.
+        # The probe is changed, not replaced: the budget has paid for one probe only.
         for command in node.sync_reads():
             exchange = command.open(node.address, node.timings)
             if not self._in_sync.clashes(exchange.answers, now, node):
@@ -347,9 +353,11 @@ class Choice:
         return None
 
     def _another(self, first: Send, now: float, unfit: Unfit, of: NodeRecord | None = None) -> Send | None:
-        """Take out a read of the same class, `of` this node if one is given, or return None. It overtakes no write to
-        its node. A write would prove less, for an ACK may be anybody's; and what spoils a read, which is repeated,
-        would leave a write unconfirmed."""
+        """Take a read of the same class, of node `of` if given, or return None. It overtakes no write to its node.
+
+        Writes are not used: an ACK may come from any node, and a failure would leave the write unconfirmed, while a
+        read is repeated.
+        """
         opened: list[Exchange[Any]] = []
         written = {first.transaction.node} if first.transaction.writes else set()
         in_sync = self._in_sync
@@ -374,7 +382,7 @@ class Choice:
         return None if transaction is None else Send(transaction, opened[0])
 
     def _ask_sync_read(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Send | None:
-        """Return a read of the first of these nodes that has one whose answer is fit to prove something, or None."""
+        """Return a sync read of the first of these nodes that has one whose reply proves something, or None."""
         for node, command, exchange in _fit_checks(nodes, unfit):
             check = self._dispatcher.check(node, command, now)
             if node.learning is not None:
@@ -383,7 +391,7 @@ class Choice:
         return None
 
     def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
-        """Return the nodes that answer, as far as is known, the last one to do so first; and those that are silent."""
+        """Return the nodes that answer, the last to do so first, and the silent nodes."""
         nodes = [
             node
             for node in self._dispatcher.nodes
@@ -391,14 +399,15 @@ class Choice:
         ]
         # The node that replied last is the most likely to reply now.
         alive = [node for node in nodes if not node.silent]
-        # Two stable sorts in place of one by a negated time: the instants of tests/verification/proof have none.
+        # Two stable sorts instead of one by a negated time: the symbolic instants of tests/verification/proof have no
+        # negation.
         alive.sort(key=lambda node: node.last_reply, reverse=True)
         alive.sort(key=lambda node: node.health is not UP)
         return alive, [node for node in nodes if node.silent]
 
 
 def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
-    """Yield the reads of these nodes whose answers are fit to prove something."""
+    """Yield the sync reads of these nodes whose replies prove something."""
     for node in nodes:
         for command in node.sync_reads():
             exchange = command.open(node.address, node.timings)
@@ -407,14 +416,14 @@ def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[Nod
 
 
 def _is_decisive(chosen: Send) -> bool:
-    """Return whether this is a write, or a read's last attempt: nothing that could be waited for may spoil it."""
+    """Return True for a write, or the last attempt of a read: an overdue reply must not spoil it."""
     transaction, exchange = chosen
     last = transaction.retried >= transaction.retries and not transaction.probe
     return transaction.writes or not exchange.answered or last
 
 
 def _opened(transaction: Transaction) -> Exchange[Any] | None:
-    """Return an exchange, or None where the protocol cannot encode it: that is told when its turn has come."""
+    """Return an exchange, or None if the protocol cannot encode it. The error is reported when its turn comes."""
     try:
         return transaction.command.open(transaction.node.address, transaction.timings())
     except Exception:

@@ -1,4 +1,4 @@
-"""Who asks: the programs that share a line, and sequences of their requests that nobody comes between."""
+"""The programs that share a line, and exclusive sequences of their requests."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ LEAST_SHARE, MOST_SHARE = 0.1, 10.0
 
 
 class Account:
-    """What a user has used of its part of the line, with all its connections: `clients` is how many it has.
+    """Line time that a user has used, over all its connections (`clients`).
 
-    `used_until`: until when it has used that part; until then the owner goes first.
+    `used_until`: until then the user has used its part and the owner goes first.
     """
 
     __slots__ = ("clients", "used_until")
@@ -24,11 +24,11 @@ class Account:
 
 
 class LineClient:
-    """One program, as the line knows it. `share` weighs its line time against that of the others, who have 1 each.
+    """One program that uses the line. `share`: weight of its line time; others have 1.
 
-    `owner_time`: seconds of the line that the owner may use, while it waits, for each second of all clients with the
-    same number together. 0: the client takes turns with the owner. `user`: clients with the same one have one part of
-    the line together; None: the client has a part of its own.
+    `owner_time`: seconds of line time that the owner may use, while it has requests, per second of all clients with the
+    same number together. 0: the client takes turns with the owner. `user`: clients with the same user share one part of
+    the line; None: a part of its own.
     """
 
     __slots__ = ("account", "over", "owner_time", "role", "share", "user")
@@ -40,33 +40,32 @@ class LineClient:
         self.account = Account()
         # Its own account until a client is admitted with an `owner_time`: then all of that role share one.
         self.role = self.account
-        """The account of all clients with its `owner_time`."""
+        """Common account of all clients with its `owner_time`."""
         self.over = False
-        """Whether nothing of it is sent any more."""
+        """True if none of its requests is sent any more."""
 
     def is_entitled(self, now: float, urgent: bool) -> bool:
-        """Return whether it may go before the owner, if that is its turn: it has not used up its part of the line, nor
-        have the others of its role used up theirs, unless its request is `urgent`."""
-        # Without the second, each of many users would have an exchange as it comes, one behind the other.
+        """Return True if it may go before the owner: neither it nor (unless `urgent`) its role has used up its part."""
+        # Without the check of the role, each of many users would have one exchange directly after the other.
         return self.account.used_until <= now and (urgent or self.role.used_until <= now)
 
     @property
     def turn(self) -> LineClient:
-        """Whose turn its requests take, and who pays for them."""
+        """The client whose turn its requests use, and that is charged for them."""
         return self
 
 
 class Hold(LineClient):
-    """A sequence of requests of one client to one node: from the first that is sent, nothing but URGENT goes between.
+    """An exclusive sequence of requests of one client to one node. From its first request on, only URGENT goes between.
 
-    It begins when that one leaves, in the turn of its client, and lasts until it is released, `longest` seconds at
-    most, to the end of the exchange that is on the wire then. The line alone changes it.
+    It begins when its first request is sent, in its client's turn. It ends when it is released, after `longest` seconds
+    at most, with the exchange that is then on the wire. Changed only by the line.
     """
 
     __slots__ = ("began", "client", "holds", "longest", "node", "priority")
 
     priority: int
-    """The class in which it has begun."""
+    """Class of the request with which it began."""
     began: float
     """When it began to hold the line, in seconds, if its client has an `owner_time`."""
 
@@ -77,18 +76,18 @@ class Hold(LineClient):
         self.longest = longest
         self.began = -inf
         self.holds = False
-        """Whether the line is held for it."""
+        """True while the line is held for it."""
 
     @property
     def turn(self) -> LineClient:
-        """Itself, while it holds the line; before, it waits among its client's requests."""
+        """Itself while it holds the line; before that, its client."""
         return self if self.holds else self.client
 
 
 OWN = LineClient()
-"""The program that owns the line: what is asked for nobody in particular, polls and probes are its requests."""
+"""The program that owns the line. Requests without a client, polls and probes belong to it."""
 
 
 def turn_of(client: LineClient | None) -> LineClient:
-    """Return whose turn a request of this client takes; None is the program that owns the line."""
+    """Return the client whose turn a request uses; None is the program that owns the line."""
     return OWN if client is None else client.turn

@@ -1,7 +1,7 @@
-"""What is counted on a line, and the immutable snapshots of it that users get.
+"""Counters of a line, and the immutable snapshots of them for users.
 
-The states of the line and the marks of the UART are defined here, because most counters are of them. Times are kept in
-log-linear histograms: bounded memory, a tenth of a microsecond to record one.
+The states of the line and the UART marks are defined here, because most counters refer to them. Times are kept in
+log-linear histograms: bounded memory, and 0.1 us to record one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from busmaster.arbiter.learned import LearnedTimes
 
 
 class LineState(enum.IntEnum):
-    """The table on top of arbiter.py says what leads where."""
+    """State of a line. The table in arbiter.py shows the transitions."""
 
     OFFLINE = 0
     READY = 1
@@ -28,26 +28,26 @@ class LineState(enum.IntEnum):
 
 
 OFFLINE, READY, HOLDOFF, EXCHANGE, RESYNCHRONISING = LineState
-"""For the arbiter: to look a member up in its class takes 60 ns, and a transaction does it a dozen times."""
+"""Module constants for the arbiter: a lookup in the class takes 60 ns, and a transaction does a dozen."""
 
 
 class Mark(enum.Enum):
-    """What the UART says of a byte that it received."""
+    """UART report about a received byte."""
 
     DAMAGED = "parity or framing error"
     BREAK = "break"
 
 
 BATCH = 256
-"""Times that are kept as they came until they are sorted into buckets, all at once."""
+"""Number of times that are collected before they are sorted into buckets together."""
 _UPPER = slice(3, None, 4) if sys.byteorder == "little" else slice(0, None, 4)
 
 
 class Histogram:
     """Times in seconds, each within 1/16 of its value. Negative times count as 0.
 
-    A bucket is what the upper sixteen bits of a time say, as the machine keeps it: the exponent and the first four
-    bits of the fraction. So no bucket has to be computed, and a batch is counted without a step of Python for each.
+    A bucket is given by the upper sixteen bits of a time as a double: the exponent and the first four bits of the
+    fraction. No bucket needs to be calculated, and a batch is counted without a Python step per time.
     """
 
     __slots__ = ("_counts", "_highest", "_new", "_total")
@@ -59,7 +59,7 @@ class Histogram:
         self._highest = 0.0
 
     def record(self, seconds: float) -> None:
-        """Record one time, in seconds; a negative one counts as 0."""
+        """Record one time, in seconds."""
         new = self._new
         new.append(seconds)
         if len(new) >= BATCH:
@@ -67,24 +67,24 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        """How many times were recorded."""
+        """Number of recorded times."""
         return sum(self._sorted().values())
 
     @property
     def total(self) -> float:
-        """The sum of all times, in seconds."""
+        """Sum of all times, in seconds."""
         self._sorted()
         return self._total
 
     @property
     def highest(self) -> float:
-        """The longest time, in seconds; 0 when nothing was recorded."""
+        """Longest time, in seconds; 0 if none was recorded."""
         self._sorted()
         return self._highest
 
     @property
     def mean(self) -> float:
-        """The mean time, in seconds; 0 when nothing was recorded."""
+        """Mean time, in seconds; 0 if none was recorded."""
         count = self.count
         return self._total / count if count else 0.0
 
@@ -137,7 +137,7 @@ class Quantiles:
 
     @classmethod
     def of(cls, histogram: Histogram) -> Quantiles:
-        """Return the quantiles of what a histogram holds now."""
+        """Return the quantiles of a histogram's current contents."""
         return cls(
             histogram.count, histogram.mean, histogram.quantile(0.5), histogram.quantile(0.99), histogram.highest
         )
@@ -145,8 +145,11 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True)
 class NodeStatistics:
-    """Counts of one node since the last reset. `attempts` are those that have ended: ok + no_reply + garbled + refused
-    + those cut off by the loss of the line; `failed` counts transactions that ended with an error, retries and all."""
+    """Counters of one node since the last reset.
+
+    `attempts` counts finished attempts: ok + no_reply + garbled + refused + those cut off by the loss of the line.
+    `failed` counts transactions that ended with an error after all retries.
+    """
 
     attempts: int
     ok: int
@@ -160,24 +163,24 @@ class NodeStatistics:
     probes: int
     max_reply_delay: float
     latency: Quantiles
-    """From the start of the request to the end of its reply, of attempts that succeeded."""
+    """From the start of the request to the end of its reply, for successful attempts."""
     learned: tuple[LearnedTimes, ...] = ()
-    """Of each kind of command that it was asked, where its reply times are learned."""
+    """Learned times for each kind of command, if reply times are learned."""
     overdue: int = 0
-    """Of those that were `late`, the replies that began after the reply window even: their values count all the same,
-    and say that the window is too short for this node."""
+    """Replies, counted in `late` too, that began after the reply window. Their values were delivered. If there are
+    many, the window is too short for this node."""
 
     @property
     def fruitless(self) -> int:
-        """Attempts that brought no value."""
+        """Attempts that returned no value."""
         return self.no_reply + self.garbled + self.refused
 
 
 @dataclass(frozen=True, slots=True)
 class DriverErrors:
-    """What a serial driver has counted of its UART's errors, since the port was opened or the counts were reset.
+    """UART errors counted by the serial driver since the port was opened or the counters were reset.
 
-    `overruns` are bytes lost in the UART, `buffer_overruns` bytes lost behind it because nobody read them in time.
+    `overruns`: bytes lost in the UART. `buffer_overruns`: bytes lost in the driver because they were not read in time.
     """
 
     framing: int
@@ -199,7 +202,7 @@ class DriverErrors:
 
 @dataclass(frozen=True, slots=True)
 class LineStatistics:
-    """Counts of the line since the last reset; times in seconds."""
+    """Counters of the line since the last reset. Times in seconds."""
 
     elapsed: float
     exchanges: int
@@ -216,38 +219,38 @@ class LineStatistics:
     losses: int
     backlog: int
     waits: tuple[Quantiles, Quantiles, Quantiles, Quantiles]
-    """From being queued to being started, for URGENT, COMMAND, POLL and BACKGROUND."""
+    """Time from queueing to sending, for URGENT, COMMAND, POLL and BACKGROUND."""
     sync_reads: int = 0
-    """Reads that were asked to prove that the line is in sync (R15)."""
+    """Reads sent to prove that the line is in sync (R15)."""
     ambiguous: int = 0
-    """Answers that were not believed, since they could have been another request's (R15)."""
+    """Replies that were not delivered because they could belong to another request (R15)."""
     damaged: int = 0
-    """Bytes that the UART marked: a parity or framing error."""
+    """Bytes that the UART marked with a parity or framing error."""
     breaks: int = 0
-    """Breaks that the UART saw."""
+    """Breaks reported by the UART."""
     driver: DriverErrors | None = None
-    """What the serial driver has counted; None where it counts nothing, and while the port is lost."""
+    """Errors counted by the serial driver; None if it counts none, and while the port is lost."""
 
     @property
     def utilisation(self) -> float:
-        """The share of the time in which the line was in use, resynchronising included."""
+        """Share of the time in which the line was in use, including resynchronisation."""
         return min(1.0, (self.busy + self.quiet_time) / self.elapsed) if self.elapsed > 0 else 0.0
 
 
 class RecentUtilisation:
-    """The share of the last `window` seconds in which a line was in use, resynchronising included.
+    """Share of the last `window` seconds in which a line was in use, including resynchronisation.
 
-    It knows the line only by the statistics that it is given: the window begins with the youngest of them that is at
-    least `window` seconds old, or with the oldest that it has.
+    Calculated from the snapshots passed to `note`. The period begins with the newest snapshot that is at least `window`
+    seconds old, or with the oldest one.
     """
 
     def __init__(self, window: float) -> None:
         self._window = window
         self._used: deque[tuple[float, float]] = deque()
-        """When statistics were given, and the seconds for which the line had been in use by then."""
+        """Time of each snapshot, and the seconds for which the line had been in use."""
 
     def note(self, now: float, line: LineStatistics) -> float:
-        """Take the statistics of this moment, and return the share up to it. Until there are two: since the reset."""
+        """Add the current snapshot and return the share. The first one returns the share since the reset."""
         used, seen = line.busy + line.quiet_time, self._used
         if seen and used < seen[-1][1]:  # the statistics were reset
             seen.clear()
@@ -277,23 +280,23 @@ class NodeCounters:
         self.reset()
 
     def reset(self) -> None:
-        """Begin all counts anew."""
+        """Reset all counters."""
         self.late = self.overdue = self.no_reply = self.garbled = self.refused = self.cut_off = 0
         self.retries = self.unheard = self.failed = self.probes = 0
         self.latency = Histogram()
 
     @property
     def ok(self) -> int:
-        """How many attempts succeeded: each has recorded its latency, and nothing else is counted for each value."""
+        """Number of successful attempts: each records a latency, so no other counter is needed per value."""
         return self.latency.count
 
     @property
     def attempts(self) -> int:
-        """How many attempts have ended, whatever came of them."""
+        """Number of finished attempts, successful or not."""
         return self.ok + self.no_reply + self.garbled + self.refused + self.cut_off
 
     def snapshot(self, max_reply_delay: float) -> NodeStatistics:
-        """Return an immutable snapshot of the counts; `max_reply_delay` is the node's, in seconds."""
+        """Return an immutable snapshot of the counters. `max_reply_delay`: the node's, in seconds."""
         return NodeStatistics(
             self.attempts,
             self.ok,
@@ -336,15 +339,15 @@ class LineCounters:
 
     def __init__(self, since: float) -> None:
         self.exchanges = 0
-        """Ever: what a request waited for is counted across a reset."""
+        """Never reset: a request's `exchanges_ahead` may span a reset of the statistics."""
         self.entered = since
-        """When the line entered its state, or `spent` was brought up to date."""
+        """When the line entered its state, or `spent` was last updated."""
         self.spent = [0.0] * len(LineState)
-        """Seconds in each state, ever, up to the last change."""
+        """Seconds in each state until the last change. Never reset."""
         self.reset(OFFLINE, since)
 
     def reset(self, state: LineState, since: float) -> None:
-        """Begin all counts anew at the time `since`, in seconds, when the line is in this state."""
+        """Reset all counters at the time `since`, in seconds, with the line in this state."""
         self.since = since
         self.completed = self.cancelled = self.unexpected_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.resyncs = self.noisy = self.losses = 0
@@ -360,15 +363,15 @@ class LineCounters:
             self.damaged += 1
 
     def _times(self, state: LineState, now: float) -> list[float]:
-        """Return the seconds ever spent in each state, up to now."""
+        """Return the total seconds in each state, up to now."""
         times = self.spent.copy()
         times[state] += now - self.entered
         return times
 
     def snapshot(self, state: LineState, now: float, backlog: int) -> LineStatistics:
-        """Return an immutable snapshot of the counts since the last reset.
+        """Return an immutable snapshot of the counters since the last reset.
 
-        Nothing changes: whoever looks does not cut the pauses, from which probes are paid, into pieces.
+        Changes nothing: reading the statistics must not split the idle times from which probes are paid.
         """
         first, second, third, fourth = self.waits
         exchanges, times = self._before

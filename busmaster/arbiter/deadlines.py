@@ -1,6 +1,4 @@
-"""The table of deadlines of one line; and when callers give up: until when a request must have been sent, and until
-when it must be over (R12).
-"""
+"""The deadlines of one line, and the times at which callers stop waiting (R12)."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from busmaster.arbiter.transaction import ENDED, Transaction
 
 
 class _Other:
-    """A deadline that seldom changes: which of them is the earliest is found then, and not at every exchange."""
+    """A deadline that seldom changes. The earliest one is updated when it is set, not at every exchange."""
 
     def __set_name__(self, owner: type[Deadlines], name: str) -> None:
         self._name = name
@@ -28,26 +26,26 @@ class _Other:
 
 
 class Deadlines:
-    """When what is due, in the arbiter's time; inf when it is not set."""
+    """Deadlines in the arbiter's time; inf if not set."""
 
     __slots__ = ("each", "earliest_other", "line")
 
     schedule = _Other()
     """The next poll is due."""
     expiry = _Other()
-    """The first queued request's `start_within` runs out."""
+    """The first queued request's `start_within` expires."""
     failing = _Other()
-    """More of what waited for a line that can no longer be used is to fail."""
+    """The next batch of requests of an unusable line is to fail."""
     health = _Other()
     """A dead node's next probe, or the end of a suspension."""
     hold = _Other()
-    """The line has been held for one sequence of requests for as long as it may be."""
+    """A sequence has held the line for its maximum time."""
     sequence = _Other()
-    """A sequence may begin that had to wait because others held the line before."""
+    """A sequence that had to wait for the owner's time may begin."""
 
     def __init__(self) -> None:
         self.line = inf
-        """The state of the line ends: a window, an inter-byte timeout, a holdoff, a resynchronisation."""
+        """The state of the line ends: a window, an inter-byte timeout, a holdoff or a resynchronisation."""
         self.each: dict[str, float] = {}
         """All others, by name."""
         self.earliest_other = inf
@@ -55,11 +53,11 @@ class Deadlines:
 
 
 SLACK = 64
-"""Entries of ended transactions that are kept beside twice as many as wait."""
+"""Entries of ended transactions kept in addition to twice the number of queued ones."""
 
 
 class Expiries:
-    """The transactions of one line with a `start_by` or a `finish_by`. Both are met by what happens right at them."""
+    """The transactions of one line with a `start_by` or a `finish_by`. An action exactly at that time is in time."""
 
     __slots__ = ("_deadlines", "_heap", "_order")
 
@@ -69,7 +67,7 @@ class Expiries:
         self._order = count()
 
     def expect(self, transaction: Transaction, waiting: int) -> None:
-        """Remember when the caller of a transaction gives up; `waiting` is how many transactions wait."""
+        """Remember when a caller stops waiting. `waiting`: number of queued transactions."""
         # Ended transactions are not removed one by one, which would search the heap at the end of each request.
         if len(self._heap) > 2 * waiting + SLACK:
             self._heap = [entry for entry in self._heap if entry[2].phase is not ENDED]
@@ -79,7 +77,7 @@ class Expiries:
         self._set_deadline()
 
     def due(self, now: float) -> Iterator[Transaction]:
-        """Take out the transactions that have not ended and whose time, one of the two, is over."""
+        """Remove and yield the unfinished transactions of which one of the two times has passed."""
         heap = self._heap
         while heap and (heap[0][0] < now or heap[0][2].phase is ENDED):
             transaction = heapq.heappop(heap)[2]
@@ -88,5 +86,5 @@ class Expiries:
         self._set_deadline()
 
     def _set_deadline(self) -> None:
-        # Behind the moment, which is still in time. A fixed nanosecond is lost in a clock that is months old.
+        # Just after that time, which is still in time. A fixed nanosecond would be lost on a clock that is months old.
         self._deadlines.expiry = nextafter(self._heap[0][0], inf) if self._heap else inf

@@ -1,13 +1,12 @@
-"""Which transaction goes next, and how each one ends (R6-R12).
+"""Selects the next transaction and ends each transaction (R6 to R12).
 
-The arbiter says when the line is free and what came of an attempt; the dispatcher never knows what is on the line.
-It queues, orders the writes of a node, retries, confirms refusals, parks the polls of dead nodes, pays for probes,
-and ends every transaction exactly once.
+The arbiter reports when the line is free and how an attempt ended. The dispatcher does not know what is on the wire. It
+queues requests, keeps the writes of a node in order, retries, confirms refusals, parks the polls of dead nodes, charges
+probes to their budget, and ends each transaction exactly once.
 
-If the line can no longer be used, whatever waits is taken out at once, so that none of it is sent any more, whatever
-becomes of the line meanwhile. But a thousand callers told in one callback would hold up the loop that owns the line,
-and perhaps others: it ends in bounded pieces. What remains is due at once, so that the owner calls again when it has
-seen to its other ports.
+If the line becomes unusable, all queued transactions are removed at once, so that none of them can be sent later. Their
+callers are notified in batches: a thousand callers in one callback would block the event loop, which may also serve
+other lines. The next batch is due immediately, after the loop has served its other ports.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ AT_ONCE = 32
 
 
 class FailingTransactions:
-    """The transactions of one line that are to fail. Each gets the fault for which it was added, however late."""
+    """Transactions of one line that are about to fail. Each keeps the error for which it was added."""
 
     __slots__ = ("_deadlines", "_left")
 
@@ -76,15 +75,15 @@ class FailingTransactions:
         return len(self._left)
 
     def add(self, transactions: Iterable[Transaction], fault: BusError) -> None:
-        """Have `next` hand these transactions out with `fault`, behind those that are there."""
+        """Append transactions that `next` will return with `fault`."""
         for transaction in transactions:
             transaction.phase = FAILING
             self._left.append((transaction, fault))
 
     def next(self, now: float) -> Iterator[tuple[Transaction, BusError]]:
-        """Hand out at most AT_ONCE transactions, each with an error of its own, and set the deadline of the others.
+        """Yield at most AT_ONCE transactions, each with its own error, and set the deadline for the rest.
 
-        A transaction that has ended meanwhile, since its caller has gone, is left out.
+        A transaction that has ended in the meantime, for example because it was cancelled, is skipped.
         """
         left = self._left
         piece = [left.popleft() for _ in range(min(AT_ONCE, len(left)))]
@@ -95,7 +94,8 @@ class FailingTransactions:
 
 
 def take_out(queues: Iterable[deque[Transaction]], backlog: Backlog) -> list[Transaction]:
-    """Empty the backlog and each node's queue of writes, except for what is on the wire. Returns what was taken out."""
+    """Empty the backlog and each node's write queue, except for writes on the wire. Returns the removed
+    transactions."""
     taken: list[Transaction] = []
     for writes in queues:
         if writes:
@@ -109,24 +109,24 @@ def take_out(queues: Iterable[deque[Transaction]], backlog: Backlog) -> list[Tra
 REFUSED_POLL_PAUSE = 10.0
 """Seconds between polls of a point that was refused again and again."""
 RETRY_PATIENCE = 1.0
-"""Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
+"""Seconds from queueing to the deadline of a request in POLL or BACKGROUND. A poll uses its period."""
 NOT_DONE = (Refused, Superseded)
-"""Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
+"""Errors that mean that a write was not carried out, unless an earlier attempt may have been."""
 
 
 class Tapped:
-    """Tells whoever taps the line of each attempt, from now on; of one that is on the wire already, nothing is told."""
+    """Reports each attempt to the tap. An attempt that is already on the wire when the tap starts is not reported."""
 
     def __init__(self, events: deque[Event], counters: LineCounters) -> None:
         self.attempt: Attempt | None = None
-        """What is on the wire."""
+        """The attempt on the wire."""
         self._events = events
         self._counters = counters
         self._order_of_transactions = count(1)
         self._numbers: dict[Transaction, int] = {}
 
     def started(self, transaction: Transaction) -> None:
-        """Begin the attempt that goes out now, with the number of its transaction."""
+        """Start an attempt with the number of its transaction."""
         if transaction.attempts == 1 or transaction not in self._numbers:
             self._numbers[transaction] = next(self._order_of_transactions)
         node = transaction.node
@@ -142,9 +142,9 @@ class Tapped:
         )
 
     def over(self, transaction: Transaction, verdict: Verdict, result: Any, now: float) -> None:
-        """Tell how the attempt ended."""
+        """Report the result of the attempt."""
         attempt, self.attempt = self.attempt, None
-        if attempt is None:  # it was on the wire before anybody listened
+        if attempt is None:  # it was on the wire before the tap was opened
             return
         attempt.late = transaction.late
         attempt.heard = transaction.wanted or transaction.check
@@ -152,7 +152,7 @@ class Tapped:
         self._events.append(attempt)
 
     def forget(self, transaction: Transaction) -> None:
-        """Forget the number of a transaction that has ended."""
+        """Release the number of a transaction that has ended."""
         self._numbers.pop(transaction, None)
 
 
@@ -180,16 +180,16 @@ class Dispatcher:
     ) -> None:
         self.events: deque[Event] = deque()
         self.unnoted: Transaction | None = None
-        """The one that has succeeded, until `note_success`."""
+        """The successful transaction that `note_success` has not ended yet."""
         self.backlog: Backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
         self.writes = Writes(self.backlog)
         self.counters = counters
         self.fault: Callable[[], BusError] | None = None
-        """Makes the error with which everything fails while the line cannot be used."""
+        """Returns the error for all requests while the line is unusable; None while it is usable."""
         self.is_held: Callable[[], bool] = lambda: False
-        """Says whether the port had not sent all of the request on the wire when it was asked last."""
+        """Returns True if the port had not sent the whole request when it was last queried."""
         self._deadlines = deadlines
         self.probes = Probes(deadlines, self.nodes, now)
         self._capacity = capacity
@@ -197,25 +197,27 @@ class Dispatcher:
         self._expiries = Expiries(deadlines)
         self.failing = FailingTransactions(deadlines)
         self.tapped: Tapped | None = None
-        """Where somebody taps the line: a line that nobody listens to pays a comparison for it."""
+        """None if the line is not tapped: the check then costs one comparison."""
 
     # requests
 
     def submit(self, transaction: Transaction, now: float) -> bool:
-        """Queue a transaction, or end it at once with the reason why not. Returns False if nothing else has changed."""
+        """Queue a transaction, or end it immediately with an error. Returns False if it was queued and nothing else
+        changed."""
         node, counters = transaction.node, self.counters
         transaction.queued = now
         transaction.deadline = now + RETRY_PATIENCE
-        transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
+        transaction.exchanges_ahead = counters.exchanges  # same as `_waits`, written out: this runs for every request
         transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING]
         if self.fault is not None:
             self._admitted(transaction, now)
             return True
-        changed = transaction.writes  # it may have superseded others, which is to be told
+        changed = transaction.writes  # it may have superseded other writes, whose callers must be notified
         queue = self.backlog.queues[transaction.priority]
-        if changed and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
+        # Even if this write fails below: a `disable()` must never be followed by the `enable()` that it overtook (R7).
+        if changed and transaction.priority is URGENT:
             self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
-        # writes that are parked are in no class
+        # Parked writes are in no class queue, so the node's queue is counted as well.
         waiting = max(queue.live, len(self.writes.queues[node])) if changed else queue.live
         if waiting >= self._capacity and (waiting := self.writes.waiting_of(transaction)) >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
@@ -225,21 +227,21 @@ class Dispatcher:
                 return True
             if node.budgeted and transaction.client is not None and not isinstance(transaction.client, Hold):
                 transaction.client = self.share().new_nodes()
-        # Behind the check above, so that a rejected write never blocks the writes behind it.
+        # After the capacity check, so that a rejected write never blocks the writes behind it.
         if changed:
             self.writes.queues[node].append(transaction)
         if transaction.start_by < inf:
             self._expiries.expect(transaction, len(self.backlog))
             changed = True
-        transaction.phase = QUEUED  # as backlog.push does: this is done for every request
+        transaction.phase = QUEUED  # same as `backlog.push`, written out: this runs for every request
         queue.push(transaction)
         return changed
 
     def cancel(self, transaction: Transaction, now: float) -> None:
-        """Note that a caller has gone: its transaction is not sent if still queued, unheard if on the wire (R6)."""
+        """Handle a cancelled caller: a queued transaction is not sent; the reply to one on the wire is ignored (R6)."""
         if not transaction.wanted or transaction.phase in (ENDED, IDLE):
             return
-        # On the wire it stays until its reply has come or its window is over: cancelling saves no line time (R6).
+        # A request on the wire runs until its reply or its deadline. Cancelling saves no line time (R6).
         transaction.wanted = False
         self.counters.cancelled += 1
         if transaction.phase is QUEUED:
@@ -250,7 +252,7 @@ class Dispatcher:
             self._end(transaction, now)
 
     def next(self, now: float) -> Transaction | None:
-        """Take out the transaction that may be sent now, or return None."""
+        """Remove and return the transaction to send now, or None."""
         while (transaction := self.backlog.pop(now)) is not None:
             verdict = self._admitted(transaction, now)
             if verdict is OK:
@@ -261,20 +263,20 @@ class Dispatcher:
         return None
 
     def urgent_waits(self) -> bool:
-        """Return whether something of the class URGENT waits."""
+        """Return True if an URGENT request is queued."""
         return self.backlog.waiting(URGENT) > 0
 
     def eligibility(self, transaction: Transaction, now: float) -> Eligible | Rejected:
-        """Return whether a transaction may be sent now; nothing is changed."""
+        """Return whether a transaction may be sent now. Changes nothing."""
         return eligibility(transaction, now, self.writes, None if self.fault is None else self.fault())
 
     def proves(self, read: Transaction, now: float) -> bool:
-        """Return whether a read that waits may be sent in place of a sync read: its node is not known to be down."""
+        """Return True if a queued read can replace a sync read: it may be sent, and its node is not DOWN."""
         return read.node.health is not DOWN and self.eligibility(read, now) is OK
 
     def _admitted(self, transaction: Transaction, now: float) -> Eligible | None:
-        """Return OK or WAITS, and have the budget of probes pay for what is asked of a dead node; or end the
-        transaction, and return None."""
+        """Return OK or WAITS, or end the transaction and return None. A request to a dead node is charged to the probe
+        budget."""
         verdict = self.eligibility(transaction, now)
         if verdict is IF_PAID:
             cost = transaction.node.max_reply_delay
@@ -290,9 +292,9 @@ class Dispatcher:
         return verdict
 
     def started(self, transaction: Transaction, now: float) -> None:
-        """Note that the next attempt of a transaction goes out now."""
+        """Record that the next attempt of a transaction is sent now."""
         counters = self.counters
-        # Waits are those of the first attempt: a retry waits because of the line, not because of its class.
+        # Only the first attempt counts as a wait: a retry waits because of the line and not because of its class.
         if transaction.attempts:
             transaction.first_byte = -inf
         elif not transaction.check:
@@ -308,14 +310,15 @@ class Dispatcher:
         transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
-        transaction.late = transaction.overdue = False  # an earlier attempt may have been: its value is not this one's
+        transaction.late = transaction.overdue = False  # a flag of an earlier attempt does not apply to the new reply
         if self.tapped is not None:
             self.tapped.started(transaction)
 
     def _take_stops(self, stop: Transaction, now: float) -> None:
-        """Have equal stops that wait for the same node get the outcome of the one that is sent now.
+        """Give equal stops that are queued for the same node the outcome of the stop that is sent now (R9).
 
-        Not those behind a write that is no stop: sent once, they would be overtaken by it.
+        Stops behind a write that is not a stop are excluded: if they were sent only once, that write would overtake
+        them.
         """
         alike: list[Transaction] = []
         for write in self.writes.queues[stop.node]:
@@ -329,13 +332,13 @@ class Dispatcher:
                 continue
             if write.phase is QUEUED:
                 self.backlog.discard(write, PARKED)
-            write.phase = ON_WIRE  # it is not sent itself, and runs out as this one does
+            write.phase = ON_WIRE  # not sent itself; ends together with this one
             write.attempts, write.started = 1, now
             alike.append(write)
         stop.stops_alike = tuple(alike)
 
     def _release_stops(self, stop: Transaction) -> None:
-        """Have the stops that wait for the outcome of this one be sent themselves, as it is not sent again."""
+        """Queue the equal stops again, because the stop whose outcome they wait for is not sent again."""
         alike, stop.stops_alike = stop.stops_alike, ()
         for other in alike:
             if other.phase is ON_WIRE:
@@ -345,20 +348,21 @@ class Dispatcher:
     # what came of an attempt
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
-        """Note a success at once where it bears on what goes next; else with the events, when the next request left."""
+        """Record a success. Parts that do not affect the next request are deferred until that request has left."""
         if self.tapped is not None:
             self.tapped.over(transaction, Verdict.OK, value, now)
-        # Still there if the owner has not pumped its events since the last success.
+        # Set if the owner has not fetched its events since the last success.
         if self.unnoted is not None:
             self.note_success()
         transaction.value = value
         transaction.last_byte = now
         self.unnoted = transaction
-        if transaction.writes or transaction.node.health is not UP:  # its next write may go; its polls may resume
+        # affects the next request: the node's next write may go, or its polls resume
+        if transaction.writes or transaction.node.health is not UP:
             self.note_success()
 
     def note_success(self) -> None:
-        """End the transaction that has succeeded and is not noted yet, if there is one."""
+        """End the successful transaction that was deferred by `succeeded`, if any."""
         transaction = self.unnoted
         if transaction is None:
             return
@@ -382,7 +386,7 @@ class Dispatcher:
     def attempt_failed(
         self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, ambiguous: bool = False
     ) -> None:
-        """Ask again or fail. A `ambiguous` answer came and was not believed, which says nothing of the node (R15)."""
+        """Retry or fail a transaction. An `ambiguous` reply says nothing about the node's health (R15)."""
         if self.tapped is not None:
             self.tapped.over(transaction, _verdict(no_reply, failure.what, ambiguous), failure.what, now)
         node = transaction.node
@@ -391,27 +395,30 @@ class Dispatcher:
             node.counters.no_reply += 1
         else:
             node.counters.garbled += 1
-        # An ambiguous reply says nothing against the node, so the attempt is repeated even to one that fails.
+        # An ambiguous reply is not a failure of the node, so the attempt is repeated even if the node is SUSPECT.
         worth = ambiguous or self._watch.is_worth_a_retry(transaction)
         if transaction.retried < transaction.retries and worth and self.is_wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
             return
-        # A sync read may be refused or unknown to the node: its failure says nothing about the node.
+        # The node may not support the item of a sync read, so a failed sync read is not a failure of the node.
         if not (ambiguous or transaction.check):
             self._watch.failed(node, now)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
-            kind, failure.hint = WriteUnconfirmed, None  # whatever came: what to do about the write comes first
+            # for a write, the hint of WriteUnconfirmed replaces that of the failure
+            kind, failure.hint = WriteUnconfirmed, None
         self._end(transaction, now, make_error(kind, failure.what, transaction, failure.hint))
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
-        """Fail a transaction over which the protocol's reader failed: a bug there. To ask again would meet it again."""
+        """Fail a transaction because the protocol's reader raised an exception. It is not retried: the bug would
+        recur."""
         if self.tapped is not None:
             self.tapped.over(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
-        transaction.node.counters.garbled += 1  # but no failure of the node: a bug says nothing of its health
+        # not a failure of the node: a bug in the reader says nothing about its health
+        transaction.node.counters.garbled += 1
         kind = WriteUnconfirmed if transaction.writes else BusError
         error = make_error(kind, what, transaction)
         error.hint = "this is not the line's fault: please report it, with a capture"
@@ -419,8 +426,11 @@ class Dispatcher:
         self._end(transaction, now, error)
 
     def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
-        """Ask once more after a NAK or EOT where that can tell something new; then it is final (R7). Where it is not
-        `certain`, it may be an earlier request's (R15): a read is asked once more; a write was perhaps carried out."""
+        """Handle a NAK or EOT: repeat the request once if that can give new information, else raise Refused (R7).
+
+        If the refusal is not `certain`, it may belong to an earlier request (R15): a read is repeated once, and a write
+        may have been carried out.
+        """
         if self.tapped is not None:
             self.tapped.over(transaction, Verdict.REFUSED, refusal.what, now)
         node = transaction.node
@@ -431,24 +441,25 @@ class Dispatcher:
             transaction.refusals += 1
             self._requeue(transaction, now)
             return
-        # A NAK that may be noise, or another request's, takes nothing away that could prove that the line is in sync.
+        # An uncertain NAK must not disable a sync read: the node may support it.
         if certain and not transaction.writes and (transaction.refusals or not refusal.confirm):
             node.note_refused(transaction.command)
-        node.last_reply = now  # a refusal is an answer too (R11)
+        node.last_reply = now  # R11: a refusal is a reply too
         if node.health is not UP:
             self._watch.heard(node, now)
-        # Once may be noise that looks like a NAK; twice in a row is a point that the node does not have.
+        # One refusal may be noise that looks like a NAK. Two in a row mean that the node does not have the point.
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
             transaction.refused_until = now + REFUSED_POLL_PAUSE
         self._end(transaction, now, name_error(refusal, transaction))
 
     def unsendable(self, transaction: Transaction, bug: Exception, now: float) -> None:
-        """Fail a transaction that its protocol cannot encode: a bug there, but nobody may wait for ever."""
+        """Fail a transaction that its protocol cannot encode. This is a bug in the protocol, but the caller must not
+        wait forever."""
         self._end(transaction, now, make_error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
-        """Fail a transaction under which the line was lost: a write may have been carried out."""
+        """Fail the transaction on the wire after the port was lost. A write may have been carried out."""
         if self.tapped is not None:
             self.tapped.over(transaction, Verdict.CUT_OFF, error.what, now)
         transaction.node.counters.cut_off += 1
@@ -457,14 +468,14 @@ class Dispatcher:
     # clients
 
     def share(self) -> SharedBacklog:
-        """Return the backlog in which clients take turns, which the line has from now on."""
+        """Return the backlog in which clients take turns. Converts the backlog on the first call."""
         backlog = self.backlog
         if not isinstance(backlog, SharedBacklog):
             self.backlog = self.writes.backlog = backlog = SharedBacklog(backlog, self.writes, self._deadlines)
         return backlog
 
     def end_hold(self, now: float, hold: Hold | None = None) -> None:
-        """Hold the line no longer for a sequence, the one that lasts if none is given: what of it waits ends so."""
+        """End a sequence, by default the one that holds the line. Its queued requests fail with HoldEnded."""
         backlog = self.share()
         hold = hold or backlog.hold
         if hold is not None:
@@ -475,18 +486,19 @@ class Dispatcher:
     # everything at once
 
     def supersede_writes(self, now: float) -> None:
-        """End every write that waits, of whatever class, as Superseded."""
+        """Fail every queued write of every class with Superseded."""
         for node in self.nodes:
             self._supersede(node, LEFT, now)
 
     def fail_all(self, now: float) -> None:
-        """Take out whatever waits, to end with the current fault: the first few now, the others with `fail_more`."""
+        """Remove all queued transactions and fail them with the current fault: one batch now, the others in
+        `fail_more`."""
         assert self.fault is not None
         self.failing.add(take_out(self.writes.queues.values(), self.backlog), self.fault())
         self.fail_more(now)
 
     def handle_timeout(self, now: float, unread: bool) -> None:
-        """Do what is due, but for what is the line's; with bytes `unread`, nobody is told that his time is over."""
+        """Run expired timers except the line timer. While input is `unread`, no request expires."""
         deadlines = self._deadlines
         if now >= deadlines.failing:
             self.fail_more(now)
@@ -497,23 +509,25 @@ class Dispatcher:
         if now >= deadlines.hold:
             self.end_hold(now)
         if now >= deadlines.sequence:
-            deadlines.sequence = inf  # the line, if it is free, asks the backlog next
+            deadlines.sequence = inf  # if the line is free, it calls the backlog next
 
     def fail_more(self, now: float) -> None:
-        """End a bounded piece of what was taken out: the deadline has passed already while there is more."""
+        """End one batch of the removed transactions. Its deadline has already passed while more are left."""
         for transaction, error in self.failing.next(now):
             self._end(transaction, now, error)
 
     def expire(self, now: float) -> None:
-        """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12). What is on
-        the wire runs out unheard, as when its caller is cancelled; what has come by now has come in time."""
+        """Fail callers whose time has passed (R12): with NotStarted if nothing was sent, else with an unknown outcome.
+
+        An exchange on the wire continues, and its reply is ignored, as after a cancellation.
+        """
         self.note_success()
-        # First the success above: a reply that has arrived in time must not be reported as too late.
+        # The success first: a reply that has arrived in time must not be reported as too late.
         for transaction in self._expiries.due(now):
             if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
-                continue  # its caller has gone, or it was started in time: then only its `finish_by` ends it
+                continue  # The caller was cancelled, or the request was sent in time: then only `finish_by` ends it.
             if transaction.phase is FAILING:
-                continue  # it ends next, with what became of the line
+                continue  # it ends next, with the error of the line
             if transaction.phase is ON_WIRE:
                 transaction.wanted = False
                 self.counters.cancelled += 1
@@ -526,29 +540,29 @@ class Dispatcher:
     # polls
 
     def add_poll(self, poll: Poll, now: float) -> None:
-        """Run a poll from now on."""
+        """Start a poll."""
         self.schedule.add(poll, now)
         self._deadlines.schedule = self.schedule.next_due()
 
     def remove_poll(self, poll: Poll, now: float) -> None:
-        """End a poll: what it has queued is never sent, and what it has on the wire goes unheard."""
+        """Remove a poll. Its queued requests are discarded; the reply of one on the wire is ignored."""
         self.schedule.remove(poll)
         self._deadlines.schedule = self.schedule.next_due()
         for transaction in poll.results:
             self.cancel(transaction, now)
 
     def prepare_poll(self, poll: Poll, now: float) -> None:
-        """Do the new `preparation` of a poll, a slice at a time."""
+        """Run the new `preparation` of a poll, one slice at a time."""
         self.schedule.prepare(poll, now)
         self._deadlines.schedule = self.schedule.next_due()
 
     def demand(self, poll: Poll, now: float) -> None:
-        """Run one cycle of a poll now, off the grid. The running one serves, if there is one."""
+        """Run one cycle of a poll now, outside its grid. If a cycle is running, that one is used."""
         self.schedule.demand(poll)
         self.release_polls(now)
 
     def release_polls(self, now: float) -> None:
-        """Start what is due, a bounded piece of it: the deadline has passed already while there is more."""
+        """Start a batch of due cycles. The deadline has already passed while more are left."""
         for transaction in self.schedule.begin(now):
             self._waits(transaction)
             if self._admitted(transaction, now) is not None:
@@ -558,16 +572,19 @@ class Dispatcher:
     # dead nodes
 
     def suspend(self, node: NodeRecord, until: float) -> None:
-        """Send a node nothing until this time, in seconds: what is asked of it fails with NodeDown."""
+        """Send a node nothing until the given time, in seconds. Requests to it fail with NodeDown."""
         node.suspended_until = until
         self.probes.plan()
 
     def release_node(self, node: NodeRecord) -> None:
-        """Resume a node's polls with their next cycle, as its hook has run, unless it has died and come back since."""
+        """Resume a node's polls with their next cycle after its hook has run.
+
+        Counted, because the node may have gone DOWN and returned again in the meantime.
+        """
         node.holds = max(0, node.holds - 1)
 
     def probe(self, now: float, idle: bool) -> None:
-        """Ask the dead node whose turn it is, if the budget allows. If `idle`, the line has nothing else to do."""
+        """Send the next due probe if the budget allows it. `idle`: the line has nothing else to do."""
         probe = self.probes.next(now, self.fault is None, idle)
         if probe is not None:
             self._waits(probe)
@@ -577,7 +594,7 @@ class Dispatcher:
             self.backlog.push(probe)
 
     def check(self, node: NodeRecord, command: Command[Any], now: float) -> Transaction:
-        """Make a read by which the line proves that it is in sync (R15). It goes at once; nobody waits for it."""
+        """Return a sync read, which proves that the line is in sync (R15). It is sent immediately and has no caller."""
         self.counters.sync_reads += 1
         check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
         check.check = True
@@ -589,32 +606,36 @@ class Dispatcher:
     # the ways of one transaction
 
     def is_wanted(self, transaction: Transaction) -> bool:
-        """Return whether a transaction may be sent again: its caller waits for it, and nothing has overtaken it."""
+        """Return True if a transaction may be sent again: its caller still waits, and no later write has overtaken
+        it."""
         client = transaction.client
         over = client is not None and client.over
         return transaction.wanted and not (transaction.superseded or over) and self.fault is None
 
     def _requeue(self, transaction: Transaction, now: float) -> None:
-        """Put a transaction at the back of its class; a poll's key becomes failure time + period (R7)."""
+        """Append a transaction to its class. The deadline of a poll becomes the failure time plus the period (R7)."""
         poll = transaction.poll
-        # From now on and not from the first deadline: a retry that keeps its place would delay the polls behind it.
+        # Counted from now and not from the first deadline: a retry that keeps its place would delay the polls behind
+        # it.
         transaction.deadline = now + (poll.patience if poll is not None else RETRY_PATIENCE)
         self.backlog.push(transaction)
 
     def _supersede(self, node: NodeRecord, why: str, now: float, above: Priority | None = None) -> None:
-        """End a node's writes, those below the class `above` if one is given: what is overtaken is never sent after
-        what overtakes it, nor if that cannot be sent itself (R7)."""
+        """Fail a node's queued writes, of classes below `above` if given.
+
+        A superseded write is never sent after the write that overtakes it, even if that one cannot be sent itself (R7).
+        """
         # A copy, since ending a write removes it from the queue.
         for write in list(self.writes.queues[node]):
             if write.phase is ON_WIRE:
-                write.superseded = True  # it runs out, but is not repeated behind what overtakes it
+                write.superseded = True  # the attempt continues, but is not retried behind the write that overtakes it
             elif above is None or write.priority > above:
                 if write.phase is QUEUED:
                     self.backlog.discard(write, PARKED)
                 self._end(write, now, make_error(Superseded, why, write))
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
-        """End it exactly once (R8). A write sent before something else ended it may have been carried out."""
+        """End a transaction exactly once (R8). A write that was sent before another error ended it is unconfirmed."""
         if self.tapped is not None:
             self.tapped.forget(transaction)
         if transaction.writes:
@@ -639,7 +660,7 @@ class Dispatcher:
             self._end(other, now, error and make_error(type(error), error.what, other, error.hint))
         poll = transaction.poll
         if poll is not None:
-            # A group that was removed meanwhile has no reader any more.
+            # A group that was removed in the meantime has no reader.
             if poll.group is not None and poll.active:
                 self.events.append(Sampled(poll, transaction))
             poll.remaining -= 1
@@ -651,6 +672,7 @@ class Dispatcher:
             self.events.append(transaction)
 
     def _waits(self, transaction: Transaction) -> None:
-        """Note what the line has counted so far, for which it does not wait: it is taken off when it has waited."""
+        """Store the line's counters. Their difference at the start of the request gives the exchanges that went ahead
+        of it."""
         transaction.exchanges_ahead = self.counters.exchanges
         transaction.quiet_time_ahead = self.counters.spent[RESYNCHRONISING]

@@ -1,8 +1,8 @@
-"""Whether a transaction may be sent now: the one place that knows (R6, R7, R11, R12).
+"""Decides whether a transaction may be sent now (R6, R7, R11, R12). No other place decides this.
 
-It is asked when a request comes, when a poll is due, when a transaction is the next to go, and when a read may go
-before it. Two things are decided elsewhere: whose turn it is and whether a sequence may begin, by `Backlog`; whether
-its answer could be taken for one that is overdue, by `Choice`.
+It is called when a request arrives, when a poll is due, when a transaction is next, and when a read may go before it.
+Two decisions are made elsewhere: whose turn it is and whether a sequence may begin (`Backlog`), and whether the reply
+could be mistaken for an overdue one (`Choice`).
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from busmaster.arbiter.transaction import QUEUED, Transaction, make_error, name_
 from busmaster.errors import BusError, NodeDown, Refused
 
 SUSPENDED = "suspended for maintenance"
-PROBED = "down: it is probed, its polls wait"
+PROBED = "not responding: polling suspended, retrying in the background"
 RETURNING = "back, and its on_return hook is still running"
-REFUSED_AGAIN = "refused again and again: polled every 10 s"
-UNANSWERED = "down: no answer for a while"
+REFUSED_AGAIN = "refused repeatedly: polled every 10 s"
+UNANSWERED = "not responding: the request was not sent, retrying in the background"
 
 
 class Eligible(enum.Enum):
-    """A transaction that does not end: it may be sent, or may be later."""
+    """A transaction that continues: it may be sent now or later."""
 
     OK = "ok"
     IF_PAID = "if paid"
-    """Its node is down: the budget of probes pays for it, or it ends."""
+    """Its node is DOWN: it is sent if the probe budget pays for it, else it fails."""
     WAITS = "waits"
-    """It is queued, and an earlier write of its client to its node is not over (R7)."""
+    """An earlier write of its client to its node is unfinished (R7)."""
 
 
 OK, IF_PAID, WAITS = Eligible
 
 
 class Rejected(NamedTuple):
-    """A transaction that ends, with this error."""
+    """A transaction that fails with this error."""
 
     error: BusError
 
@@ -44,11 +44,11 @@ class Rejected(NamedTuple):
 def eligibility(
     transaction: Transaction, now: float, writes: Writes, fault: BusError | None = None
 ) -> Eligible | Rejected:
-    """Return whether the transaction may be sent now. `fault`: why the line cannot be used. Nothing is changed."""
+    """Return whether the transaction may be sent now. Changes nothing. `fault`: why the line is unusable."""
     node = transaction.node
     if fault is not None:
         return Rejected(name_error(fault, transaction))
-    if transaction.start_by < now and (  # queued right now, it is in time: its caller's clock was read earlier
+    if transaction.start_by < now and (  # a request queued now is in time: its caller read the clock earlier
         transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
     ):
         return Rejected(too_late(transaction, now))
@@ -69,5 +69,5 @@ def eligibility(
 
 
 def unpaid(transaction: Transaction) -> Rejected:
-    """Return how a transaction ends for which the budget of probes does not pay."""
+    """Return the result for a transaction that the probe budget does not pay for."""
     return Rejected(make_error(NodeDown, UNANSWERED, transaction))

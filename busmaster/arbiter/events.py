@@ -1,6 +1,6 @@
-"""What the arbiter and the transport tell their owner, in the order in which it happened.
+"""Events that the arbiter and the transport report to their owner, in order.
 
-Of what happens in one call, the successes may come last: they are noted when the next request has left.
+Within one call, successes may be reported last, after the next request has left.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from busmaster.errors import BusError
 
 @dataclass(slots=True)
 class Overdue:
-    """A transaction's `finish_by` has passed while it was on the wire: its caller gets this error now.
+    """A transaction's `finish_by` has passed while it was on the wire. Its caller gets this error now.
 
-    The exchange runs out as if its caller had been cancelled (R6), and it is not told again.
+    The exchange continues as if its caller had been cancelled (R6). There is no further event for it.
     """
 
     transaction: Transaction
@@ -28,7 +28,8 @@ class Overdue:
 
 @dataclass(slots=True)
 class Sampled:
-    """One exchange of a poll's cycle is over; told where the poll has a `group`, so that it need not wait for all."""
+    """One exchange of a poll's cycle has ended. Reported if the poll has a `group`, so that it need not wait for the
+    cycle."""
 
     poll: Poll
     transaction: Transaction
@@ -36,14 +37,14 @@ class Sampled:
 
 @dataclass(slots=True)
 class Polled:
-    """A cycle of a poll is over: its transactions hold the values or errors until the next cycle starts."""
+    """A cycle of a poll has ended. Its transactions hold the values or errors until the next cycle starts."""
 
     poll: Poll
 
 
 @dataclass(frozen=True, slots=True)
 class NodeChanged:
-    """A node's health changed. `returning`: its polls wait until `Dispatcher.release_node` (its hook runs first)."""
+    """A node's health has changed. `returning`: its hook runs first; its polls wait until `Dispatcher.release_node`."""
 
     node: NodeRecord
     before: Health
@@ -53,7 +54,7 @@ class NodeChanged:
 
 @dataclass(frozen=True, slots=True)
 class MaxReplyDelayRaised:
-    """An overdue reply of this node was seen, so its maximum reply delay was raised (R3)."""
+    """An overdue reply of this node was received, so its maximum reply delay was raised (R3)."""
 
     node: NodeRecord
     age: float
@@ -62,7 +63,7 @@ class MaxReplyDelayRaised:
 
 @dataclass(frozen=True, slots=True)
 class MaxReplyDelayLowered:
-    """An hour of prompt replies: this node's maximum reply delay is what it was before it was raised."""
+    """After an hour of prompt replies this node's maximum reply delay was restored."""
 
     node: NodeRecord
     max_reply_delay: float
@@ -70,9 +71,10 @@ class MaxReplyDelayLowered:
 
 @dataclass(frozen=True, slots=True)
 class RepliesLate:
-    """A reply of this node began `age` seconds after its request, later than its reply `window`, and was delivered.
+    """A reply of this node began `age` seconds after its request, after its reply `window`, and was delivered.
 
-    Told for the first such reply, and for one that is a quarter later than any told before. A longer window fits.
+    Reported for the first such reply, and for one that is a quarter later than the last one reported. A longer window
+    suits this node better.
     """
 
     node: NodeRecord
@@ -81,7 +83,7 @@ class RepliesLate:
 
 
 class LineChange(enum.Enum):
-    """What became of the line: its port UP or DOWN, the line NOISY (nothing is sent) or QUIET again."""
+    """Change of the line: port UP or DOWN, line NOISY (nothing is sent) or QUIET again."""
 
     UP = "up"
     DOWN = "down"
@@ -91,7 +93,7 @@ class LineChange(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class LineChanged:
-    """The line changed, and why where that is known."""
+    """The line has changed. `cause` is set if it is known."""
 
     change: LineChange
     cause: str = ""
@@ -99,9 +101,9 @@ class LineChanged:
 
 @dataclass(frozen=True, slots=True)
 class PortFailed:
-    """The port is down and could not be opened again: why, and what to try. Told once until the cause changes.
+    """The port could not be reopened: cause and hint. Reported once until the cause changes.
 
-    It is tried again all the same. `bug` is the exception where it was no fault of the port. The transport tells it.
+    Reopening continues. `bug`: the exception, if it was not a fault of the port. Reported by the transport.
     """
 
     cause: str
@@ -111,13 +113,13 @@ class PortFailed:
 
 @dataclass(frozen=True, slots=True)
 class CameUnexpected:
-    """Bytes came that nobody had asked for, or an echo did not match (`collision`)."""
+    """Unexpected bytes were received, or an echo did not match (`collision`)."""
 
     data: bytes
     collision: bool = False
 
 
-# A caller's transaction is told itself when it has ended: its `value` or its `error` is set then.
+# A caller's transaction is its own event when it has ended: its `value` or its `error` is set then.
 Event: TypeAlias = (
     Transaction
     | Overdue

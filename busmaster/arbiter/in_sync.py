@@ -1,35 +1,35 @@
-"""R15, in sync: which replies are overdue, and which answers could be theirs.
+"""Detects when requests and replies are out of sync (rule R15).
 
-Replies carry neither an address nor a number. A reply that was not received may still arrive, however long its maximum
-reply delay has passed: a network or a stopped process can hold it. While it is overdue, no answer that could be this
-reply is believed.
+Replies carry neither an address nor a number. A reply that was not received can still arrive after its maximum reply
+delay: a network or a stopped process can hold it. Such a reply is *overdue*. While a reply is overdue, a reply that
+could be mistaken for it is not delivered.
 
-Of each overdue reply the line remembers how it would begin (its key), which node owes it, and until when it could be on
-time. If something else arrived in place of a whole reply, the key is ANY_BYTE: the reply's tail, a single byte, could
-look like an ACK.
+For each overdue reply the line stores how it would begin (its key), its node, and until when it could be on time. If
+other bytes arrived in place of a whole reply, the key is ANY_BYTE: the rest of that reply, a single byte, can look like
+an ACK.
 
-An overdue reply is cleared
-- by itself, if it is received while no request is open, or in place of another reply (by a whole reply, if the line
-  went on after a learned window: two replies may have collided, and what remains of them can begin with any byte);
-- by a right answer of the same node to something else, since a node answers in the order of the requests;
-- by a right answer of any node to something else, if the maximum reply delay has passed and the node has been silent
-  since, because a channel keeps the order. The entry stays until its node could no longer answer: replies that were
-  held up together arrive together, and the slower node answers last. Until then only an answer of that node can be the
-  overdue one, and a similar answer of another node is ambiguous for three times its maximum reply delay;
-- after LAPSE seconds.
+An overdue reply is cleared when one of these happens:
 
-If every request that could prove something is itself overdue, an overdue reply is *forgiven*: the request is sent
-although its answer could be the overdue one. That answer is held until the maximum reply delay has passed. If a second
-one arrives, neither is believed.
+- It is received while no request is open, or in place of another reply. If the line continued after a learned window,
+  only a whole reply counts: two replies may have collided, and the remains of a collision can begin with any byte.
+- The same node correctly answers a later request: a node answers in order.
+- Its maximum reply delay has passed, its node has been silent since, and another node has correctly answered a later
+  request: a channel keeps order. The entry stays until its node can no longer answer, because delayed replies arrive
+  together and the slower node answers last. Until then only a reply of that node can be the overdue one, and a similar
+  reply of another node is ambiguous for three times its maximum reply delay.
+- LAPSE seconds have passed.
 
-A master that stopped in the middle of a frame leaves a node waiting for the rest. Such a node takes the first bytes of
-the next frame, to whichever node, for that rest, and replies with a NAK (or an ACK) of its own, up to its maximum reply
-delay later. So after the line came up, no NAK is trusted, and every ACK is held, until that time has passed behind the
-first frame.
+If each request that could prove something is overdue itself, an overdue reply is *forgiven*: the request is sent
+although its reply could be the overdue one. Its reply is held until the maximum reply delay has passed. If a second one
+arrives, neither is delivered.
 
-A reply that is not overdue and yet looks like one of the last exchanges was sent twice. Then replies like those
-received lately are ambiguous for a while, and if there is a choice, requests whose replies could be confused are not
-sent one after the other.
+A master that stopped in the middle of a frame leaves a node waiting for the rest. That node takes the first bytes of
+the next frame, to any node, for the rest, and replies with a NAK (or an ACK) of its own, up to its maximum reply delay
+later. Until that time has passed after the first frame on a new line, no NAK is trusted and each ACK is held.
+
+A reply that is not overdue but looks like the reply to one of the last exchanges is a duplicate. After a duplicate,
+replies like recent ones are ambiguous for a while, and requests whose replies could be confused are not sent one after
+the other if there is a choice.
 """
 
 from __future__ import annotations
@@ -44,27 +44,30 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.contract.exchange import Command, Done
 
 ANY_BYTE = b""
-"""The key of an overdue reply that any lone byte could pay."""
+"""Key of an overdue reply that any single byte can clear."""
 LAPSE = 10.0
-"""Seconds after its request in which a reply is overdue: TCP gives up on most paths that stand still for longer."""
+"""Seconds after its request for which a reply is overdue. TCP closes most connections that stall for longer."""
 AMBIGUOUS_DELAYS = 3.0
-"""For how many maximum reply delays an answer like one that was believed to be overtaken is ambiguous."""
+"""A reply like one that was considered overtaken is ambiguous for this many maximum reply delays."""
 AMBIGUITY_PERIOD = 30.0
-"""Seconds after something was said twice in which answers like those heard lately are ambiguous."""
+"""Seconds after a duplicate reply for which replies like recent ones are ambiguous."""
 SAID_MEMORY = 0.5
-"""Seconds for which what was said may be said again."""
+"""Seconds after a delivered reply in which a duplicate of it can arrive."""
 RECENT = 128
-"""Exchanges of which a reply may be said a second time: about so many fit into the longest maximum reply delay."""
+"""Number of exchanges whose replies may be duplicated: about as many as fit into the longest maximum reply delay."""
 MOST_UNHEARD = 4
-"""Learned windows in a row that may bring nothing before a node is taken to be silent."""
+"""Consecutive learned windows without a reply before a node is considered silent."""
 MOST_OVERDUE = 400
-"""More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
+"""Maximum number of overdue replies. More than fit into LAPSE with any window in use; the oldest is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """A reply that may still be on time: the command that it answers, the learned `window` after which the line went
-    on, the `silence` after which it is over, as the document says, and how long it `lasts` at most; in seconds."""
+    """A reply that may still be on time although the line has continued.
+
+    `command`: its request. `window`: the learned window that ended the wait. `silence`: the documented silence after
+    which the reply is over. `lasts`: the longest time from its first to its last byte. Times in seconds.
+    """
 
     command: Command[Any]
     window: float
@@ -74,24 +77,25 @@ class Awaited:
 
 @dataclass(slots=True)
 class OverdueReply:
-    """A reply that may still come. `node` is None where it cannot be told whose it is."""
+    """A reply that may still arrive. `node` is None if it is not known which node will send it."""
 
     key: bytes
     node: NodeRecord | None
     asked: float
     over: float
-    """From then on, it is later than its node's maximum reply delay allows."""
+    """From this time on it is later than its node's maximum reply delay."""
     until: float = inf
-    """From then on, only its own node's answers can be it: a right answer of another node was heard."""
+    """From this time on only replies of its own node can be it, because another node has correctly answered."""
     awaited: Awaited | None = None
-    """Where the line went on after a learned window: it may still come, and meet with what is said."""
+    """Set if the line continued after a learned window: the reply may still arrive and collide with the next
+    request."""
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
-        """Return whether it could be the answer of this node (None: of any) to a request that is made now."""
+        """Return True if it could be this node's (None: any node's) reply to a request that is sent now."""
         return now < self.until or (node is not None and self.is_of(node))
 
     def is_of(self, node: NodeRecord) -> bool:
-        """Return whether this node owes it: also one that was removed meanwhile, and added again."""
+        """Return True if this node will send it. A node that was removed and added again counts as the same node."""
         own = self.node
         return own is node or (
             own is not None and own.address == node.address and own.profile.name == node.profile.name
@@ -99,8 +103,7 @@ class OverdueReply:
 
 
 class InSync:
-    """What is overdue on one line, and how far its answers can be trusted. Times are in seconds, on the caller's
-    clock."""
+    """The overdue replies of one line, and which replies are ambiguous. Times are in seconds, on the caller's clock."""
 
     __slots__ = (
         "_ambiguous",
@@ -115,19 +118,20 @@ class InSync:
     )
 
     def __init__(self, strict: bool = False) -> None:
-        """Begin with nothing overdue. If `strict`, it is always as if something had been said twice a moment ago."""
+        """Start with no overdue replies. `strict`: behave at all times as if a duplicate had just been received."""
         self.alert = strict
-        """There is something to be careful of: nothing else here matters while this is False."""
+        """True if replies must be examined. While it is False, nothing else in this object matters."""
         self.overdue_replies: list[OverdueReply] = []
         self.last: Sequence[bytes] = ()
-        """What would answer the exchange that was begun last."""
+        """Keys of the replies to the last exchange."""
         self.recent: deque[Sequence[bytes]] = deque(maxlen=RECENT)
-        """The keys of its replies and of those before: a reply like one of these that is not overdue was sent twice."""
+        """Keys of the replies to recent exchanges. A reply with one of these keys that is not overdue is a
+        duplicate."""
         self._ambiguous: list[tuple[bytes, float]] = []
         self._forgiven: list[tuple[bytes, float]] = []
         self.lone_bytes_until = -inf
-        """Until then a lone byte may be a node's reply to a frame that an earlier master left unfinished; inf until the
-        first frame was sent."""
+        """Until this time a single byte may be the reply to a frame that an earlier master left unfinished; inf until
+        the first frame was sent."""
         self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
         self._ambiguous_until = inf if strict else -inf
 
@@ -141,15 +145,16 @@ class InSync:
         over: float,
         awaited: Awaited | None = None,
     ) -> None:
-        """Note that replies that begin with these keys were not heard, see `OverdueReply`."""
+        """Add an overdue reply for each key; see `OverdueReply`."""
         self.overdue_replies += [OverdueReply(key, node, asked, over, inf, awaited) for key in keys]
-        # Bounded: a line on which nothing is heard for ten seconds must not grow without limit.
+        # Bounded: a line without any reply for ten seconds must not use more and more memory (R12).
         del self.overdue_replies[:-MOST_OVERDUE]
         self.alert = True
 
     def lapse(self, now: float) -> None:
-        """Forget what has been overdue for too long, and stop being careful where nothing is left to be careful of."""
-        # From when the request left, not from when its window ended: a reply cannot be older than its request.
+        """Remove expired entries. Clears `alert` if none are left."""
+        # Counted from the end of the request and not from the end of its window: a reply is never older than its
+        # request.
         self.overdue_replies = [overdue for overdue in self.overdue_replies if now - overdue.asked <= LAPSE]
         self._ambiguous = [entry for entry in self._ambiguous if entry[1] > now]
         self._forgiven = [entry for entry in self._forgiven if entry[1] > now]
@@ -157,16 +162,19 @@ class InSync:
         self.alert = bool(unsure or self._ambiguous_until > now or self.lone_bytes_until > now)
 
     def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
-        """Return whether an answer beginning with one of these keys, of this node if given, could be one overdue."""
+        """Return True if a reply with one of these keys, from this node if given, could be an overdue one."""
         return any(overdue.of(node, now) and _could_be(overdue, answers) for overdue in self.overdue_replies)
 
     def over(self, answers: Sequence[bytes]) -> float:
-        """Return when all that is overdue and could look so is later than its node's maximum reply delay allows."""
+        """Return the time after which each overdue reply with such a key is later than its maximum reply delay."""
         return max((overdue.over for overdue in self.overdue_replies if _could_be(overdue, answers)), default=-inf)
 
     def awaited_until(self, last_byte: float, answers: Sequence[bytes] | None = None) -> float:
-        """Return until when something may come (that could look so), though the line went on; -inf if nothing may.
-        `last_byte` is when a byte came last."""
+        """Return until when a reply (with one of these keys) may arrive on time although the line has continued, or
+        -inf.
+
+        `last_byte`: when the last byte was received.
+        """
         until = -inf
         for overdue in self.overdue_replies:
             if overdue.awaited is not None and (answers is None or _could_be(overdue, answers)):
@@ -177,8 +185,11 @@ class InSync:
         return until
 
     def nodes_overdue(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
-        """Yield the nodes that owe what could look so (None: anything), and answer, as far as is known. A removed node
-        is never asked."""
+        """Yield the nodes that have an overdue reply with one of these keys (None: any key) and are not known to be
+        silent.
+
+        Removed nodes are skipped, because no request is sent to them.
+        """
         for overdue in self.overdue_replies:
             if (
                 overdue.node is None
@@ -197,30 +208,31 @@ class InSync:
         return [(overdue.node, overdue.key) for overdue in self.overdue_replies]
 
     def lone_byte_is_overdue(self) -> bool:
-        """Return whether a reply of one byte is overdue, or anything that could be one."""
+        """Return True if a one-byte reply is overdue, or a reply of which any byte may be left."""
         return any(len(overdue.key) < 2 for overdue in self.overdue_replies)
 
     def ends(self, answers: Sequence[bytes], now: float) -> float:
-        """Return when what is overdue and could look so can be no other node's any more; inf if that is not known."""
+        """Return the time from which overdue replies with such a key can only come from their own nodes; inf if
+        unknown."""
         return max((d.until for d in self.overdue_replies if now < d.until and _could_be(d, answers)), default=inf)
 
     def forgive(self, answers: Sequence[bytes]) -> None:
-        """Forgive what is overdue and could look so: nothing unlike can be asked, R3's assumption must do, and
-        doubt."""
+        """Forgive overdue replies with these keys: no request with a distinct reply is available, so R3 and holding
+        must do."""
         self._forgiven += [
             (overdue.key, overdue.asked + LAPSE) for overdue in self.overdue_replies if _could_be(overdue, answers)
         ]
         self.overdue_replies = [overdue for overdue in self.overdue_replies if not _could_be(overdue, answers)]
 
     def answered(self, node: NodeRecord, asked: float, now: float, patience: float) -> None:
-        """Note a right answer that could be nobody else's, to what `node` was asked at `asked`.
+        """Record a correct reply of `node`, to a request sent at `asked`, that cannot be another node's.
 
-        `patience` is how long a reply is taken to need, in seconds, of a node whose replies were never timed.
+        `patience`: assumed reply time, in seconds, of a node whose replies were never timed.
         """
         self.overdue_replies = [overdue for overdue in self.overdue_replies if not overdue.is_of(node)]
         for overdue in self.overdue_replies:
-            # Only requests that left after the maximum reply delay prove anything: before, both replies may be on the
-            # way.
+            # Only a request sent after the maximum reply delay proves something. Before that, both replies can be on
+            # the way.
             if overdue.over <= asked and overdue.until == inf and _is_silent(overdue):
                 overdue.until = now + (0.0 if overdue.node is None else overdue.node.latest(patience))
                 self._ambiguous.append(
@@ -231,14 +243,13 @@ class InSync:
                 )
 
     def heard(self, run: bytes, now: float) -> OverdueReply | None:
-        """Take all that came up to a silence, unexpected or in place of a reply. Returns whose it is, as far as is
-        known.
+        """Process all bytes received before a silence, unexpected or in place of a reply. Returns the overdue reply
+        found.
 
-        What nobody overdue, though it is like the last answers, was said twice. Of what is no lone answer, a part may
-        be still to come: a byte of any kind.
+        A reply that is not overdue but looks like a recent one is a duplicate. If the bytes are more than one reply,
+        part of a reply may still be missing, which can be any byte.
         """
-        # After a learned window two nodes may have talked at the same time: stricter rules apply to what is left of
-        # that.
+        # After a learned window two nodes may have transmitted at the same time, so stricter rules apply.
         awaited = [overdue for overdue in self.overdue_replies if overdue.awaited is not None]
         if awaited:
             return self._heard_late(awaited, run, now)
@@ -256,14 +267,14 @@ class InSync:
                 payers.append(overdue)
                 self._pay(overdue)
                 rest = rest[:place] + rest[place + len(overdue.key) :]
-        # Nothing is left over, so nothing needs to be suspected.
+        # All bytes are accounted for: no duplicate is suspected.
         if payers and not rest:
             return payers[0]
         if not payers and any(until > now and _is(run, key) for key, until in (*self._ambiguous, *self._forgiven)):
             self._ambiguous = [entry for entry in self._ambiguous if not _is(run, entry[0])]
             self._forgiven = [entry for entry in self._forgiven if not _is(run, entry[0])]
             return None
-        # Built here and not kept: unexpected bytes are rare, and exchanges are not.
+        # Built here and not stored: unexpected bytes are rare, exchanges are not.
         recent = {key for answers in self.recent for key in answers}
         contained = any(len(key) > 1 and key in rest for key in recent)
         alike = any(_is(rest, key) for key in recent)
@@ -274,9 +285,12 @@ class InSync:
         return payers[0] if payers else None
 
     def _heard_late(self, awaited: list[OverdueReply], run: bytes, now: float) -> OverdueReply | None:
-        """Do as `heard` does, where the line went on before a reply was over. Talkers may have met, and what is left of
-        two can begin like anything: only a whole reply pays, and only where nobody owes another one: that could be it,
-        to something else than was asked. Returns who seems to have said it."""
+        """Variant of `heard` for when the line has continued before a reply was over.
+
+        Two replies may have collided, and the remains can begin with any byte. So only a whole reply clears an entry,
+        and only if no other node has an overdue reply: that one could be the answer to another request. Returns the
+        apparent sender's entry.
+        """
         first = None
         while found := next(
             ((overdue, rest) for overdue in awaited if (rest := _behind(overdue, run)) is not None),
@@ -288,15 +302,17 @@ class InSync:
             request = (overdue.node, overdue.asked)
             # With two requests open at the same node the reply may answer either: the entry of the other one stays.
             if all((other.node, other.asked) == request for other in self.overdue_replies if other.awaited is not None):
-                # all that its request left: the lone byte, too, that could have been a part of this reply
+                # also removes the ANY_BYTE entry of the same request, which stood for a part of this reply
                 self.overdue_replies = [other for other in self.overdue_replies if (other.node, other.asked) != request]
         if run:
             self.add_overdue((ANY_BYTE,), None, now, now)
         return first
 
     def _overdue_byte(self, run: bytes) -> OverdueReply | None:
-        """Find the overdue reply that the first byte pays: one alone, or before more of its kind, or before an overdue
-        reply."""
+        """Return the overdue reply that the first byte clears.
+
+        The byte must stand alone, or be followed by equal bytes or by another overdue reply.
+        """
         more = run[1:]
         if (
             more
@@ -310,60 +326,60 @@ class InSync:
         )
 
     def _pay(self, paid: OverdueReply) -> None:
-        """Strike the overdue reply off. Where several nodes may have paid with the same words, it is not known which:
-        the rest are nobody's."""
+        """Clear an overdue reply. If other nodes have one with the same key, the sender is uncertain, so theirs lose
+        their node."""
         self.overdue_replies.remove(paid)
         for overdue in self.overdue_replies:
+            # Two nodes with the same key: either may have sent this reply, so a later one cannot be attributed to its
+            # node.
             if overdue.key == paid.key and overdue.node is not paid.node:
                 overdue.node = None
 
     # how far an answer can be trusted
 
     def said_twice(self, now: float) -> None:
-        """Note that more was answered than was asked: for AMBIGUITY_PERIOD, answers like those heard lately are
-        ambiguous."""
+        """Record a duplicate reply: for AMBIGUITY_PERIOD, replies like recent ones are ambiguous."""
         self._ambiguous_until = max(self._ambiguous_until, now + AMBIGUITY_PERIOD)
         self.alert = True
 
     def said(self, answers: Sequence[bytes], now: float) -> None:
-        """Note that a right answer was delivered, in case it is said again."""
+        """Remember a delivered reply, to recognise a duplicate of it."""
         if now < self._ambiguous_until:
             self._said.append((answers, now))
 
     def has_ambiguity(self, now: float) -> bool:
-        """Return whether something was said twice lately."""
+        """Return True if a duplicate reply was received in the last AMBIGUITY_PERIOD seconds."""
         return now < self._ambiguous_until
 
     def is_to_be_held(self, answers: Sequence[bytes], now: float) -> bool:
-        """Return whether a reply like this may be an overdue one that was forgiven, or the reply to a frame that an
-        earlier master left unfinished."""
+        """Return True if a reply like this may be a forgiven one, or the reply to an earlier master's unfinished
+        frame."""
         lone = any(len(key) == 1 for key in answers)
         if lone and now < self.lone_bytes_until:
             return True
         return any(until > now and (key in answers if key else lone) for key, until in self._forgiven)
 
     def stood_alone(self, answers: Sequence[bytes]) -> None:
-        """Note that no second reply came behind one that was held: what was forgiven and is like it is not to come."""
-        # Channels keep the order: a second reply would have come before the end of the hold.
+        """Remove forgiven replies with these keys: no second reply arrived while this one was held."""
+        # A channel keeps order, so a second reply would have arrived before the hold ended.
         self._forgiven = [entry for entry in self._forgiven if entry[0] and entry[0] not in answers]
 
     def is_overdue(self, now: float) -> bool:
-        """Return whether a reply to an earlier request may still come."""
+        """Return True if the reply to an earlier request may still arrive."""
         return bool(self.overdue_replies) or any(until > now for _, until in self._forgiven)
 
     def refusals_are_ambiguous(self, now: float) -> bool:
-        """Return whether a NAK may be the reply to another request than the one on the wire: every request can be
-        answered with it, whatever its good replies begin with."""
+        """Return True if a NAK may belong to another request: a node can answer every request with a NAK."""
         return now < self.lone_bytes_until or self.is_overdue(now)
 
     def came_up(self) -> None:
-        """Note that the line came up: a node may hold the beginning of an earlier master's frame."""
+        """Handle a line that came up: a node may hold the beginning of an earlier master's frame."""
         self.lone_bytes_until = inf
         self.alert = True
 
     def is_ambiguous(self, answers: Sequence[bytes], now: float) -> bool:
-        """Return whether an answer like this may be one that was overtaken, or one that is said twice."""
-        # Checked first: this list is nearly always empty, and the history below can have 256 entries.
+        """Return True if a reply like this may be an overtaken reply or a duplicate."""
+        # Checked first: this list is nearly always empty, while the history below can have 256 entries.
         if any(until > now and key in answers for key, until in self._ambiguous):
             return True
         if now >= self._ambiguous_until:
@@ -377,10 +393,10 @@ class InSync:
 
 
 def _behind(overdue: OverdueReply, run: bytes) -> bytes | None:
-    """Return what comes behind this overdue reply where the run begins with all of it, and it is right; else None."""
+    """Return the bytes after this overdue reply if the run begins with a whole and correct one, else None."""
     if overdue.awaited is None or overdue.node is None or len(overdue.key) < 2 or not run.startswith(overdue.key):
         return None
-    # The reader of the request itself decides whether the reply is whole, so that no second parser can disagree.
+    # The reader of the request decides whether the reply is whole, so that no second parser can disagree.
     try:
         step = overdue.awaited.command.open(overdue.node.address, overdue.node.timings).feed(run)
     except Exception:
@@ -389,17 +405,17 @@ def _behind(overdue: OverdueReply, run: bytes) -> bytes | None:
 
 
 def _could_be(overdue: OverdueReply, answers: Sequence[bytes]) -> bool:
-    """Return whether the reply that is overdue could be taken for one of these answers."""
+    """Return True if the overdue reply could be mistaken for a reply with one of these keys."""
     return overdue.key in answers if overdue.key else any(len(key) == 1 for key in answers)
 
 
 def _is_silent(overdue: OverdueReply) -> bool:
-    """Return whether the overdue reply's node does not answer, as far as is known: another's answer must do. A node
-    that does answer is asked itself, unless it was removed."""
+    """Return True if the node of the overdue reply is not known to answer, so that another node's reply must clear
+    it."""
     node = overdue.node
     return node is None or node.removed or node.silent or node.last_reply == -inf
 
 
 def _is(run: bytes, key: bytes) -> bool:
-    """Return whether these bytes are replies of that key: begin with it, or are nothing else, where it is one byte."""
+    """Return True if the bytes are replies with this key. A one-byte key must make up the whole run."""
     return run == key * len(run) if len(key) == 1 else bool(key) and run.startswith(key)

@@ -1,28 +1,28 @@
 """Reply windows that are learned from a node's own replies.
 
-The documents' windows are made for the slowest node that there may be: a reply that is lost costs a node which answers
-in 2 ms as much as one which takes 100 ms. Where learning is asked for, a read that will be repeated is awaited for only
-as long as this node has needed of late, with a good margin; then the line goes on, though the reply may still come.
+Documented windows suit the slowest possible node: a lost reply costs as much on a node that answers in 2 ms as on one
+that takes 100 ms. If learning is enabled, a read that can be repeated waits only as long as this node has recently
+needed, with a good margin. Then the line continues, although the reply may still arrive.
 
-What makes that safe is R15, not the window: the reply is *overdue* from then on, for as long as the document's maximum
-reply delay and beyond it, and nothing that it could counterfeit is believed, no write and no broadcast is sent, until
-the node has answered something else. Nothing that is told to a caller rests on a learned time, either: writes and the
-last attempt of a read have the document's window, and go only when nothing is awaited any more; probes and all that is
-asked of a node that has failed, and not answered since, have the document's times altogether.
+R15 makes this safe, not the window: from then on the reply is *overdue*, for the documented maximum reply delay and
+longer. Until the node has answered another request, no reply that could be mistaken for it is delivered, and no write
+and no broadcast is sent. No result that a caller gets depends on a learned time either. Writes and the last attempt of
+a read have the documented window, and are sent only when no reply is awaited any more. Probes, and all requests to a
+node that has failed and not answered since, have the documented times.
 
-The rule, for each kind of command (its type) and each of the node's two steps (the answer; MSC's packet after its
-ACK) on its own: the window is one and a half times the largest reply time of the last 500 to 1000 replies, or the
-largest until the first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus
-2 ms; at least 5 ms, at most the document's. It is trusted after 200 replies.
-The second attempt of a read has twice that. The silence after which a reply is over is twice the longest pause
-within one of those replies, but 17 bytes at least. (A smoothed mean and deviation, as TCP has it, follows the usual
-reply too closely: of 76,000 replies it missed 1236, the largest none.)
+The window is calculated for each kind of command (its type) and for each of its two steps (the reply; MSC's packet
+after its ACK). It is 1.5 times the longest reply time of the last 500 to 1000 replies plus 2 ms. If the longest time
+until the first bytes were delivered is more than those 1.5 times, that time is used (an adapter may deliver a whole
+reply at once). It is at least 5 ms and at most the documented window. It is trusted after 200 replies. The second
+attempt of a read has twice that window. The silence after which a reply is over is twice the longest pause within those
+replies, and at least 17 bytes. (A smoothed mean and deviation, as in TCP, follows the usual reply too closely: of
+76,000 replies it missed 1236, the maximum none.)
 
-A node that was later than three quarters of a learned window (one shorter than the document's), or whose reply came
-after it, has the document's times again for 20 replies: enough to tell one that has become slower from one that was
-late once. One that was away has them for 200, for it may be another device.
+A node that replied after three quarters of a learned window (if that is shorter than the documented one), or after the
+window, has the documented times again for 20 replies. That is enough to distinguish a node that has become slower from
+one late reply. A node that was away has them for 200 replies, because it may be another device.
 
-Of times nothing is done here but to add, subtract, compare and multiply by a constant.
+Times are only added, subtracted, compared and multiplied by constants here.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ from busmaster.contract.timing import ReplyTiming, Timings
 TRUSTED_AFTER = 200
 """Replies of a kind after which its times are trusted."""
 TRUSTED_AGAIN_AFTER = 20
-"""As many where times of an earlier run are known, or after one that was late."""
+"""The same if times of an earlier run are known, or after a late reply."""
 EPOCH = 500
-"""Replies after which an epoch ends: the largest of this one and the last count."""
+"""Replies per epoch. The maximum of the current and the last epoch counts."""
 MARGIN = 0.002
-"""Seconds added to what was ever needed."""
+"""Seconds added to the longest observed time."""
 SLOWER = 1.5
-"""How many times its slowest reply is awaited of a node: more costs each lost frame the difference, and less would call
-replies lost that only came a little later than any before."""
+"""Factor on the slowest reply time. A larger one makes each lost frame cost more; a smaller one gives up replies that
+are only slightly later than any before."""
 LEAST = 0.005
-"""The shortest window, in seconds: less than a process is held up for."""
+"""Shortest window, in seconds: a process can be suspended for longer than anything below it."""
 AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 2, 10**9, 0
-"""How many times the learned window an attempt is awaited, but no longer than the document says. AT_LAST is the attempt
-on which an outcome rests: the document's window. NEVER: neither its window nor its silence is learned."""
+"""Factor on the learned window for an attempt; the documented window is the maximum. AT_LAST: the last attempt, with
+the documented window. NEVER: documented window and silence."""
 LATE_SHARE = 0.75
-"""The share of a learned window after which a reply says that the node has become slower."""
+"""Share of a learned window after which a reply shows that the node has become slower."""
 LEAST_SILENCE = 17
-"""The shortest silence that ends a reply, in bytes: a UART hands over up to 16 at once."""
+"""Shortest silence that ends a reply, in bytes: a UART delivers up to 16 at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedTimes:
-    """What is known of the replies of one node to one kind of command; in seconds.
+    """Learned times of one node for one kind of command, in seconds.
 
-    `slowest` is the largest reply time of the last 500 to 1000 replies, to the first byte; `received` the largest until
-    the first bytes were handed over; `pause` the longest within a reply. `window` is what is awaited, once `trusted`.
+    `slowest`: longest reply time to the first byte in the last 500 to 1000 replies. `received`: longest time until the
+    first bytes were delivered. `pause`: longest pause within a reply. `window`: the window used once it is `trusted`.
     """
 
     kind: str
@@ -73,12 +73,12 @@ class LearnedTimes:
 
 
 def window_of(slowest: float, heard: float) -> float:
-    """Return the seconds in which a reply of such a node begins: see `LearnedTimes` for what is given, in seconds."""
+    """Return the window, in seconds, for these times; see `LearnedTimes`."""
     return max(LEAST, max(SLOWER * slowest, heard) + MARGIN)
 
 
 class _Largest:
-    """The largest of the last one or two epochs."""
+    """Maximum of the current and the last epoch."""
 
     __slots__ = ("before", "now")
 
@@ -109,7 +109,7 @@ class StepTimes:
         """Replies until it is trusted."""
 
     def note(self, begun: float, heard: float, pause: float) -> bool:
-        """Note one reply. Returns whether what is known has changed."""
+        """Record one reply. Returns True if the times have changed."""
         slowest, whole, pauses = self.slowest, self.heard, self.pause
         changed = False
         # Compared one by one, without `max`: this runs for every reply, and seldom changes anything.
@@ -136,16 +136,15 @@ class StepTimes:
 
     @property
     def window(self) -> float:
-        """Seconds in which a reply begins, by all that is known."""
+        """Learned window, in seconds."""
         return window_of(self.slowest.value, self.heard.value)
 
     def timing(self, document: ReplyTiming, byte_time: float, patience: int) -> ReplyTiming:
-        """Return what is awaited: the document's while too little is known."""
+        """Return the timing to use: the documented one until there are enough replies."""
         window = min(patience * self.window, document.window)
         if self.doubts:
             return document
-        # Twice the longest pause seen, since a pause depends on the scheduler of the adapter more than a reply time
-        # does.
+        # Twice the longest pause: a pause depends more on the adapter's scheduling than a reply time does.
         gap = min(document.inter_byte_timeout, max(LEAST_SILENCE * byte_time, 2 * self.pause.value))
         return replace(
             document, late_after=min(document.late_after, window), window=window, inter_byte_timeout=gap, silence=gap
@@ -153,7 +152,7 @@ class StepTimes:
 
 
 class Kind:
-    """One kind of command of one node, and the times that its next exchange is opened with."""
+    """One kind of command of one node, and the times for its next exchange."""
 
     __slots__ = ("_byte_time", "_document", "_given", "first", "packet")
 
@@ -165,38 +164,38 @@ class Kind:
         self._given: dict[int, Timings] | None = None
 
     def timings(self, document: Timings, hurry: int) -> Timings:
-        """Return what an exchange is to be opened with: AT_FIRST, AGAIN, AT_LAST or NEVER."""
+        """Return the times to open an exchange with. `hurry`: AT_FIRST, AGAIN, AT_LAST or NEVER."""
         if self._given is None or document is not self._document:
             self._document = document
             own = replace(
                 document, packet=replace(document.packet)
-            )  # so that a packet's step can be told by its timing
+            )  # a copy of its own, so that a packet's step is recognised by its timing
             self._given = {patience: self._learned(own, patience) for patience in (AT_FIRST, AGAIN, AT_LAST)}
             self._given[NEVER] = own
         return self._given[hurry]
 
     def note(self, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
-        """Note the reply to one of its steps."""
+        """Record the reply to one of its steps."""
         step = self.packet if packet else self.first
         if step.note(begun, heard, pause) or byte_time != self._byte_time:
             self._byte_time = byte_time
             self._given = None
 
     def doubt(self, replies: int) -> None:
-        """Go back to the document's times for at least so many replies."""
+        """Use the documented times for at least this many replies."""
         for step in (self.first, self.packet):
             step.doubts = max(step.doubts, replies)
         self._given = None
 
     def _learned(self, own: Timings, patience: int) -> Timings:
         first = self.first.timing(own.read, self._byte_time, patience)
-        # Longer for a write: when its window is over it is unconfirmed, while a read is only sent again.
+        # Longer for a write: after its window it is unconfirmed, while a read is repeated.
         write = self.first.timing(own.write, self._byte_time, AT_LAST)
         return Timings(first, write, self.packet.timing(own.packet, self._byte_time, patience))
 
 
 class Learning:
-    """What is learned of one node."""
+    """Learned times of one node."""
 
     __slots__ = ("_known", "kinds", "returns")
 
@@ -204,34 +203,35 @@ class Learning:
         self.kinds: dict[type, Kind] = {}
         self._known: dict[tuple[str, bool], LearnedTimes] = {}
         self.returns = 0
-        """How often the document's times were gone back to."""
+        """How often the documented times were restored."""
 
     def timings(self, command: object, document: Timings, hurry: int) -> Timings:
-        """Return the times with which `command` is to be opened, see `Kind.timings`."""
+        """Return the times to open `command` with; see `Kind.timings`."""
         kind = self.kinds.get(type(command))
         if kind is None:
             kind = self.kinds[type(command)] = self._begin(type(command).__name__)
         return kind.timings(document, hurry)
 
     def note(self, command: object, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
-        """Note a reply: begun after so many seconds, its first bytes handed over after `heard`, with that `pause`."""
+        """Record a reply. `begun`, `heard`, `pause`: times in seconds to its first byte, to its delivery, and within
+        it."""
         # A kind that was never opened with `timings` cannot have a reply.
         kind = self.kinds.get(type(command))
         if kind is not None:
             kind.note(packet, begun, heard, pause, byte_time)
 
     def was_late(self) -> None:
-        """Go back to the document's times until it has shown whether it has become slower."""
+        """Use the documented times until it is known whether the node has become slower."""
         self._doubt(TRUSTED_AGAIN_AFTER)
 
     def was_away(self) -> None:
-        """Go back to the document's times until enough is known of what may be another device."""
+        """Use the documented times until enough is known about what may be another device."""
         # Another device may answer at this address now, so the times of an earlier run are void too.
         self._known = {}
         self._doubt(TRUSTED_AFTER)
 
     def times(self, document: Timings) -> tuple[LearnedTimes, ...]:
-        """Return what is known, a step at a time."""
+        """Return the learned times of each step."""
         found = []
         for command, kind in self.kinds.items():
             for step, limit, packet in ((kind.first, document.read, False), (kind.packet, document.packet, True)):
@@ -243,12 +243,11 @@ class Learning:
         return tuple(found)
 
     def begin_with(self, known: Iterable[LearnedTimes]) -> None:
-        """Start from what an earlier run has learned: it is trusted after fewer replies."""
+        """Start with the times of an earlier run: they are trusted after fewer replies."""
         self._known = {(times.kind, times.packet): times for times in known}
 
     def to_keep(self, document: Timings) -> tuple[LearnedTimes, ...]:
-        """Return what the next run may begin with: what is trusted, and what this one began with and never
-        ambiguous."""
+        """Return the times to store for the next run: the trusted ones, and initial ones that were not replaced."""
         trusted = {(times.kind, times.packet): times for times in self.times(document) if times.trusted}
         return tuple({**self._known, **trusted}.values())
 

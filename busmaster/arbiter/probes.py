@@ -1,6 +1,4 @@
-"""When a dead node is asked whether it is back; and what each attempt says of its node: its health, its maximum reply
-delay, and what follows of them (R3, R11).
-"""
+"""Probes of dead nodes, and the effect of each attempt on its node's health and maximum reply delay (R3, R11)."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ from busmaster.arbiter.health import DOWN, UNKNOWN, Health, NodeRecord, ProbeBud
 from busmaster.arbiter.transaction import BACKGROUND, Transaction
 
 IDLE_PROBE_EVERY = 0.8
-"""Seconds between two probes that are not paid for: on a line that has nothing else to do they delay nobody."""
+"""Seconds between two free probes: on a line with nothing else to do they delay no request."""
 
 
 class Probes:
@@ -27,7 +25,7 @@ class Probes:
         self._deadlines = deadlines
         self._running: Transaction | None = None
         self._free_at = -inf
-        """When the next probe need not be paid for, if the line has nothing else to do."""
+        """When the next probe is free, if the line has nothing else to do."""
 
     def plan(self) -> None:
         """Set the deadline of the next probe."""
@@ -35,20 +33,19 @@ class Probes:
             self._deadlines.health = inf
             return
         down = self._down()
-        # A probe of a dead node is expected to fail, and a failed attempt costs the maximum reply delay: that, not the
-        # window, is what it takes of the line.
+        # A probe of a dead node is expected to fail. A failed attempt costs the maximum reply delay and not the window.
         self.budget.probe = max((node.max_reply_delay for node in down), default=0.0)
         due = min(map(_due, down), default=inf)
         free = min((max(self._free_at, node.suspended_until) for node in down), default=inf)
         self._deadlines.health = min(due, free)
 
     def next(self, now: float, usable: bool, idle: bool) -> Transaction | None:
-        """Return the probe of the node in turn, if the line is `usable`, and the budget allows it or it is free."""
+        """Return the next probe, if the line is `usable` and the probe is paid or free, else None."""
         down = [node for node in self.nodes if node.health is DOWN and node.suspended_until <= now]
         if self._running is not None or not down or not usable:
             self._put_off(now)
             return None
-        # Of those that are due the one that has waited longest, so that none is forgotten when the budget is short.
+        # The due node that has waited longest, so that no node is skipped when the budget is short.
         node = min(down, key=lambda node: (node.probe_at > now, node.probed_at))
         cost = node.max_reply_delay
         if self._is_free(node, now, idle):
@@ -64,29 +61,28 @@ class Probes:
         return self._probe(node, cost, now)
 
     def spare(self, cost: float, now: float) -> bool:
-        """Pay for a caller's request to a dead node, if the budget holds that beside the probe that is due. Returns
-        whether it did."""
-        # The probe that is due keeps its share: else a caller that asks a dead node again and again would spend all
-        # there is, and the other dead ones would never be found to be back.
+        """Pay for a caller's request to a dead node, if the budget also holds the due probe. Returns True if paid."""
+        # The due probe keeps its share. Otherwise a caller that keeps sending requests to a dead node would use the
+        # whole budget, and the return of the other dead nodes would not be noticed.
         due = max((n.max_reply_delay for n in self.nodes if n.health is DOWN and n.probe_at <= now), default=0.0)
         return self.budget.take(cost, now, due)
 
     def alive(self, node: NodeRecord, now: float) -> None:
-        """Note that a dead node was heard: it will answer its probe, which therefore costs nothing."""
+        """Note that a dead node has transmitted. Its next probe will be answered, so the cost is refunded."""
         node.probe_at = min(node.probe_at, now)
-        # The refund is what the probe costs while it is expected to fail.
+        # The refund is the cost of a probe without a reply.
         self.budget.refund(node.max_reply_delay)
         self.plan()
 
     def over(self, probe: Transaction) -> None:
-        """Note that this transaction has ended; it may have been the probe that was out."""
-        # Identity, not equality: a caller may have sent the same command to the same node.
+        """Note that a transaction has ended. It may have been the running probe."""
+        # Identity and not equality: a caller may have sent the same command to the same node.
         if probe is self._running:
             self._running = None
             self.plan()
 
     def _is_free(self, node: NodeRecord, now: float, idle: bool) -> bool:
-        """Return whether nobody waits, nothing is due before the probe is over, or nobody lives whom it could delay."""
+        """Return True if the line is idle and no poll is due during the probe, or if all nodes are DOWN."""
         if not idle or now < self._free_at:
             return False
         return now + node.max_reply_delay < self._deadlines.schedule or all(
@@ -103,9 +99,9 @@ class Probes:
         return probe
 
     def _put_off(self, now: float) -> None:
-        """Look again when the next probe is due; a free one may have to wait for the line to be idle."""
+        """Set the deadline to the next due probe. A free one may have to wait until the line is idle."""
         self.plan()
-        # Never a time that is past: the owner would call again at once, and find the same.
+        # Never a time in the past: the owner would call again immediately without any change.
         if self._deadlines.health <= now:
             due = min((due for due in map(_due, self._down()) if due > now), default=inf)
             self._deadlines.health = min(due, now + IDLE_PROBE_EVERY)
@@ -115,12 +111,12 @@ class Probes:
 
 
 def _due(node: NodeRecord) -> float:
-    """Return when this dead node's probe is due, if it must be paid for."""
+    """Return when the paid probe of this dead node is due."""
     return max(node.probe_at, node.suspended_until)
 
 
 class NodeWatch:
-    """Of one line: it tells changes by `events`, and has `probes` see to those that are dead."""
+    """Reports changes of health in `events`, and plans the probes of dead nodes, for one line."""
 
     def __init__(
         self, nodes: list[NodeRecord], probes: Probes, events: deque[Event], jitter: Callable[[], float]
@@ -131,21 +127,21 @@ class NodeWatch:
         self._jitter = jitter
 
     def failed(self, node: NodeRecord, now: float) -> None:
-        """Note that a transaction failed for want of its node's answer."""
+        """Handle a transaction that failed without a reply of its node."""
         before = node.health
         health.note_failure(node, now, self._jitter)
         self._report(node, before)
 
     def heard(self, node: NodeRecord, now: float) -> None:
-        """Note an answer of a node that was not known to be well."""
+        """Handle a reply of a node that was not UP."""
         before = node.health
         flaps = health.flaps(node, now)
         health.note_success(node, now)
         new, node.budgeted = node.budgeted, False
-        # That a new node replies says nothing of the others: else a client that names one again and again would have
-        # the budget filled faster for ever.
+        # A reply of a new node says nothing about the others. Otherwise a client that keeps naming one would have the
+        # budget filled faster forever.
         if before is DOWN and not (flaps or new):
-            # the others may be back too; a flapping node tells nothing about them
+            # The others may be back too. A flapping node says nothing about them.
             self._probes.budget.node_returned(now)
             for other in self._nodes:
                 if other.health is DOWN:
@@ -153,15 +149,15 @@ class NodeWatch:
         self._report(node, before)
 
     def is_worth_a_retry(self, transaction: Transaction) -> bool:
-        """Return False while the node fails, or for a poll of one never heard, which may not hold up a line's start."""
+        """Return False while the node fails, or for a poll of a node that never replied, which must not delay
+        start-up."""
         node = transaction.node
         if node.health is UNKNOWN:
             return transaction.poll is None
         return not node.failures and node.health is not DOWN
 
     def lower_max_reply_delay(self, transaction: Transaction, now: float) -> None:
-        """Put a node's maximum reply delay back to what it was, when an hour of prompt replies has passed since it was
-        raised."""
+        """Restore a node's maximum reply delay after an hour of prompt replies."""
         node = transaction.node
         if transaction.late:
             node.max_reply_delay_until = now + health.CALM_MAX_REPLY_DELAY

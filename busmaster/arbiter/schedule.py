@@ -1,10 +1,9 @@
-"""Polls on a fixed grid (R10), and the line time that an exchange takes.
+"""Polls on a fixed grid (R10), and the line time of an exchange.
 
-No call does more than a bounded amount of work, however many polls there are and however much they read: the loop
-that owns the line is never held up. What is left over is due at once, so that the owner calls again when it has seen
-to the line.
+Each call does a bounded amount of work, however many polls there are and however much they read, so that the event loop
+is never blocked. Remaining work is due immediately, after the loop has served the line.
 
-Where on its period a new poll meets the others least is found by a search that can be done a slice at a time.
+The phase at which a new poll overlaps least with the others is searched in slices.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from busmaster.contract.exchange import Exchange
 from busmaster.errors import InvalidCommand
 
 KINKS = 2000
-"""Bounds the work of choosing one phase: some 2000 of them cost a millisecond."""
+"""Limit for the work of choosing one phase. About 2000 kinks take a millisecond."""
 STRIDE = 64
-"""Kinks, or other polls, that are looked at between two places at which the search can be interrupted."""
+"""Kinks, or other polls, examined between two points at which the search can be interrupted."""
 MEETINGS = 8
-"""Two polls whose cycles take longer than so many common divisors of their periods meet anyway."""
+"""Two polls whose cycles take longer than this many common divisors of their periods overlap at any phase."""
 ROUNDING = 1e-7
 
 
 class Recurring(Protocol):
-    """What occupies the line for `cost` seconds from base + k x period on. All times are in seconds."""
+    """Occupies the line for `cost` seconds from base + k x period on. All times are in seconds."""
 
     @property
     def base(self) -> float: ...
@@ -41,21 +40,22 @@ class Recurring(Protocol):
 
 
 Pair = tuple[float, float, float, float]
-"""Of another poll: when it begins, for how long it lasts, both on a circle of a length, and how often it is there."""
+"""Another poll: its begin and its length on a circle, the length of the circle, and the poll's frequency on it."""
 
 
 def quietest_offset(
     poll: Recurring, others: Iterable[Recurring], now: float, stretch: float = 1.0
 ) -> Generator[int, None, float]:
-    """Find the seconds from `now`, below the period, at which this poll's cycles meet the others' least.
+    """Find the offset from `now`, in seconds below the period, at which this poll's cycles overlap least with the
+    others.
 
-    It is a generator that returns the offset; between, it yields how much it has looked at since, never much more than
-    STRIDE. All costs are multiplied by `stretch`. The time in which two polls want the line at once is a function of
-    their offset modulo the common divisor of their periods, made of straight pieces; the least sum of all of them lies
-    at one of the kinks. Among equals the earliest wins. The search ends early where there would be too many kinks.
+    A generator that returns the offset. In between it yields how much it has examined since, never much more than
+    STRIDE. All costs are multiplied by `stretch`. The time in which two polls need the line at once is a piecewise
+    linear function of their offset modulo the common divisor of their periods. The minimum of the sum lies at one of
+    the kinks. The earliest minimum is used. The search ends early if there are too many kinks.
     """
-    # Stretched over the time that there is: cycles that just fit one behind the other would meet as soon as one of them
-    # takes longer than it was calculated.
+    # Stretched over the available time: cycles that just fit one behind the other would overlap as soon as one of them
+    # takes longer than calculated.
     own = min(poll.cost * stretch, poll.period)
     pairs: list[Pair] = []
     divisors: dict[float, float] = {}
@@ -80,7 +80,7 @@ def quietest_offset(
 
 
 def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Generator[int, None, float]:
-    """Add up the bends of the sum of overlaps, sorted into so many pieces of the way, then walk it to its least."""
+    """Add up the slope changes of the overlap, sorted into `pieces` parts of the way, then walk to the minimum."""
     overlap = slope = at = 0.0
     bends: list[dict[float, float]] = [{} for _ in range(pieces)]
     looked_at = 0
@@ -100,7 +100,7 @@ def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Gene
     for piece in bends:
         for x in sorted(piece):
             if least <= ROUNDING:
-                return best  # it meets nobody there, and among equals the earliest wins
+                return best  # no overlap here, and the earliest minimum is used
             overlap += slope * (x - at)
             slope += piece[x]
             at = x
@@ -111,7 +111,7 @@ def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Gene
 
 
 def _kinks(pair: Pair, own: float, reach: float) -> Iterator[tuple[float, float]]:
-    """Yield where the overlap with one other poll changes its slope, from before 0 up to `reach`, and by how much."""
+    """Yield where the overlap with another poll changes its slope, from before 0 up to `reach`, and by how much."""
     begin, length, step, weight = pair
     shorter = min(own, length)
     first = begin - own - step * floor((begin + length) / step)
@@ -125,7 +125,7 @@ def _kinks(pair: Pair, own: float, reach: float) -> Iterator[tuple[float, float]
 
 
 def common_divisor(first: float, second: float) -> float:
-    """Return the greatest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
+    """Return the largest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
     first, second = max(first, second), min(first, second)
     least = 1e-4 * second
     while second > least:
@@ -134,19 +134,19 @@ def common_divisor(first: float, second: float) -> float:
 
 
 FILL = 0.9
-"""Cycles are spread over this share of the time when phases are chosen: the rest is left for what varies."""
+"""Cycles are spread over this share of the time when phases are chosen. The rest is reserve for variation."""
 SLICE = 128
-"""Units of work, each of about a microsecond, that are done in one call for polls that cannot start yet."""
+"""Units of work, of about a microsecond each, done in one call for polls that cannot start yet."""
 AT_ONCE = 32
-"""Cycles, and exchanges of cycles, that are started in one call."""
+"""Cycles, and exchanges of cycles, started in one call."""
 
 
 def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | None = None) -> float:
-    """Return the seconds of the line that one undisturbed attempt takes.
+    """Return the line time, in seconds, of one undisturbed attempt.
 
-    These are bytes both ways, and the wait before each reply step. `reply_time` is the node's measured time to its
-    first byte; where it is None, half of `late_after` is assumed. This is the one function by which merging, phases and
-    planning weigh exchanges.
+    It contains the bytes in both directions and the wait before each reply step. `reply_time`: the node's measured time
+    to its first byte. If it is None, half of `late_after` is assumed. Merging, phases and planning all use this
+    function.
     """
     sent = len(exchange.request) + exchange.closing
     timing = exchange.timing
@@ -162,7 +162,7 @@ def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | Non
 
 
 class Schedule:
-    """All polls of a line and when each is due next."""
+    """All polls of a line and their due times."""
 
     def __init__(self) -> None:
         self.polls: dict[Poll, None] = {}
@@ -180,9 +180,9 @@ class Schedule:
         self._left_over_at = inf
 
     def add(self, poll: Poll, now: float) -> None:
-        """Put a poll on it. One without a phase gets it when first due: those added together are placed jointly.
+        """Add a poll. Without a given phase it gets one when it is first due: polls added together are placed jointly.
 
-        Raises InvalidCommand for a poll that is, or was, on it.
+        Raises InvalidCommand for a poll that is or was on the schedule.
         """
         if poll.active or poll.cycles:
             raise InvalidCommand(f"poll group {poll.name!r} is or was running: make a new one")
@@ -192,7 +192,7 @@ class Schedule:
         self.prepare(poll, now)
 
     def prepare(self, poll: Poll, now: float) -> None:
-        """Do the poll's preparation: as far as one slice of work goes at once, where no other work waits."""
+        """Start the poll's preparation. One slice of work is done immediately, unless other work is pending."""
         if not poll.active:
             return
         if poll.preparation is None:
@@ -207,13 +207,13 @@ class Schedule:
         self._work_at = now if self.unplaced() else inf
 
     def remove(self, poll: Poll) -> None:
-        """Take a poll off the schedule: what is planned for it is left out when its turn comes."""
+        """Remove a poll. Its planned cycles are skipped."""
         if poll.active:
             poll.active = False
             poll.preparation = None
             del self.polls[poll]
-            # Its entry stays until its turn comes, and is swept only where what was removed outgrows what is left: a
-            # removal must not cost a walk over all polls.
+            # Its heap entry stays until it is due, and is removed in bulk if removed polls outnumber the others: a
+            # removal must not walk over all polls.
             if len(self._heap) > 2 * len(self.polls) + AT_ONCE:
                 self._heap = [entry for entry in self._heap if entry[2].active]
                 heapq.heapify(self._heap)
@@ -221,25 +221,25 @@ class Schedule:
                 self._work_at = inf
 
     def demand(self, poll: Poll) -> None:
-        """Run one cycle off the grid, with the next call of `begin`; of a poll that is being prepared, after that."""
+        """Run one cycle outside the grid, with the next call of `begin`. A poll in preparation runs it afterwards."""
         if poll.preparation is not None:
             poll.wanted = True
         else:
             self._demanded.append(poll)
 
     def next_due(self) -> float:
-        """Return when something is due next: a cycle, work, or what was left over; inf if nothing is."""
+        """Return when the next cycle, preparation or remaining work is due; inf if nothing is."""
         heap = self._heap
         while heap and not heap[0][2].active:
             heapq.heappop(heap)
         return min(heap[0][0] if heap else inf, self._work_at, self._left_over_at)
 
     def begin(self, now: float) -> list[Transaction]:
-        """Return the transactions, ready to be queued, of cycles that start now: at most AT_ONCE of them."""
+        """Return the transactions of the cycles that start now, ready to be queued: at most AT_ONCE."""
         due = self.release(now)
         while self._demanded:
             poll = self._demanded.popleft()
-            # What is due now does not run yet, and at most one cycle of a poll is under way (R10).
+            # Cycles that are due now have not started yet, and at most one cycle of a poll is running (R10).
             if poll.active and not poll.running and poll not in due:
                 poll.due = now
                 due.append(poll)
@@ -255,11 +255,12 @@ class Schedule:
         return begun
 
     def release(self, now: float) -> list[Poll]:
-        """Return the polls whose cycle starts now, `due` set. Cycles that could not start are counted missed."""
+        """Return the polls whose cycle starts now, with `due` set. Cycles that could not start are counted as
+        missed."""
         if self._work_at <= now:
             self.work(now)
         starting: list[Poll] = []
-        # Bounded, because a thousand cycles due at the same moment would block the loop of all other lines.
+        # Bounded: a thousand cycles due at the same moment would block the loop for all other lines.
         heap = self._heap
         for _ in range(AT_ONCE):
             if not heap or heap[0][0] > now:
@@ -272,11 +273,11 @@ class Schedule:
         return starting
 
     def _starts(self, poll: Poll, now: float) -> bool:
-        """Put the first poll of the heap, which is due, back where it is due next. Returns whether its cycle starts."""
-        # From the number of the period, never by adding periods up: sums of floats drift, and a grid must not (R10).
+        """Reinsert the first poll of the heap at its next due time. Returns True if its cycle starts."""
+        # From the number of the period and never by adding periods up: sums of floats drift, and a grid must not (R10).
         behind = floor((now - poll.base) / poll.period) - poll.number
         if poll.base + (poll.number + max(behind, 0) + 1) * poll.period <= now:
-            behind = max(behind, 0) + 1  # the quotient was rounded down across a cycle that the clock already stands on
+            behind = max(behind, 0) + 1  # The quotient was rounded down although the next cycle is due exactly now.
         if behind > 0:
             poll.number += behind
             poll.missed += 0 if poll.paused else behind
@@ -286,7 +287,7 @@ class Schedule:
         if poll.paused:
             return False
         # R10: a cycle that cannot start is missed and counted; it is never queued behind the running one.
-        if poll.remaining:  # its last cycle still runs: a second one beside it would only make both late
+        if poll.remaining:  # The last cycle is still running: a second one beside it would make both late.
             poll.missed += 1
             return False
         poll.due = due
@@ -295,7 +296,7 @@ class Schedule:
     # what cannot start yet
 
     def work(self, now: float) -> None:
-        """Do one slice. Short periods are placed first: what is left free then repeats, and longer periods find it."""
+        """Do one slice. Short periods are placed first: their free time repeats, and longer periods fit into it."""
         left = SLICE
         while left > 0 and self.unplaced():
             left -= self._prepare(now) if self._preparing else self._place(now)
@@ -303,7 +304,7 @@ class Schedule:
             self._work_at = inf
 
     def unplaced(self) -> bool:
-        """Return whether some poll cannot start yet: further calls of `work` or `release` prepare it, or place it."""
+        """Return True if a poll cannot start yet. Further calls of `work` or `release` prepare or place it."""
         while self._preparing and not self._preparing[0].active:
             self._preparing.popleft()
         while self._unplaced and not self._unplaced[0][2].active:
@@ -313,7 +314,7 @@ class Schedule:
         return bool(self._preparing or self._unplaced) or self._placing is not None
 
     def _prepare(self, now: float) -> int:
-        """Do one step of a poll's preparation. Returns the units that it took."""
+        """Do one step of a poll's preparation. Returns the units used."""
         poll = self._preparing[0]
         units = None if poll.preparation is None else next(poll.preparation, None)
         if units is not None:
@@ -335,7 +336,7 @@ class Schedule:
             self._demanded.append(poll)
 
     def _place(self, now: float) -> int:
-        """Do one step of placing a poll. Returns the units that it took."""
+        """Do one step of placing a poll. Returns the units used."""
         if self._placing is None:
             poll = heapq.heappop(self._unplaced)[2]
             self._placing = poll, now, self._search(poll, now)
@@ -343,18 +344,19 @@ class Schedule:
         try:
             return next(search)
         except StopIteration as found:
-            base = since + found.value  # the search may take several slices: its offset counts from when it began
+            base = since + found.value  # The search may take several slices; its offset counts from its start.
             poll.phase = (base - self._epoch) % poll.period
             self._start(poll, base, now)
             self._placing = None
             return 1
 
     def _search(self, poll: Poll, now: float) -> Generator[int, None, float]:
-        """Find where it meets least those that have their place, if all spread over the time that there is."""
-        # The offsets are spread over the time that the load needs: a line that is nearly idle would leave long gaps.
+        """Find the phase with the least overlap with the placed polls, spread over the time that the load needs."""
+        # Spread over the time that the load needs: on a nearly idle line there would be long gaps otherwise.
         load = 0.0
         others = []
-        for number, other in enumerate(tuple(self.polls), 1):  # a copy: polls come and go between two slices
+        # a copy: polls can be added and removed between two slices
+        for number, other in enumerate(tuple(self.polls), 1):
             load += other.cost / other.period
             if other.placed:
                 others.append(other)
@@ -363,7 +365,7 @@ class Schedule:
         return (yield from quietest_offset(poll, others, now, FILL / load if load else 1.0))
 
     def _start(self, poll: Poll, base: float, now: float) -> None:
-        """Begin the poll's grid with its first time from now on."""
+        """Start the poll's grid with its first due time from now on."""
         poll.placed = True
         poll.base = base + ceil((now - base) / poll.period) * poll.period
         poll.number = 0
@@ -371,9 +373,9 @@ class Schedule:
 
 
 def begin_cycle(poll: Poll, now: float) -> Iterator[Transaction]:
-    """Start a cycle of the poll: its transactions, each made fresh when it is taken, ready to be queued.
+    """Start a cycle of the poll. Yields its transactions, each reset when it is taken, ready to be queued.
 
-    A node that was never heard is read in BACKGROUND, so that absent nodes hold up nobody when a line starts.
+    A node that has never replied is read in BACKGROUND, so that absent nodes delay no other node at start-up.
     """
     # Members change between two cycles only, so that one cycle never mixes the old and the new ones.
     if poll.fresh is not None:
@@ -396,7 +398,7 @@ def _made_fresh(poll: Poll, now: float) -> Iterator[Transaction]:
 
 
 def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority = POLL) -> None:
-    """Give a poll its transactions, from its next cycle on."""
+    """Set the transactions of a poll, from its next cycle on."""
     fresh = tuple(members)
     for transaction in fresh:
         transaction.poll = poll

@@ -1,10 +1,9 @@
-"""The backlog of a line that several programs share, and that is held for sequences of requests (R9).
+"""The queues of a line that several programs share, and that can be held for a sequence of requests (R9).
 
-One class of the backlog on a line that several programs share: they take turns, by the line time that each has had.
-
-Whose requests have had the least of the line (weighed by its share) goes next: start-time fair queueing. Who comes
-begins with what the others have had, so that nobody saves up for a burst; who has just had a long exchange waits until
-the others that wait have had as much, but nobody is passed over more than twice by each of them (R9).
+In each class the clients take turns by the line time that each has used: start-time fair queueing. The client that has
+used the least, weighted by its share, goes next. A new client starts with the value of the others, so that no client
+saves up for a burst. A client that has just had a long exchange waits until the others that wait have had as much, but
+each of them passes it at most twice (R9).
 """
 
 from __future__ import annotations
@@ -22,12 +21,15 @@ from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.transaction import COMMAND, FAILING, QUEUED, URGENT, Priority, Transaction
 
 PASSED_BY_EACH = 2
-"""How often each of the others may go before a client that waits, whose share is 1."""
+"""How often each other client may go before a waiting client whose share is 1."""
 
 
 class _Turn:
-    """What one client has waiting in a class. `had`: seconds of the line, weighed; `passed`: how often others went
-    before it since it waits; `run`: how often it went since a lower class did."""
+    """The queue and the use of one client in a class.
+
+    `had`: line time in seconds, weighted. `passed`: requests of others sent since it has been waiting. `run`: its
+    requests sent since the last one of a lower class.
+    """
 
     __slots__ = ("client", "had", "passed", "queue", "run")
 
@@ -44,9 +46,9 @@ _Order: TypeAlias = "OrderedDict[LineClient, _Turn]"
 
 
 class Turns:
-    """A class whose clients take turns; `new_queue` makes the queue of each, and `own` is that of the line's owner.
+    """A class whose clients take turns. `new_queue` makes a client's queue; `own` is the queue of the line's owner.
 
-    `owner_first`: the owner takes no turns but goes first, so that no number of programs delays its safe state.
+    `owner_first`: the owner always goes first, so that other programs do not delay its safe state.
     """
 
     __slots__ = ("_had", "_new_queue", "_next", "_own", "_owner_first", "_turns", "aside", "live", "may_begin")
@@ -56,20 +58,21 @@ class Turns:
         self._own = own
         self._new_queue = new_queue
         self._turns: _Order = OrderedDict()
-        """In the order in which they had their last turns."""
+        """In the order of their last turns."""
         self._turns[OWN] = _Turn(OWN, own)
         self._next: _Turn | None = None
-        """Whose turn it is in any case, for it was given back."""
+        """Client that goes next regardless of usage, because its last request was put back."""
         self._had = 0.0
-        """What a client has had that comes now."""
+        """Initial use of a new client."""
         self.live = own.live
         self.may_begin: Callable[[Hold], bool] | None = None
-        """Whether the line can be held for a sequence; None: for each. Change it with `admit_sequences`."""
+        """Returns whether the line can be held for a sequence; None: always. Set with `admit_sequences`."""
         self.aside: list[Transaction] = []
-        """Requests of sequences that may not begin. They wait outside the queues: nothing waits behind them."""
+        """Requests of sequences that may not begin. They are kept outside the queues, so that no request waits behind
+        them."""
 
     def push(self, transaction: Transaction) -> None:
-        """Add a transaction at its place in its client's queue."""
+        """Add a transaction to its client's queue."""
         if self.may_begin is not None and self._stays_aside(transaction):
             self.aside.append(transaction)
             return
@@ -77,7 +80,7 @@ class Turns:
         self.live += 1
 
     def push_front(self, transaction: Transaction) -> None:
-        """Add a transaction before all others of its client."""
+        """Add a transaction at the front of its client's queue."""
         if self.may_begin is not None and self._stays_aside(transaction):
             self.aside.insert(0, transaction)
             return
@@ -85,27 +88,28 @@ class Turns:
         self.live += 1
 
     def give_back(self, transaction: Transaction) -> None:
-        """Put back what was popped last: it is the next to be popped."""
+        """Put back the transaction that was popped last. It is popped next."""
         self.push_front(transaction)
         self._next = self._of(turn_of(transaction.client))
 
     def keep_turn(self, client: LineClient) -> None:
-        """Have this client go next, if it waits: of what was popped last nothing was sent."""
+        """Give this client the next turn if it has requests, because the one popped last was not sent."""
         turn = self._turns.get(client)
         if turn is not None and turn.queue.live:
             self._next = turn
 
     def pop(self) -> Transaction:
-        """Take out the first of the client whose turn it is. Raises IndexError if nobody waits."""
+        """Remove and return the first transaction of the client whose turn it is. Raises IndexError if there is
+        none."""
         turn = self._chosen()
         self.live -= 1
-        # Moved to the end, so that clients with the same use take turns in the order of their last turns.
+        # Moved to the end, so that clients with equal use take turns in the order of their last turns.
         turn.passed = 0
         self._turns.move_to_end(turn.client)
         return turn.queue.pop()
 
     def pop_of(self, client: LineClient) -> Transaction | None:
-        """Take out the first of one client's, whose turn it is in any case, or return None."""
+        """Remove and return the first transaction of this client regardless of turns, or None."""
         turn = self._turns.get(client)
         if turn is None or not turn.queue.live:
             return None
@@ -113,7 +117,7 @@ class Turns:
         return turn.queue.pop()
 
     def pop_entitled(self, now: float, *, urgent: bool = False) -> Transaction | None:
-        """Take out the first of a client that has not used up its part of the line, or return None."""
+        """Remove and return the first transaction of a client that has not used its part of the line, or None."""
         entitled = [turn for turn in self._waiting() if turn.client.is_entitled(now, urgent)]
         if not entitled:
             return None
@@ -124,12 +128,13 @@ class Turns:
         return turn.queue.pop()
 
     def put_back(self, transaction: Transaction) -> None:
-        """Put back what was popped last, at the front of its client's queue; another client may go first."""
+        """Put the transaction popped last back at the front of its client's queue. Another client may go first."""
         self._put_back(transaction)
 
     def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few that suits, or return None; of the client whose turn it is, if it can."""
-        # The first few clients and the first few requests of each: a bounded search, whoever fills a queue.
+        """Remove and return the first suitable one among the first requests, or None. Prefers the client whose turn it
+        is."""
+        # The first clients and the first requests of each: the search is bounded, however full a queue is.
         for turn in sorted(self._waiting(), key=_had)[:LOOKED_AT]:
             found = turn.queue.pick(suits)
             if found is not None:
@@ -138,28 +143,28 @@ class Turns:
         return None
 
     def pick_of(self, client: LineClient, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few of one client's that suits, or return None."""
+        """Remove and return the first suitable one among this client's first requests, or None."""
         turn = self._turns.get(client)
         found = None if turn is None else turn.queue.pick(suits)
         self.live -= found is not None
         return found
 
     def discard(self, transaction: Transaction) -> None:
-        """Give up the place of a transaction that waits no longer; it is swept out later."""
+        """Release the place of a transaction that has left the queue. The entry is removed later."""
         if self._leave_aside(transaction):
             return
         self.live -= 1
         self._of(turn_of(transaction.client)).queue.discard(transaction)
 
     def remove(self, transaction: Transaction) -> None:
-        """Take out this transaction at once, wherever in its client's queue it is."""
+        """Remove this transaction immediately, wherever it is in its client's queue."""
         if self._leave_aside(transaction):
             return
         self._of(turn_of(transaction.client)).queue.remove(transaction)
         self.live -= 1
 
     def entries(self) -> Iterator[Transaction]:
-        """Return all that is in the queues, ended ones too, in no order; not what waits aside."""
+        """Return all entries of the queues, including ended ones, in any order, without those set aside."""
         return chain.from_iterable(turn.queue.entries() for turn in self._turns.values())
 
     def __iter__(self) -> Iterator[Transaction]:
@@ -168,7 +173,7 @@ class Turns:
     # sequences that may not begin
 
     def admit_sequences(self, may_begin: Callable[[Hold], bool] | None) -> None:
-        """Put aside what waits of sequences that may not begin from now on, and put back the others."""
+        """Set aside the requests of sequences that may not begin any more, and put back the others."""
         self.may_begin = may_begin
         before, self.aside = self.aside, []
         for transaction in reversed(before):
@@ -183,12 +188,12 @@ class Turns:
             self.aside += waiting
 
     def let_pass(self, transaction: Transaction) -> None:
-        """Put back one that waits aside: it may be sent, but its sequence does not begin with it."""
+        """Put back a request that was set aside. It may be sent, but does not begin its sequence."""
         if self._leave_aside(transaction):
             self._put_back(transaction)
 
     def _put_back(self, transaction: Transaction) -> None:
-        """Put back one that waited aside. Its client has waited all the time: it is not one that comes now."""
+        """Put back a request that was set aside. Its client was waiting all the time, so it does not count as new."""
         self._of(turn_of(transaction.client)).queue.push_front(transaction)
         self.live += 1
 
@@ -200,7 +205,7 @@ class Turns:
         return not self.may_begin(hold)
 
     def _leave_aside(self, transaction: Transaction) -> bool:
-        """Take a transaction out of those that wait aside. Returns whether it was one of them."""
+        """Remove a transaction from those set aside. Returns True if it was one of them."""
         place = next((place for place, one in enumerate(self.aside) if one is transaction), None)
         if place is None:
             return False
@@ -210,36 +215,36 @@ class Turns:
     # whose turn it is
 
     def waiting_of(self, client: LineClient) -> int:
-        """Return how many transactions of a client wait."""
+        """Return the number of a client's queued transactions."""
         turn = self._turns.get(client)
         aside = sum(turn_of(one.client) is client for one in self.aside) if self.aside else 0
         return aside if turn is None else turn.queue.live + aside
 
     def charge(self, client: LineClient, seconds: float) -> None:
-        """Note that a client has had the line for so long."""
+        """Charge line time to a client."""
         turn = self._turns.get(client)
         if turn is not None:
             turn.had += seconds / client.share
 
     def forget(self, client: LineClient) -> None:
-        """Keep nothing of a client that waits for nothing and will not come again."""
+        """Remove a client that has no queued requests."""
         turn = self._turns.pop(client, None)
         if turn is self._next:
             self._next = None
 
     def count_run(self, client: LineClient, turns: int = 1) -> None:
-        """Count that a client had so many turns while lower classes waited."""
+        """Count turns of a client while lower classes waited."""
         turn = self._turns.get(client)
         if turn is not None:
             turn.run += turns
 
     def begin_runs(self) -> None:
-        """Note that a lower class had a turn."""
+        """Reset the counts: a lower class had a turn."""
         for turn in self._turns.values():
             turn.run = 0
 
     def shortest_run(self) -> int:
-        """Return how many turns each of those who wait has had at least since a lower class had one."""
+        """Return the smallest number of turns that a waiting client has had since a lower class had one."""
         return min((turn.run for turn in self._waiting()), default=0)
 
     def _of(self, client: LineClient) -> _Turn:
@@ -252,13 +257,13 @@ class Turns:
         return [turn for turn in self._turns.values() if turn.queue.live]
 
     def _joined(self, transaction: Transaction) -> _Turn:
-        """Return the turn of a transaction's client, which waits from now on."""
-        if not self.live:  # nobody has waited for anybody: all are even
+        """Return the turn of a transaction's client, which starts to wait now."""
+        if not self.live:  # no client has waited for another, so all start equal
             self._had = 0.0
             for other in self._turns.values():
                 other.had = 0.0
         turn = self._of(turn_of(transaction.client))
-        # A client that was idle begins where the others are: it cannot save up turns for a burst.
+        # A client that was idle starts with the value of the others: it cannot save up turns for a burst.
         if not turn.queue.live:
             turn.passed = 0
             if turn.had < self._had:
@@ -283,7 +288,7 @@ class Turns:
 
 
 URGENT_RUN = 16
-"""Urgent exchanges of one program in a row after which a waiting lower class gets one slot. The line's owner has no
+"""Consecutive urgent exchanges of one program after which a waiting lower class gets one slot. The line's owner has no
 such limit."""
 
 
@@ -291,25 +296,26 @@ MOST_USED = 1.0
 """Seconds for which a client lets the owner go first at most, unless its last exchange alone costs more."""
 NEW_NODES_OWNER_TIME = 127.0
 """`owner_time` of all requests together to nodes that only clients named and that have never replied. Each can take a
-whole maximum reply delay, and one too many in a cycle of the owner makes it miss the next: so few go before a waiting
+whole maximum reply delay. One too many in a cycle of the owner makes it miss the next, so few go before a waiting
 owner."""
 MOST_BEFORE_URGENT = 8
-"""How many times its part behind one urgent exchange the owner may use at once. With less it would not get its part
-where many users have their first urgent exchanges; with more a stop would wait longer."""
+"""Maximum owner time behind one urgent exchange, as a multiple of its part. With less, the owner would not get its part
+if many users have their first urgent exchanges. With more, a stop would wait longer."""
 HELD_TIME = 2.0
-"""How many times as long as a sequence of a client held the line, while the owner waited, the owner then has before
-another such sequence begins; times the role's `owner_time`. Twice, since polls that are due meanwhile are missed, and
-the owner cannot use the time between its cycles to catch up: with once as long, a line that is 75 % busy had 3/7."""
+"""Factor for the time that the owner gets after a client's sequence has held the line while the owner waited, before
+another such sequence begins; multiplied by the role's `owner_time`. It is 2 because polls that become due meanwhile are
+missed, and the owner cannot use the time between its cycles to catch up. With 1, a line that is 75 % busy kept 3/7."""
 LEAST_PAUSE = 1e-6
-"""Seconds below which no sequence waits."""
+"""Pauses shorter than this, in seconds, are skipped."""
 LONGEST_PAUSE = 8.0
-"""How many times that, in seconds, until a sequence may begin in any case, whatever other requests of the role take."""
+"""Factor for the longest pause: after this many times the pause, a sequence may begin whatever other requests of the
+role use."""
 MOST_LEFT = 64
-"""Accounts of users without a connection that are kept. The oldest is discarded first."""
+"""Maximum number of accounts kept for users without a connection. The oldest is discarded first."""
 
 
 class SharedBacklog(Backlog):
-    """A backlog in each of whose classes clients take turns. `hold` is for whom the line is held."""
+    """Queues in which clients take turns in each class. `hold` is the sequence for which the line is held."""
 
     __slots__ = (
         "_accounts",
@@ -334,42 +340,42 @@ class SharedBacklog(Backlog):
     )
 
     def __init__(self, before: Backlog, writes: Writes, deadlines: Deadlines) -> None:
-        """Take over what waits in the backlog that a line had as long as it was its owner's alone."""
+        """Take over the queued requests of a line that only its owner used so far."""
         super().__init__()
         self.hold: Hold | None = None
         self._members: dict[float, int] = {}
-        """How many users are connected with each `owner_time` but 0."""
+        """Number of connected users for each `owner_time` other than 0."""
         self._roles: dict[float, Account] = {}
-        """The account of all clients together with each `owner_time` but 0."""
+        """Common account of all clients for each `owner_time` other than 0."""
         self._accounts: dict[tuple[float, Hashable], Account] = {}
-        """By `owner_time` and user. One per user and not per connection, or a user with many connections would have
-        most of what the users have together."""
+        """By `owner_time` and user. One account per user and not per connection: otherwise a user with many connections
+        would get most of the users' line time."""
         self._left_accounts: dict[tuple[float, Hashable], Account] = {}
         """Accounts of users without a connection. A user that connects again takes its account over: otherwise a
         program with a connection for each request would always be entitled."""
         self._new_nodes: LineClient | None = None
         self._before_urgent = 0.0
-        """Seconds of the line that the owner may use before the next urgent request of a client that has used its
-        part. Below 0, the owner had more than that."""
+        """Seconds of line time that the owner may use before the next urgent request of a client that has used its
+        part. Negative if the owner had more."""
         self._held_by: Account | None = None
-        """The role whose sequence held the line last, until its next one may begin."""
+        """The role whose sequence held the line last, until its next sequence may begin."""
         self._pause = 0.0
-        """Seconds that the line's owner is to have before that."""
+        """Seconds of line time that the owner gets before that."""
         self._pause_ends = inf
-        """When it ends, whatever the owner has had."""
+        """Latest end of that pause, whatever the owner has used."""
         self._owner_waited = False
-        """Whether the owner had something waiting when the line was given away last."""
+        """True if the owner had a queued request when the line was last given to a client."""
         self._begins = False
-        """Whether what was taken out last is of a sequence that may hold the line."""
+        """True if the request popped last belongs to a sequence that may hold the line."""
         self._writes = writes
         self._deadlines = deadlines
         self._streak, self._rotated = before._streak, before._rotated
         self._begin(before)
         self._last: Transaction | None = None
-        """What was taken out last, when it had been sent so often:"""
+        """The request popped last, and in `_attempts` its number of attempts at that time."""
         self._attempts = 0
         self._payer: tuple[Turns, LineClient] | None = None
-        """Who pays for the time of the line, and in which class, ever since:"""
+        """The class and the client that are charged for the line time since `_since`."""
         self._since = -inf
 
     def _begin(self, before: Backlog) -> None:
@@ -387,13 +393,14 @@ class SharedBacklog(Backlog):
         return super().__len__() + sum(len(turns.aside) for turns in self._turns)
 
     def waiting_of(self, priority: Priority, client: LineClient | None) -> int:
-        """Return how many transactions of this class wait that are this client's."""
+        """Return the number of queued transactions of this class and client."""
         return self._turns[priority].waiting_of(turn_of(client))
 
     # what goes next
 
     def pop(self, now: float) -> Transaction | None:
-        """Take out the next to go at the time `now`, or return None: of those of a hold alone, as long as one lasts."""
+        """Remove and return the next transaction at the time `now`, or None. While a sequence holds the line, only its
+        requests."""
         self.note_time(now)
         urgent, *lower = self._turns
         # Only the urgent requests of clients yield; those of the owner go first without limit.
@@ -409,15 +416,15 @@ class SharedBacklog(Backlog):
         return self._taken(transaction, now)
 
     def _entitled(self, transaction: Transaction, now: float) -> Transaction:
-        """Return the same, or what goes first because the client of this one has used up its part of the line."""
+        """Return the transaction, or another one if the client of this one has used its part of the line."""
         urgent = transaction.priority is URGENT
         if turn_of(transaction.client).is_entitled(now, urgent):
             return transaction
         if not urgent:
             other = next((found for turns in self._turns if (found := turns.pop_entitled(now)) is not None), None)
         elif (other := self._turns[URGENT].pop_entitled(now, urgent=True)) is None and self._before_urgent > 0:
-            # Urgent requests are not held back until their client is entitled: a stop passes. They alternate with the
-            # owner, by time and not by number, or long writes would take most of the line from short polls.
+            # Urgent requests do not wait until their client is entitled: a stop passes. They alternate with the owner
+            # by time and not by number, or long writes would take most of the line from short polls.
             other = self._pop_lower(now)
         if other is None:
             return transaction
@@ -425,7 +432,7 @@ class SharedBacklog(Backlog):
         return other
 
     def _pop_lower(self, now: float) -> Transaction | None:
-        """Take out what goes next below URGENT, if a client that has not used its part waits there."""
+        """Remove and return the next transaction below URGENT, if an entitled client has one."""
         self._urgent_yields = True
         transaction = super().pop(now)
         if transaction is None or turn_of(transaction.client).is_entitled(now, urgent=False):
@@ -444,13 +451,13 @@ class SharedBacklog(Backlog):
                 return transaction
             urgent.put_back(transaction)
             return other
-        if now >= self._deadlines.hold:  # it ends next
+        if now >= self._deadlines.hold:  # the sequence ends next
             return None
         of_hold = (turns.pop_of(hold) for turns in lower)
         return next((transaction for transaction in of_hold if transaction is not None), None)
 
     def _write_before(self, transaction: Transaction) -> Transaction | None:
-        """Return a write that has to go before a read with which a sequence begins: once it has begun, it could not."""
+        """Return a write that must precede a read that begins a sequence: it could not be sent during the sequence."""
         hold = transaction.client
         if not isinstance(hold, Hold) or hold.holds or transaction.writes:
             return None
@@ -460,7 +467,7 @@ class SharedBacklog(Backlog):
         return write
 
     def _taken(self, transaction: Transaction | None, now: float) -> Transaction | None:
-        """Note what goes next, and who pays for it."""
+        """Record the transaction that is sent next and the client that is charged."""
         if transaction is None:
             self._last = None
             hold = self.hold
@@ -490,17 +497,18 @@ class SharedBacklog(Backlog):
             urgent.count_run(client)
 
     def restore(self, transaction: Transaction) -> None:
-        """Put back what was popped last: it is the next to be popped, and its class keeps its turn."""
+        """Put back the transaction that was popped last. It is popped next, and its class keeps its turn."""
         self._streak, self._rotated = self._streak_before, self._rotated_before
         transaction.phase = QUEUED
         self._turns[transaction.priority].give_back(transaction)
 
     def keep_turn(self, transaction: Transaction) -> None:
-        """Note that what was popped last is not sent: its client is the next to have its turn."""
+        """Note that the transaction popped last is not sent. Its client has the next turn."""
         self._turns[transaction.priority].keep_turn(turn_of(transaction.client))
 
     def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few of a class that suits, or return None; the others keep their places."""
+        """Remove and return the first suitable one among the first of a class, or None. The others keep their
+        places."""
         turns, hold = self._turns[priority], self.hold
         if hold is None or priority is URGENT:
             found = turns.pick(lambda one: self._write_before(one) is None and suits(one))
@@ -509,7 +517,7 @@ class SharedBacklog(Backlog):
         return found and self._taken(found, self._since)
 
     def take(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out one that suits, of whatever class, or return None: for what has to be asked now in any case."""
+        """Remove and return a suitable transaction of any class, or None. For a request that must be sent now."""
         hold = self.hold
 
         def may(one: Transaction) -> bool:
@@ -521,7 +529,7 @@ class SharedBacklog(Backlog):
     # holds
 
     def note_time(self, now: float) -> None:
-        """Have whoever had the line until now pay for it; a sequence of which a request was sent has begun."""
+        """Charge the line time until now. A sequence begins when its first request has been sent."""
         self._begin_hold()
         if self._payer is not None:
             turns, client = self._payer
@@ -537,7 +545,7 @@ class SharedBacklog(Backlog):
         self._since = now
 
     def _count_pause(self, now: float) -> None:
-        """Count what the owner is to have before the next sequence begins, and end the pause when it has had that."""
+        """Count the line time that the owner gets before the next sequence, and end the pause when it has had it."""
         time, hold = now - self._since, self.hold
         payer = None if self._payer is None else self._payer[1]
         if payer is not None and payer.role is self._held_by and (self._owner_waited or self._owner_waits()):
@@ -546,8 +554,8 @@ class SharedBacklog(Backlog):
             return
         if hold is not None:
             return
-        # As the owner has nothing to send, or its request was on the wire.
-        # Counted in time and not in exchanges: polls may be short and sequences long.
+        # The owner has nothing to send, or its request was on the wire. Counted in time and not in exchanges: polls may
+        # be short and sequences long.
         self._pause -= time
         if self._pause <= LEAST_PAUSE or now >= self._pause_ends:
             self._end_pause()
@@ -558,21 +566,21 @@ class SharedBacklog(Backlog):
         self._admit_sequences()
 
     def _admit_sequences(self) -> None:
-        """Have each class put aside the sequences that may not begin now."""
+        """Update in each class which sequences are set aside."""
         waits = self.hold is not None or self._held_by is not None
         for turns in self._turns:
             turns.admit_sequences(self._may_begin if waits else None)
 
     def _may_begin(self, hold: Hold) -> bool:
-        """Return whether the line can be held for a sequence that does not hold it."""
+        """Return True if the line can be held for a sequence that does not hold it yet."""
         return self.hold is None and hold.client.role is not self._held_by
 
     def let_pass(self, transaction: Transaction) -> None:
-        """Have one that waits be sent although its sequence may not begin: a stop waits behind it."""
+        """Send a transaction although its sequence may not begin: a stop is queued behind it."""
         self._turns[transaction.priority].let_pass(transaction)
 
     def _use(self, client: LineClient, now: float) -> None:
-        """Note until when a client has used its part of the line: all of its `owner_time` have equal parts."""
+        """Update until when a client has used its part. All users with the same `owner_time` have equal parts."""
         cost, hold = 1 + client.owner_time, self.hold
         used = (now - self._since) * cost
         held = (now - hold.began) * cost if hold is not None and hold.client is client else 0.0
@@ -581,15 +589,15 @@ class SharedBacklog(Backlog):
         self._charge(client.account, used * members, held * members, now)
 
     def _charge(self, account: Account, used: float, held: float, now: float) -> None:
-        # Bounded, since what it used while the line was idle took nothing from the others; but more than one exchange
-        # costs, or a client would be entitled again as soon as all others had their turns. A sequence is charged whole,
-        # in however many pieces it has been counted.
+        # Bounded, because line time used while the line was idle took nothing from others. The bound is more than one
+        # exchange costs, or a client would be entitled again as soon as all others had their turns. A sequence is
+        # charged whole, however many pieces it was counted in.
         most = now + max(2 * used, held, MOST_USED)
         until = min(max(account.used_until, self._since) + used, most)
         account.used_until = max(account.used_until, until)
 
     def _delay_urgent(self, client: LineClient, now: float) -> None:
-        """Give the owner its time behind an urgent exchange. What it had beyond its time before is taken off."""
+        """Give the owner its time behind an urgent exchange, minus what it had in excess before."""
         # Bounded: a stop of a client that has used its part waits no longer than this, whatever others have used.
         time = client.owner_time * (now - self._since)
         self._before_urgent = min(self._before_urgent + time, MOST_BEFORE_URGENT * time)
@@ -616,9 +624,9 @@ class SharedBacklog(Backlog):
         self._deadlines.hold = self._since + hold.longest
 
     def end_hold(self, hold: Hold, now: float) -> list[Transaction]:
-        """Hold the line no longer for a sequence. Returns what of it waits, which is not sent any more.
+        """End a sequence. Returns its queued requests, which are not sent any more.
 
-        One lower exchange goes next, if any waits: sequences one after the other leave nobody out.
+        One exchange of a lower class goes next, if one is queued, so that consecutive sequences do not starve it.
         """
         self.note_time(now)
         left = list(self._left(hold))
@@ -627,7 +635,7 @@ class SharedBacklog(Backlog):
                 self.discard(transaction, FAILING)
             else:
                 transaction.phase = FAILING
-        # A sequence of which nothing was sent never held the line: it ends without a pause for others.
+        # A sequence without any sent request never held the line, so it ends without a pause.
         if hold.holds:
             self.hold = None
             self._deadlines.hold = inf
@@ -644,13 +652,13 @@ class SharedBacklog(Backlog):
         return left
 
     def _begin_pause(self, now: float) -> None:
-        """Have other sequences wait until the owner has had its part of the line."""
+        """Set aside other sequences until the owner has had its part of the line."""
         if self._held_by is not None:
             self._pause_ends = now + LONGEST_PAUSE * self._pause
             if self._pause <= LEAST_PAUSE and self._last is None:
                 self._end_pause()
                 return
-            # With an exchange of the sequence on the wire, its end says whether there is a pause.
+            # If an exchange of the sequence is on the wire, its end decides whether there is a pause.
         self._admit_sequences()
 
     def _left(self, hold: Hold) -> Iterator[Transaction]:
@@ -659,7 +667,7 @@ class SharedBacklog(Backlog):
         yield from self._writes.parked_of(hold.node, hold)
 
     def admit(self, client: LineClient, owner_time: float) -> None:
-        """Count a client among those of this `owner_time` from now on."""
+        """Count a client among those with this `owner_time`."""
         self._dismiss(client)
         client.owner_time, client.account = owner_time, Account()
         client.role = client.account
@@ -675,7 +683,7 @@ class SharedBacklog(Backlog):
         client.account = account
 
     def new_nodes(self) -> LineClient:
-        """Return the client that has the requests of all clients to new nodes, until such a node replies."""
+        """Return the client that stands for all requests to new nodes until they reply."""
         client = self._new_nodes
         if client is None:
             client = self._new_nodes = LineClient()
@@ -691,29 +699,29 @@ class SharedBacklog(Backlog):
             return
         key, owner_time = _account_of(client), client.owner_time
         del self._accounts[key]
-        if client.user is not None:  # the client itself comes no more
+        if client.user is not None:  # a client without a user never connects again
             self._left_accounts[key] = account
             if len(self._left_accounts) > MOST_LEFT:
-                # Bounded: a client that connects under many users would otherwise fill the memory.
+                # R12: a client that connects under many users would otherwise fill the memory.
                 del self._left_accounts[next(iter(self._left_accounts))]
         self._members[owner_time] -= 1
         if not self._members[owner_time]:
             del self._members[owner_time]
 
     def forget(self, client: LineClient) -> None:
-        """Keep nothing of a client that has gone, and has nothing waiting."""
+        """Remove a client that has disconnected and has no queued requests."""
         self._dismiss(client)
         for turns in self._turns:
             turns.forget(client)
 
     def drain(self) -> list[Transaction]:
-        """Take out everything that waits, in order of class; the backlog is empty afterwards."""
+        """Remove and return all transactions, in order of class."""
         drained = [transaction for turns in self._turns for transaction in turns]
-        # New queues: the old ones belong to what is being failed in pieces.
+        # New queues: the old ones still hold the transactions that are failed in batches.
         empty = Backlog()
         empty.queues = new_queues()
         self._begin(empty)
-        self._begin_hold()  # before what is known of the request that has left is forgotten
+        self._begin_hold()  # before `_last` is cleared
         self._payer = self._last = None
         return drained
 

@@ -1,4 +1,4 @@
-"""What somebody is told who taps a line: every byte, whose exchange it belongs to, and how each exchange ended."""
+"""What a tap of a line receives: every byte, the attempt it belongs to, and how each attempt ended."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from busmaster.contract.timing import Timings
 
 
 class Verdict(enum.Enum):
-    """How one attempt ended: what the arbiter made of it, whether or not it is tried again."""
+    """How one attempt ended, whether or not it is retried."""
 
     OK = "ok"
     NO_REPLY = "no reply"
     GARBLED = "garbled"
     REFUSED = "refused"
     AMBIGUOUS = "ambiguous"
-    """A good answer came and was not believed: it may have been another request's (R15)."""
+    """A correct reply was not delivered, because it could belong to another request (R15)."""
     SPOILT = "spoilt"
-    """What came was not read at all: the port, or when and how it came, said that it is no answer."""
+    """The bytes were not parsed: the port's report or their timing shows that they are not a reply."""
     CUT_OFF = "cut off"
-    """The line was lost, or closed, under it."""
+    """The line was lost or closed during the attempt."""
 
 
 class Attempt:
-    """One attempt at one command, which is one exchange on the wire. Nothing of it changes once its `verdict` is set.
+    """One attempt at one command, which is one exchange on the wire. Immutable once its `verdict` is set.
 
-    `protocol` is the name of its node's protocol. `transaction` numbers the requests of a line from 1, each cycle of a
-    poll anew, and `number` the attempts at one of them. `purpose` says why it is asked, where no caller asks: a poll's
-    name, "probe" or "check" (R15). `quiet_time` is for how many seconds the line had resynchronised, ever, when it
-    began.
+    `protocol`: name of its node's protocol. `transaction`: number of the request on this line, from 1; each cycle of a
+    poll has a new one. `number`: number of the attempt. `purpose`: for a request without a caller, the poll's name,
+    "probe" or "check" (a sync read, R15). `quiet_time`: total seconds of resynchronisation of the line when it began.
     """
 
     __slots__ = (
@@ -72,22 +71,22 @@ class Attempt:
         self.quiet_time = quiet_time
         self.verdict: Verdict | None = None
         self.result: Any = None
-        """The value of one that is OK, else what was wrong, in words."""
+        """The value if it is OK, else the cause as text."""
         self.late = False
-        """Its reply began after `late_after`, and is accepted."""
+        """Its reply began after `late_after` and was accepted."""
         self.heard = True
-        """Somebody still waits for it: False once its caller has gone."""
+        """False if its caller was cancelled."""
         self.ended_at = -inf
 
     def end(self, verdict: Verdict, result: Any, now: float) -> None:
-        """Say how the attempt ended."""
+        """Set the result of the attempt."""
         self.result = result
         self.ended_at = now
-        self.verdict = verdict  # last: whoever looks from another thread finds the rest
+        self.verdict = verdict  # last, so that another thread that sees the verdict sees the result too
 
     @property
     def request(self) -> bytes:
-        """What it says first: every attempt at a command says the same."""
+        """The request bytes. They are the same for every attempt at a command."""
         return self.command.open(self.address, self.timings).request
 
     def __str__(self) -> str:
@@ -98,21 +97,22 @@ class Attempt:
 
 
 class Tap(Protocol):
-    """Sees what passes on a line (a capture). Must not block, nor raise. Times are of the clock of the line's owner.
+    """Receives the traffic of a line (for example for a capture). Must not block or raise. Times are on the owner's
+    clock.
 
-    `attempt` is what is on the wire: None while nothing is asked. What is transmitted then closes the attempt before,
-    or answers what came unexpected; with a new attempt its request comes last, behind what closes the one before. What
-    is received with none is nobody's answer.
+    `attempt` is the attempt on the wire, or None between requests. Bytes transmitted without one close the previous
+    attempt or acknowledge unexpected bytes. With a new attempt, its request comes last, behind the bytes that close the
+    previous one. Bytes received without one are unexpected.
     """
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        """Hear of bytes when they have been handed to the port."""
+        """Process bytes that have been handed to the port."""
         ...
 
     def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        """Hear of bytes as they come, an echo too, before anything is made of them."""
+        """Process received bytes, echo included, before the arbiter does."""
         ...
 
     def attempted(self, attempt: Attempt, /) -> None:
-        """Hear how an attempt has ended: perhaps after the next one was transmitted."""
+        """Process an attempt that has ended, possibly after the next one was transmitted."""
         ...

@@ -1,5 +1,7 @@
-"""Transactions: a command with its caller, priority and retries; polls, which run theirs once a period; and the errors
-with which they end: a fresh one each, which says which node, which command and how often.
+"""Transactions (a command with its caller, priority and retries), polls that run theirs once per period, and their
+errors.
+
+Each failed transaction gets an error instance of its own, which contains the node, the command and the attempts.
 """
 
 from __future__ import annotations
@@ -19,11 +21,11 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NoReply, NotStarted, WriteUnconfirmed
 
 LONGEST_PATIENCE = 10.0
-"""Seconds after which a poll's cycle goes before those that came later, however long its period is."""
+"""Longest time in seconds from a cycle's due time to its deadline, however long the poll's period is."""
 
 
 class Priority(enum.IntEnum):
-    """The classes of R9, strict: a lower number goes first."""
+    """The classes of R9. A lower number goes first."""
 
     URGENT = 0
     COMMAND = 1
@@ -35,9 +37,9 @@ URGENT, COMMAND, POLL, BACKGROUND = Priority
 
 
 class Phase(enum.Enum):
-    """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7).
+    """State of a transaction. A write is PARKED while an earlier write to its node is unfinished (R7).
 
-    What is FAILING waited for a line that can no longer be used: it ends next, and is never sent (R13).
+    FAILING: the line became unusable while it was queued. It ends next and is never sent (R13).
     """
 
     IDLE = "idle"
@@ -50,11 +52,11 @@ class Phase(enum.Enum):
 
 IDLE, QUEUED, PARKED, ON_WIRE, FAILING, ENDED = Phase
 LEFT = "the line is being left: only its safe state is still written"
-"""Why a write is superseded that is not of the safe state, once that is being sent."""
+"""Reason for superseding other writes while the safe state is sent."""
 
 
 class Timeline(NamedTuple):
-    """Why it took as long as it did. Times are the bus's clock, in seconds; None for what did not happen."""
+    """When the steps of a request happened, on the bus's clock in seconds; None for steps that did not happen."""
 
     queued: float
     started: float | None
@@ -63,13 +65,13 @@ class Timeline(NamedTuple):
     last_byte: float | None
     attempts: int
     exchanges_ahead: int
-    """Exchanges of others that went first while it waited."""
+    """Exchanges of other requests that went first while it was queued."""
     quiet_time_ahead: float
-    """Seconds of that wait in which the line was resynchronising after somebody's uncertain outcome."""
+    """Seconds of that wait in which the line was resynchronising."""
 
 
 class Transaction:
-    """One command on its way. Made by the caller, changed by the arbiter alone, ended exactly once (R8)."""
+    """One command in progress. Created by the caller, changed only by the arbiter, ended exactly once (R8)."""
 
     __slots__ = (
         "attempts",
@@ -114,29 +116,30 @@ class Transaction:
 
     queued: float
     deadline: float
-    """By which it wants to be answered."""
+    """Deadline used for earliest-deadline-first ordering."""
     exchanges_ahead: int
     quiet_time_ahead: float
     late: bool
     """The reply to its last attempt began after `late_after`."""
     overdue: bool
-    """It began after its window even."""
-    # Those above are set when it is queued, or sent, and not before; and a string behind a statement of a function is
-    # an instruction that does nothing. Each costs, and this is done for every request.
+    """That reply began after the reply window."""
+    # The attributes above are set when it is queued or sent, and not in `__init__`. The docstrings are here because a
+    # string inside a function is an instruction that does nothing. Both cost time for every request.
     finish_by: float
-    """Its caller waits no longer, and nothing is sent from then on."""
+    """The caller stops waiting at this time, and nothing is sent from then on."""
     client: LineClient | None
-    """Whose request it is; None is the program that owns the line."""
+    """The client that sent the request; None: the program that owns the line."""
     check: bool
-    """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
+    """A sync read, sent only to prove that replies match requests (R15). It has no caller and is excluded from
+    statistics."""
     touches: object
-    """What a write changes, for its owner to know."""
+    """What a write changes. Used by the owner only."""
     stop: bool
-    """It stops its node, or is of its safe state: writing it once is as good as writing it twice."""
+    """It stops its node or belongs to the safe state: sending it once is as good as sending it twice."""
     stops_alike: tuple[Transaction, ...]
-    """Equal stops that waited when this one was sent, and get its outcome."""
+    """Equal stops that were queued when this one was sent, and get its outcome."""
     unsure: bool
-    """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
+    """An attempt with an unknown outcome was sent, so it may have been carried out (R7)."""
 
     def __init__(
         self,
@@ -160,13 +163,13 @@ class Transaction:
         self.writes = writes = command.writes
         self.idempotent = command.idempotent if idempotent is None else idempotent
         if probe or (writes and not self.idempotent):
-            self.retries = 0  # whatever number was given: that alone does not make a write repeatable
+            self.retries = 0  # R7: a number of retries alone does not make a write repeatable
         else:
             self.retries = node.retries if retries is None else retries
         self.start_by = start_by
         self.finish_by = finish_by
         if finish_by < inf:
-            # a start_by is met by what starts right at it, but at finish_by nothing is sent any more
+            # A request may start exactly at its start_by, but nothing is sent at or after finish_by.
             self.start_by = min(start_by, nextafter(finish_by, -inf))
         self.tag = tag
         self.poll = poll
@@ -181,7 +184,7 @@ class Transaction:
         self.reset()
 
     def reset(self) -> None:
-        """Make it fresh for its (next) run: a poll's transaction lives as long as the poll."""
+        """Reset it for its next run. A poll's transactions live as long as the poll."""
         # `queued`, `deadline` and the counts of what went ahead are set anew whenever it is queued.
         self.phase = IDLE
         self.attempts = 0
@@ -196,22 +199,22 @@ class Transaction:
         self.started = self.first_byte = self.last_byte = self.ended_at = -inf
 
     def timings(self) -> Timings:
-        """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""
-        # AT_LAST unless a case below says otherwise: the last attempt uses the documented window (R15).
+        """Return the times for the next attempt. A learned window is used only for a read that can be repeated."""
+        # AT_LAST unless a case below changes it: the last attempt uses the documented window (R15).
         node, hurry = self.node, AT_LAST
         if node.learning is None:
             return node.timings
-        # A check is made as a probe is, but nobody waits for it: a learned window will do.
+        # A sync read is created as a probe, but has no caller, so a learned window is enough.
         if node.failures or node.health is UNKNOWN or node.health is DOWN or self.probe != self.check:
             hurry = NEVER
         elif self.writes and node.profile.acks_are_commands:
-            hurry = NEVER  # a late ACK would make whichever drive is asked meanwhile say something more
+            hurry = NEVER  # a late ACK would make the addressed drive send its next value
         elif self.check or (self.retried < self.retries and not self.writes and self.retried < 2):
             hurry = AGAIN if self.retried else AT_FIRST
         return node.learning.timings(self.command, node.timings, hurry)
 
     def timeline(self) -> Timeline:
-        """Return when its steps happened, None for those that did not, and what went ahead of it."""
+        """Return when its steps happened and which exchanges went ahead of it."""
 
         def known(time: float) -> float | None:
             return None if time == -inf else time
@@ -228,12 +231,11 @@ class Transaction:
 
 
 class Poll:
-    """Transactions that are run once a period, on the grid base + k x period.
+    """Transactions that are run once per period, on the grid base + k x period.
 
-    `cost` is the line time of one cycle in seconds, for the choice of phases. `results` are its transactions: they
-    hold the outcome of the last cycle until the next one starts. `preparation`, if there is one, is work that gives it
-    its transactions and its cost: each step yields how many units it took, of about a microsecond. A poll that was
-    removed is not added again.
+    `cost`: line time of one cycle in seconds, used to choose phases. `results`: its transactions, which hold the
+    outcome of the last cycle until the next one starts. `preparation`: optional work that creates the transactions and
+    the cost; each step yields the units it took, of about a microsecond. A removed poll cannot be added again.
     """
 
     __slots__ = (
@@ -293,7 +295,7 @@ class Poll:
 
     @property
     def running(self) -> bool:
-        """Whether its last cycle still runs."""
+        """True while its last cycle is running."""
         return self.remaining > 0
 
     def next_due(self) -> float:
@@ -301,7 +303,7 @@ class Poll:
         return self.base + self.number * self.period
 
 
-TOO_LATE = "allow more time, or see bus.statistics(), or busmaster plan, for what holds it up"
+TOO_LATE = "allow more time; bus.statistics() and busmaster plan show what delays it"
 
 HELD = "flow control holds the port or the adapter is stuck; check CTS, replug"
 
@@ -312,7 +314,7 @@ def make_error(kind: type[BusError], what: str, transaction: Transaction, hint: 
 
 
 def name_error(error: BusError, transaction: Transaction) -> BusError:
-    """Say in an error which node, which command and how often, and return it."""
+    """Add the node, the command and the number of attempts to an error, and return it."""
     error.name(transaction.node)
     error.command = str(transaction.command)
     error.attempts = transaction.attempts
@@ -320,11 +322,11 @@ def name_error(error: BusError, transaction: Transaction) -> BusError:
 
 
 def too_late(transaction: Transaction, now: float, *, held: bool = False) -> BusError:
-    """Return the error of a transaction whose caller's time is over: whether it was sent is what the error says.
+    """Return the error for a transaction whose caller's time has passed. It reports whether the request was sent.
 
-    `held`: the port has not sent all that it was handed, this request or the one before it, and may still do.
+    `held`: the port has not sent all bytes of this or the previous request, and may still send them.
     """
-    # In the error, because "too late" alone does not tell whether the line or the node was slow.
+    # In the error, because "too late" alone does not show whether the line or the node was slow.
     waited = (now - transaction.queued) * 1000
     if not transaction.attempts:
         what = f"not sent within its time: it waited {waited:.0f} ms for the line"
@@ -338,8 +340,8 @@ def too_late(transaction: Transaction, now: float, *, held: bool = False) -> Bus
 
 
 def hold_ended(transaction: Transaction, hold: Hold) -> BusError:
-    """Return the error of what a sequence still waits for when the line is no longer held for it."""
-    over = f"the {hold.longest:g} s for which the line was held for it are over"
+    """Return the error for the remaining requests of a sequence whose time has passed."""
+    over = f"the sequence has ended: its {hold.longest:g} s have passed"
     if transaction.attempts:
         return make_error(NoReply, f"not answered, and {over}", transaction)
     return make_error(HoldEnded, over, transaction)

@@ -1,4 +1,4 @@
-"""Whether an answer is believed, and what an attempt that ends leaves overdue (R15)."""
+"""Decides whether a reply is delivered, and which replies are overdue after an attempt (R15)."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.unexpected import QUIET, UnexpectedBytes
 from busmaster.contract.exchange import Done
 
-TWO_ANSWERS = "two answers came where one was due"
-TOO_EARLY = "bytes came before the request was out"
-COLLIDED = "the echo differs from what was sent: a collision, or an adapter without echo"
+TWO_ANSWERS = "two replies received, one expected"
+TOO_EARLY = "bytes received before the request was sent completely"
+COLLIDED = "the echo differs from the bytes sent: a collision, or an adapter without echo"
 
 
 def damaged(mark: Mark) -> str:
-    """Say that the port found a byte damaged."""
-    return f"{mark.value} in the reply, says the port"
+    """Return the error text for a byte that the port reported as damaged."""
+    return f"{mark.value} in the reply, reported by the port"
 
 
 SPOILING = frozenset((TOO_EARLY, COLLIDED, *map(damaged, Mark)))
-"""Reasons for which what comes is not read at all."""
+"""Errors for which the received bytes are not parsed."""
 
 
 class Trust:
-    """Of one line. While things are said twice on it, an ambiguous answer is held until another could have come."""
+    """Checks the replies of one line. After a duplicate reply, an ambiguous reply is held until another could have
+    arrived."""
 
     __slots__ = ("_in_sync", "held")
 
     def __init__(self, in_sync: InSync) -> None:
         self._in_sync = in_sync
         self.held: Done[Any] | None = None
-        """An answer that is delivered only if no other comes meanwhile."""
+        """A reply that is delivered only if no second one arrives."""
 
     def weigh(self, wire: OnWire, progress: Done[Any], now: float) -> str | float | None:
-        """Weigh an answer. Returns None if it is believed, else why not; or until when it is `held`."""
+        """Check a reply. Returns None to deliver it, the reason not to, or the time until which it is `held`."""
         transaction, exchange, step = wire.transaction, wire.exchange, wire.step
         assert transaction is not None
         assert exchange is not None
@@ -46,17 +47,17 @@ class Trust:
         if any(progress.rest.startswith(key) for key in answers):
             return TWO_ANSWERS
         if in_sync.clashes(answers, now, transaction.node):
-            # It pays nothing: it may be this request's, and what was overdue before is still to come.
-            return "its answer may be an earlier request's, whose own never came"
+            # It clears nothing: it may be this request's reply, and the overdue one may still arrive.
+            return "ambiguous reply: it may belong to an earlier request, whose reply is overdue"
         to_be_held = in_sync.is_to_be_held(answers, now)
         if not held and (to_be_held or in_sync.is_ambiguous(answers, now)):
             latest = step.end + transaction.node.latest(step.timing.window) + step.latency
             if progress.rest or step.begun_at > latest:
-                return "its answer may be another's, said late or twice"
-            if to_be_held:  # its own reply may take as long as the document allows, not only as long as usual
+                return "ambiguous reply: it may be a late or duplicate reply to another request"
+            if to_be_held:  # its own reply may take as long as documented, not only as long as usual
                 latest = max(latest, step.past())
             if to_be_held or in_sync.has_ambiguity(now):
-                if progress.send:  # at once: MSC says its packet again until that is acknowledged
+                if progress.send:  # at once: MSC repeats its packet until it is acknowledged
                     wire.say(progress.send, now)
                 self.held = Done(progress.value)
                 return max(now, latest) + 2 * step.byte_time
@@ -67,22 +68,25 @@ class Trust:
         return None
 
     def add_overdue(self, wire: OnWire, *, heard: bool, whole: bool = False) -> None:
-        """Note that an attempt ends: its reply may still come. What was `heard` was not it, and may have been a part of
-        it; a `whole` one lacks nothing but what noise may have pushed out at its end."""
+        """Record that the reply to a finished attempt may still arrive.
+
+        `heard`: bytes were received that may be part of it. `whole`: the reply was complete except for damage at its
+        end.
+        """
         exchange, transaction = wire.exchange, wire.transaction
         assert transaction is not None
         assert exchange is not None
         keys = () if whole else tuple(exchange.overdue)
         step, awaited = wire.step, None
         over = step.past()
-        if step.timing.silence is not None:  # it may meet with what is said then, and only a part of it be heard
-            # its node goes on by itself with the steps that need no word from the host (MSC: the packet after its ACK)
+        # The reply may collide with the next request, so that only part of it is received.
+        if step.timing.silence is not None:
+            # The node continues with steps that need no transmission by the host (MSC: the packet after its ACK).
             over += sum(later.timing.max_reply_delay for later in exchange.later if not later.sent)
             silence = max(QUIET, transaction.node.timings.read.inter_byte_timeout) + step.latency + step.byte_time
             lasts = step.longest * step.byte_time + silence  # with one pause
             awaited = Awaited(transaction.command, step.timing.window, silence, lasts)
-        # The ACK that began a packet's step (MSC) may have been an overdue one: this request's own is then still to
-        # come
+        # The ACK before the packet (MSC) may have been an overdue one. This request's own ACK is then still to come.
         ack_in_doubt = exchange.later and self._in_sync.lone_byte_is_overdue()
         if heard or (awaited is not None and keys) or ack_in_doubt:
             keys += (ANY_BYTE,)
@@ -93,9 +97,11 @@ class Trust:
     def hear(
         self, wire: OnWire, run: bytes, unexpected: UnexpectedBytes, now: float, ours: bool = False
     ) -> NodeRecord | None:
-        """Take what came before this silence of the line. Returns who overdue it, if that is known. It pays nothing
-        where it may be `ours`, an echo that went astray: the end of a request can be a whole right reply of
-        somebody's."""
+        """Process the bytes received before a silence. Returns the node whose overdue reply they contain, if known.
+
+        If they may be `ours`, an incomplete echo, they clear nothing: the end of a request can look like a whole
+        correct reply of another node.
+        """
         if ours:
             self._in_sync.add_overdue((ANY_BYTE,), None, now, now)
             return None
@@ -103,11 +109,11 @@ class Trust:
         paid = self._in_sync.heard(run, now)
         node = None if paid is None else paid.node
         if paid is None or node is None or len(paid.key) < 2:
-            return node  # a lone byte may be noise, and makes no node slower
+            return node  # a single byte may be noise, so it raises no maximum reply delay
         if node.learning is None or paid.awaited is None:
             unexpected.blame_overdue_reply([one for one, key in overdue if key == paid.key])
         else:
-            node.unheard = 0  # heard, if late: whatever else it owes, it is asked for itself
+            node.unheard = 0  # the node is alive: a sync read can clear its other overdue replies
             first_byte = unexpected.last_byte - (len(run) - 1) * wire.step.byte_time - wire.step.latency
             if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:
                 node.learning.was_late()

@@ -102,7 +102,7 @@ def test_a_good_answer_that_may_be_anothers_is_ambiguous() -> None:
     bench = Bench(tapped=True)
     bench.ask(bench.node(), retries=0)
     bench.hear(f"{FIVE} {FIVE}", after=0.004)
-    assert said(bench) == ["1.1 ambiguous: read element 1: two answers came where one was due"]
+    assert said(bench) == ["1.1 ambiguous: read element 1: two replies received, one expected"]
 
 
 def test_the_loss_of_the_line_cuts_it_off() -> None:

@@ -235,10 +235,10 @@ def test_the_masters_own_verdict_is_what_counts() -> None:
 
 
 def test_an_answer_that_was_not_believed_is_read_as_one_and_still_not_believed() -> None:
-    one = told(Verdict.AMBIGUOUS, "two answers came where one was due", *read(VALUE))
+    one = told(Verdict.AMBIGUOUS, "two replies received, one expected", *read(VALUE))
     assert one.judged
     assert not one.changed
-    assert told(Verdict.AMBIGUOUS, "two answers came where one was due", *read(NAK)).changed
+    assert told(Verdict.AMBIGUOUS, "two replies received, one expected", *read(NAK)).changed
 
 
 @pytest.mark.parametrize("verdict", [Verdict.SPOILT, Verdict.CUT_OFF])

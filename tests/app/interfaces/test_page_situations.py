@@ -60,7 +60,7 @@ async def test_a_person_reads_of_a_dead_drive_a_lost_line_and_an_owner_that_is_a
                 await asyncio.to_thread(browser.open, of.url)
                 await reads(browser, "node 5", "node 6", UP, NONE_DOWN, "ready")
                 devices[1].faults.dead = 1.0
-                await reads(browser, "1 of 2", UP, DOWN, "its polls wait", without=NONE_DOWN)
+                await reads(browser, "1 of 2", UP, DOWN, "polling suspended", without=NONE_DOWN)
                 devices[1].faults.dead = 0.0
                 await reads(browser, UP, NONE_DOWN, without=DOWN)
 
