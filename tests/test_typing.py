@@ -86,7 +86,7 @@ def test_handles_need_only_what_has_nodes_and_a_bus_is_one() -> None:
     far: Requester = fake.node(hcp2.PROFILE, 5)
     assert Node.of(Hcp2Controller(bus, 5)) is near
     assert Hcp2Controller(fake, 5).node is far
-    with pytest.raises(InvalidCommand, match="node 5 is no node of a bus in this process"):
+    with pytest.raises(InvalidCommand, match="node 5 is not a node of a bus in this process"):
         Node.of(Hcp2Controller(fake, 5))
 
 

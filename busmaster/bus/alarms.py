@@ -1,4 +1,4 @@
-"""Alarms: values that left what they must not leave, each told when it begins and when it ends, and not in between."""
+"""Alarms: values outside their limits. An alarm is reported when it begins and when it ends, and not in between."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ Side: TypeAlias = Literal["low", "high"]
 
 @dataclass(frozen=True, slots=True)
 class AlarmChanged:
-    """A polled value is above `high` or below `low` of its point (`active`), or no longer.
+    """A polled value is above `high` or below `low` of its point (`active`), or has returned.
 
-    `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is watched no
-    more. Of a bit whose 1 is an alarm, `limit` is "high" and `bound` False; of one whose 0 is an alarm, "low" and True.
+    `limit`: the limit that was crossed; `bound`: its value. `value` is None if the alarm ended because the point is no
+    longer watched. For a bit whose 1 is an alarm, `limit` is "high" and `bound` False; for a bit whose 0 is an alarm,
+    "low" and True.
     """
 
     point: Point[Any]
@@ -30,14 +31,14 @@ class AlarmChanged:
 
     @property
     def name(self) -> str:
-        """What is the alarm: "high" or "low" for a number; "set" or "clear" for a bit."""
+        """Kind of alarm: "high" or "low" for a number; "set" or "clear" for a bit."""
         if isinstance(self.bound, bool):
             return "set" if self.limit == "high" else "clear"
         return self.limit
 
     @property
     def text(self) -> str:
-        """Say in a sentence what began or ended, with the value and its unit."""
+        """Describe the change in a sentence, with the value and its unit."""
         if isinstance(self.bound, bool):
             return self._text_of_bit()
         crossed = f"{'above' if self.limit == 'high' else 'below'} its {self.limit} of {self._text(self.bound)}"
@@ -59,28 +60,28 @@ class AlarmChanged:
 
 
 BusEvent: TypeAlias = Event | AlarmChanged
-"""What a bus tells: of its line and nodes, and of what it polls."""
+"""Events of a bus: of its line, its nodes and its polled values."""
 
 
 class Alarms:
-    """Those of one line. `tell` is called with each that begins or ends.
+    """The alarms of one line. `tell` is called with each change.
 
-    A value that could not be read neither begins an alarm nor ends one.
+    A value that could not be read neither begins nor ends an alarm.
     """
 
     def __init__(self, tell: Callable[[AlarmChanged], None]) -> None:
         self.states: Mapping[Point[Any], AlarmChanged | None] = {}
-        """The alarm of each point that was looked at, None for none. Replaced whole, so that any thread may look."""
+        """The alarm of each watched point, or None. Replaced as a whole, so that it can be read from any thread."""
         self._tell = tell
         self._groups: Counter[Point[Any]] = Counter()
-        """In how many poll groups each point is watched."""
+        """Number of poll groups that watch each point."""
 
     def watch(self, points: Iterable[Point[Any]]) -> None:
-        """Note that one more poll group watches these points, until it calls `forget`."""
+        """Watch these points for one more poll group, until `forget`."""
         self._groups.update(points)
 
     def look(self, points: Iterable[Point[Any]], samples: Mapping[Point[Any], Sample[Any]]) -> None:
-        """Tell what the samples of these points begin and end."""
+        """Report the alarms that begin or end with the samples of these points."""
         changed: dict[Point[Any], AlarmChanged | None] = {}
         told: list[AlarmChanged] = []
         for point in points:
@@ -100,7 +101,7 @@ class Alarms:
         self._become({**self.states, **changed} if changed else self.states, told)
 
     def forget(self, points: Iterable[Point[Any]]) -> None:
-        """Note that a poll group no longer watches these points, and end the alarms of those that no other does."""
+        """Stop watching these points for one poll group. Ends the alarms of points that no other group watches."""
         points = tuple(points)
         self._groups.subtract(points)
         self._groups = +self._groups
@@ -116,9 +117,9 @@ class Alarms:
 
 
 def _begun(point: Point[Any], value: float) -> AlarmChanged | None:
-    """Return the alarm that a value begins, None if it begins none."""
+    """Return the alarm that a value begins, or None."""
     low, high = point.meaning.low, point.meaning.high
-    if isinstance(value, bool):  # a bit, of which a bound says "above false" or "below true"
+    if isinstance(value, bool):  # a bit: its alarm is "above false" or "below true"
         low, high = None if low is None else bool(low), None if high is None else bool(high)
     if high is not None and value > high:
         return AlarmChanged(point, "high", high, value, active=True)
@@ -128,7 +129,7 @@ def _begun(point: Point[Any], value: float) -> AlarmChanged | None:
 
 
 def _holds(limit: Side, point: Point[Any], value: float) -> bool:
-    """Return whether a value is not yet back: one that is no number is not."""
+    """Return True if a value has not returned within its limit. A value that is not a number has not returned."""
     meaning = point.meaning
     if limit == "high":
         return meaning.high is not None and not value <= meaning.high - meaning.margin

@@ -1,4 +1,4 @@
-"""What poll groups were answered last: for points that no group reads under their name, or not by themselves."""
+"""Replies of the last poll cycles, for points that no group reads under their name or separately."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from busmaster.contract.profile import Profile
 
 
 class Answer(NamedTuple):
-    """What one exchange of a cycle brought, asked for at `started` by the bus's clock.
+    """The result of one exchange of a cycle, sent at `started` on the bus's clock.
 
-    `serves` are the points that it is for, each with its place in the value of a batch (None: all of it).
+    `serves`: its points, each with its place in the value of a batch (None: the whole value).
     """
 
     node: Requester
@@ -25,15 +25,16 @@ class Answer(NamedTuple):
     started: float
 
     def found(self, command: Command[Any]) -> list[Any]:
-        """Return what this command would have returned, alone in a list; an empty one where it was not asked."""
+        """Return the result of this command in a list, which is empty if the exchange did not contain it."""
         places = (place for point, place in self.serves if point.command == command)
         return [self.value if place is None else self.value[place] for place in places][:1]
 
 
 def composed(command: Command[Any], answers: Iterable[Answer], profile: Profile) -> list[Any]:
-    """Return what a command would return by what answers, the youngest last, told of each of its places.
+    """Return the result of a command composed from replies, the newest last, by the places they contain.
 
-    Of a write it is what it changes. It is alone in a list, which is empty where they did not tell all of it.
+    For a write, the places it changes. The result is in a list, which is empty if the replies do not contain all
+    places.
     """
     held: dict[Hashable, Any] = {}
     for answer in answers:

@@ -1,4 +1,4 @@
-"""A bus: the object that owns one line."""
+"""The bus: the object that owns one line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 import anyio
-import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
+import anyio._backends._asyncio  # imported here and not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import LineClient
@@ -50,14 +50,15 @@ MOST_CAPACITY = 1_000_000
 
 
 class Bus:
-    """One line and everything on it. Use it in `async with`: entering opens the port, leaving closes it.
+    """One line and the nodes on it. Use it in `async with`: entering opens the port, leaving closes it.
 
-    `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
-    reconnects repeatable. `tap` sees every byte (see busmaster.capture). `strict`: an answer that could be another
-    request's is held until that one would have come (R15), at about a third of the line's rate. Entering raises
-    LineDown if the port cannot be opened, or, with `wait_for_port`, goes on as after a loss; once open, a lost port
-    fails its callers at once and is opened again by itself, as soon as the same device is back (R13); `events` tells
-    of attempts that fail.
+    `capacity`: maximum number of queued requests per priority class (R12). `seed`: makes the jitter of probes and
+    reconnects repeatable. `tap`: receives every byte (see busmaster.capture). `strict`: hold each ambiguous reply until
+    the other possible reply would have arrived (R15), at about a third of the line's rate. `wait_for_port`: if the port
+    cannot be opened, continue as after a loss; without it, entering raises LineDown.
+
+    If an open port is lost, all requests fail at once. The port is reopened automatically when the same device is back
+    (R13); `events` reports failed attempts.
     """
 
     def __init__(
@@ -104,10 +105,10 @@ class Bus:
         self._taps = Taps(self._pump, tap)
         self._nodes: dict[tuple[str, int], Node] = {}
         self._profiles: dict[str, Profile] = {}
-        """Of the protocols on this line, by name."""
+        """The protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
         self._reads_after_writes = ReadsAfterWrites(line, self._groups, self._start)
-        """Counts of the reads of points with `read_after_write`."""
+        """Executes and counts the reads of points with `read_after_write`."""
         line.on_touched.append(self._on_touched)
         self._outlook = Outlook(line, endpoint, self._nodes, self._groups)
         self._streams: list[Stream[BusEvent]] = []
@@ -121,13 +122,13 @@ class Bus:
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
         loop = running_loop()
-        if loop is None:  # awaited, and not by asyncio
+        if loop is None:  # a coroutine that runs without asyncio
             raise InvalidCommand(
                 f"the bus on {self.endpoint.name} needs asyncio's event loop, which does not run here: "
                 "run the program by asyncio.run, or by anyio.run with its asyncio backend, not by trio"
             )
         self._line.bind(loop)
-        # Time that passed before the bus was entered is not time of the line.
+        # The time before the bus was entered does not count as time of the line.
         self._arbiter.reset_statistics(self.now())
         connection = Connection(self.endpoint, self._pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
@@ -147,23 +148,24 @@ class Bus:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Close the bus: waiting callers get BusClosed at once; the exchange on the wire may end, in its own window."""
+        """Close the bus: queued requests fail with BusClosed at once; the exchange on the wire may finish within its
+        window."""
         self._check_loop()
-        # First of all, so that callbacks of the groups that end cannot start a new request.
+        # First, so that callbacks of the closing groups cannot start a new request.
         self._line.closed = True
         for group in self.groups:
             group.close()
-        # At once: what waits fails now, and only the exchange on the wire runs out.
+        # Queued requests fail now; only the exchange on the wire is finished.
         self._arbiter.close(self.now())
         self._pump.turn()
         with anyio.CancelScope(shield=True):  # Task.cancel() comes through all the same
             try:
                 await self._pump.run_out()
             finally:
-                await self._let_go()  # when cancelled too: the port would stay open and be opened again for ever
+                await self._let_go()  # also after a cancellation, or the port would stay open and be reopened forever
 
     async def _let_go(self) -> None:
-        """Close the port, as nothing is on the wire, or nobody waits for its end."""
+        """Close the port. Nothing is on the wire, or the wait for its end was cancelled."""
         assert self._connection is not None
         self._line.unbind()
         try:
@@ -175,23 +177,24 @@ class Bus:
                 stream.close()
             for task in self._tasks:
                 task.cancel()
-        # Hooks of the application are cancelled, and their errors belong to the log, not to whoever closes the bus.
+        # Hooks of the application are cancelled. Their errors belong in the log; the code that closes the bus did not
+        # cause them.
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def _accept_device(self) -> None:
-        """Let the next opening take whatever device has the port's name then, as if the program were started again.
+        """Accept any device that has the port's name at the next opening, as after a restart of the program.
 
-        Without it, only the device that the line was opened on is opened again. A port that is named by a serial
-        number (usb:SERIAL) never takes another one. A connection that is up stays as it is.
+        By default only the device that the line was opened on is reopened. A port given by a serial number (usb:SERIAL)
+        never accepts another one. An open connection is not affected.
         """
         if self._connection is not None:
             self._connection.accept_device()
 
     def _take_only_safe_writes(self) -> Callable[[], None]:
-        """End every write that waits as Superseded, and accept none from now on but those that say `safe=True`.
+        """Fail every queued write with Superseded, and accept only writes with `safe=True` from now on.
 
-        A write that is on the wire runs out, and is not repeated. Reads and polls go on. What is returned,
-        called once, takes writes again: not on a line that is about to be left.
+        A write on the wire is finished, and is not repeated. Reads and polls continue. Call the returned function once
+        to accept all writes again; it is not needed on a line that will be closed.
         """
         self._check_loop()
         self._line.only_safe += 1
@@ -204,11 +207,11 @@ class Bus:
     def node(
         self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> Node:
-        """Return the node at this address: a protocol and an address are one node, however often it is asked for.
+        """Return the node at this address. Calls with the same protocol and address return the same node.
 
-        Raises InvalidCommand for an address that the protocol does not have; for a protocol that cannot share the line
-        with those that are on it; and for another profile, timings or retries than the node was first asked with. What
-        is None was left open.
+        Raises InvalidCommand for an address that the protocol does not have, for a protocol that cannot share the line
+        with those on it, and if profile, timings or retries differ from those of the first call. None means not
+        specified.
         """
         node = self._find_or_add(profile, address, timings, retries)
         node._kept = True
@@ -223,30 +226,30 @@ class Bus:
         retries: int | None = None,
         budgeted: bool = False,
     ) -> Node:
-        """Return the node as `node` does, for somebody who will give it back.
+        """Return the node as `node` does, for a borrower that will give it back.
 
-        One that was only ever lent leaves the bus when all who borrowed it have given it back. `budgeted`: if the node
-        is new, until its first reply it is asked within the budget of probes only (R11), as a node that is down is.
+        A node that was only lent is removed when all borrowers have given it back. `budgeted`: requests to a new node
+        use only the probe budget (R11) until its first reply, as for a node that is DOWN.
         """
         node = self._find_or_add(profile, address, timings, retries)
-        # A node that the owner or another client uses has proved itself; only a new one is limited.
+        # A node that the owner or another client uses has already replied; only a new one is limited.
         if budgeted and not (node._kept or node._borrowers):
             self._arbiter.ask_within_budget(node._record, self.now())
         node._borrowers += 1
         return node
 
     def _has_node(self, profile: Profile, address: int) -> bool:
-        """Return whether the node at this address is on the line."""
+        """Return True if the node at this address is on the line."""
         return (profile.name, address) in self._nodes
 
     def _give_back(self, node: Node) -> None:
-        """Take back a node that was lent: nothing of it is polled or asked any more by whoever gives it back."""
+        """Return a lent node. The borrower no longer polls it or sends requests to it."""
         node._borrowers -= 1
         if not (node._kept or node._borrowers):
             del self._nodes[node.profile.name, node.address]
             self._line.forget_node(node, node._record)
             if not any(other.profile.name == node.profile.name for other in self._nodes.values()):
-                del self._profiles[node.profile.name]  # another protocol may be spoken on an empty line
+                del self._profiles[node.profile.name]  # an empty line accepts another protocol
 
     def _find_or_add(
         self, profile: Profile, address: int, timings: Timings | Learned | None, retries: int | None
@@ -279,12 +282,12 @@ class Bus:
 
     @property
     def nodes(self) -> tuple[Node, ...]:
-        """Return the nodes that are on the line, in the order in which they were first asked for."""
+        """Return the nodes on the line, in the order in which they were added."""
         return tuple(self._nodes.values())
 
     @property
     def groups(self) -> tuple[PollGroup, ...]:
-        """Return the poll groups that run, or rest, in the order in which they were made."""
+        """Return the poll groups, including paused ones, in the order in which they were made."""
         return tuple(self._groups.values())
 
     def poll_group(
@@ -298,14 +301,15 @@ class Bus:
         merge: Sequence[Merge] = (),
         client: LineClient | None = None,
     ) -> PollGroup:
-        """Read `points` every `period` seconds, on a fixed grid, from now on (R10).
+        """Read `points` every `period` seconds on a fixed grid (R10).
 
-        `phase` (seconds, below the period) places the group on the grid; without it, it is placed where it meets the
-        other groups least. `merge`: cheaper exchanges to opt in to, such as `protocols.mentor.merge_runs`, beside
-        those that the nodes' profiles have; they are taken where they save line time, and no longer once refused.
-        Hundreds of points or groups are worked out in slices while the line goes on, and start some milliseconds later.
-        `client`, of `SharedLine.add_client`, is the program that pays for the line time; without it, this one does.
-        Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
+        `phase`: position on the grid, in seconds below the period; by default it is chosen for the least overlap with
+        the other groups. `merge`: optional cheaper exchanges such as `protocols.mentor.merge_runs`, in addition to
+        those of the nodes' profiles. They are used if they save line time, and no longer after a refusal. Hundreds of
+        points or groups are prepared in slices while the line runs, and start some milliseconds later. `client` (from
+        `SharedLine.add_client`) is charged for the line time; by default this program is.
+
+        Raises InvalidCommand if the name is in use, and for invalid times and priorities.
         """
         self._check_loop()
         if self._line.closed or not self.running:
@@ -315,7 +319,7 @@ class Bus:
             phase = seconds(phase, f"poll group {name!r}: a phase")
         priority = checked_priority(priority)
         if name in self._groups:
-            raise InvalidCommand(f"there is a poll group {name!r} already")
+            raise InvalidCommand(f"a poll group {name!r} already exists")
         group = PollGroup(
             self._line,
             name,
@@ -327,29 +331,29 @@ class Bus:
             on_close=self._forget,
             client=client,
         )
-        # After all checks: an error must not leave half a group behind.
+        # After all checks: an error must not leave a partly created group behind.
         self._arbiter.add_poll(group.poll, self.now())
         self._groups[name] = group
         self._pump.turn()
         return group
 
     def latest(self, point: Point[T]) -> Sample[T] | None:
-        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
+        """Return the newest good sample of this point in any group. None if a write has made it stale."""
         return self._line.latest(point)
 
     # looking
 
     def now(self) -> float:
-        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
+        """Return the time of the bus's clock, in seconds. All times of the bus use this clock."""
         return self._pump.clock()
 
     def wall_time(self) -> float:
-        """Return the same moment as `now` in seconds since 1970, by the machine's clock."""
+        """Return the current time in seconds since 1970, by the machine's clock."""
         return self.now() + self._line.wall_offset()
 
     @property
     def running(self) -> bool:
-        """Return whether it is open, though its line may be down."""
+        """Return True while the bus is open, even if its line is down."""
         return self._line.running
 
     @property
@@ -359,7 +363,8 @@ class Bus:
 
     @property
     def state(self) -> LineState:
-        """Return what the line does: OFFLINE, READY, in an EXCHANGE, in the HOLDOFF between two, or RESYNCHRONISING."""
+        """Return the state of the line: OFFLINE, READY, EXCHANGE, HOLDOFF (between two exchanges) or
+        RESYNCHRONISING."""
         return self._arbiter.state
 
     @property
@@ -369,21 +374,24 @@ class Bus:
 
     @property
     def _lost_seconds(self) -> float:
-        """Return for how long the line was lost since the bus was opened, in all."""
+        """Return the total time, in seconds, for which the line was lost since the bus was opened."""
         return self._line.losses.seconds(self.now())
 
     def as_of_now(self, point: Point[T], sample: Sample[T]) -> Sample[T]:
-        """Return a sample of a poll group with the quality that it has now: bad while the line is lost, stale after a
-        write to what the point reads. `PollGroup.latest` has it as it was when its cycle ended."""
+        """Return a poll group's sample with its current quality.
+
+        It is bad while the line is lost, and stale after a write to its quantity. `PollGroup.latest` has the quality at
+        the end of the cycle.
+        """
         return self._line.as_of_now(point, sample)
 
     def statistics(self) -> LineStatistics:
-        """Return an immutable snapshot of the line's counts since it was opened or reset."""
+        """Return an immutable snapshot of the line's counters since it was opened or they were reset."""
         self._check_loop()
         return replace(self._arbiter.statistics(self.now()), driver=self._pump.driver_errors())
 
     def reset_statistics(self) -> None:
-        """Start all counts of line, nodes and groups again."""
+        """Reset all counters of the line, the nodes and the groups."""
         self._check_loop()
         self._arbiter.reset_statistics(self.now())
         self._pump.reset_driver_errors()
@@ -392,16 +400,16 @@ class Bus:
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Calculate what becomes of the groups that run, and of `more`, by the reply times measured so far.
+        """Calculate the load of the running groups and of `more`, with the reply times measured so far.
 
-        It is calculated at once: with hundreds of points that takes some ten milliseconds, in which no line of this
-        loop goes on. While a line runs, await `ext.plan_in_steps`.
+        The calculation blocks the event loop: with hundreds of points for some ten milliseconds, in which no line of
+        this loop continues. While a line runs, use `await ext.plan_in_steps`.
         """
         self._check_loop()
         return at_once(self._outlook.plan_steps(more, could_merge))
 
     async def _plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Do what `plan` does, in steps of less than a millisecond between which exchanges go on."""
+        """Calculate as `plan` does, in steps of less than a millisecond between which exchanges continue."""
         self._check_loop()
         steps = self._outlook.plan_steps(more, could_merge)
         done = 0
@@ -416,36 +424,36 @@ class Bus:
                 await asyncio.sleep(0)
 
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
-        """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
+        """Return the longest time, in seconds, until a request of this class, made now, is sent (R9).
 
-        It calculates with what is polled, what waits already, every node's probe, each kind of command that was asked
-        or polled so far, the programs that are connected, and the longest exclusive sequence that was begun; with nodes
-        that are dead, late or trickling; not with a line that is never silent. Reply times that are learned do not
-        shorten it: those of the document may come back at any moment.
+        The calculation includes the polls, the queued requests, a probe of each node, each kind of command sent so far,
+        the connected programs, the longest exclusive sequence so far, and dead, late or slow nodes. It does not cover a
+        line that is never silent. Learned reply times do not shorten it, because the documented times can be restored
+        at any moment.
         """
         self._check_loop()
         return self._outlook.worst_case_wait(checked_priority(priority))
 
     @property
     def alarms(self) -> Mapping[Point[Any], AlarmChanged | None]:
-        """Return what each polled point with limits has left and is not back from; None for those within."""
+        """Return the active alarm of each polled point with limits; None if the value is within its limits."""
         return self._line.alarms.states
 
     def _overheard(self, samples: Mapping[Point[Any], Sample[Any]]) -> None:
-        """Take values that another master's requests have brought for what they begin and end of alarms."""
+        """Evaluate alarms for values received by listening to another master."""
         self._line.alarms.look([point for point in samples if point.meaning.watched], samples)
 
     def events(self) -> Stream[BusEvent]:
-        """Return a stream of what happens from now on.
+        """Return a stream of events from now on.
 
-        Line and nodes tell NodeChanged, LineChanged, PortFailed and others, what is polled tells AlarmChanged.
+        Line and nodes report NodeChanged, LineChanged, PortFailed and others; polled values report AlarmChanged.
         """
         self._check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
 
     def _check_loop(self) -> None:
-        """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
+        """Raise InvalidCommand if an open bus is used from another thread or another event loop."""
         self._line.check_loop()
 
     # inside
@@ -475,14 +483,14 @@ class Bus:
         if isinstance(event, NodeChanged):
             node = self._nodes.get((event.node.profile.name, event.node.address))
             if node is None or node._record is not event.node:
-                return  # it was given back while it was asked something
-            # A drive that was away may come back with other values: `max_step` must not trust the ones before.
+                return  # the node was given back during a request
+            # A drive that was away may return with other values, so `max_step` must not use the earlier ones.
             if event.after is Health.DOWN and self._line.limiter is not None:
                 self._line.limiter.forget(node)
             if event.returning:
                 self._start(self._run_hook(node))
         self._line.logbook.note(event, self.now())
-        # Unexpected bytes can come thousands of times a second; they are counted and logged instead.
+        # Unexpected bytes can arrive thousands of times per second. They are counted and logged instead.
         if not isinstance(event, CameUnexpected):
             for stream in self._streams:
                 stream.put(event)
@@ -492,15 +500,15 @@ class Bus:
         self._on_event(PortFailed(cause.what, cause.hint, cause.__cause__))
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        """Start a task of the bus's own: a task group would tie entering and leaving the bus to one task."""
+        """Start a background task. A task group would tie entering and leaving the bus to the same task."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def _run_hook(self, node: Node) -> None:
-        """Run a node's hook. One that fails must not take the bus down: the node's polls resume all the same.
+        """Run a node's on_return hook. If it fails, the error is logged and the node's polls resume anyway.
 
-        A node that comes back again while its hook still runs gets another run of it, after that one.
+        If the node returns again while its hook is running, the hook runs again afterwards.
         """
         try:
             async with node._returning:

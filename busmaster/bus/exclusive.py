@@ -1,4 +1,4 @@
-"""A node for one sequence of requests: nothing but what is urgent comes between them on its line."""
+"""A node within one exclusive sequence of requests: only urgent requests go between them on its line."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ T = TypeVar("T")
 
 
 def checked_hold(max_hold: float, label: str) -> float:
-    """Return `max_hold`, in seconds. Raises InvalidCommand, naming the node, unless it is above 0, and 5 at most."""
+    """Return `max_hold`, in seconds. Raises InvalidCommand with the node's name unless it is above 0 and at most 5."""
     if not 0 < seconds(max_hold, f"{label}: max_hold") <= LONGEST_HOLD:
         raise InvalidCommand(f"{label}: a line is held for {LONGEST_HOLD:g} s at most (max_hold), not {max_hold!r}")
     return max_hold
 
 
 class HeldNode(ABC):
-    """A node as it is asked within one sequence: it is its node in all, but for `request`."""
+    """A node within one exclusive sequence. It behaves like its node, except for `request`."""
 
     def __init__(self, node: Requester) -> None:
         self._node = node
@@ -75,8 +75,8 @@ class HeldNode(ABC):
         self._node.check(*commands, stop=stop)
 
     def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
-        """Raise InvalidCommand: a sequence is no part of another."""
-        raise InvalidCommand(f"{self.label}: its line is held already: ask within the sequence that has begun")
+        """Raise InvalidCommand: sequences cannot be nested."""
+        raise InvalidCommand(f"{self.label}: the line is already held: send it within the running sequence")
 
     @abstractmethod
     async def request(
@@ -89,14 +89,14 @@ class HeldNode(ABC):
         stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> T:
-        """Run one command within the sequence, as `Requester.request`.
+        """Run one command within the sequence, as `Requester.request` does.
 
-        Raises HoldEnded once the line is no longer held, and sends nothing.
+        Raises HoldEnded, and sends nothing, when the line is no longer held.
         """
         ...
 
 
 def hold_ended(node: Addressed, longest: float, command: Command[Any]) -> HoldEnded:
-    """Return the error for what is asked when the `longest` seconds for which the line was held at most are over."""
-    what = f"the {longest:g} s for which the line was held for it are over, or its block was left"
+    """Return the error for a request after the end of its sequence. `longest`: maximum hold time in seconds."""
+    what = f"the sequence has ended: its {longest:g} s have passed, or its block was left"
     return HoldEnded(what, node=node, command=str(command))

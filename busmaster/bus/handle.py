@@ -1,4 +1,4 @@
-"""What every handle shares: a node, and points by name."""
+"""The base class of all handles: a node, and points by name."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from busmaster.errors import InvalidCommand, VerifyFailed
 T = TypeVar("T")
 
 MOST_ITEMS = 65536
-"""As many as the largest address space of a protocol has."""
+"""Size of the largest address space of a protocol."""
 Send: TypeAlias = Callable[[], Awaitable[None]]
-"""Sends what was prepared."""
+"""Sends a prepared write."""
 
 
 class Handle(ABC):
     """An awaitable handle of one node: thin and typed, over `Requester.request`.
 
-    Raises InvalidCommand for an address that the protocol does not have. Handles of one protocol and address share the
-    node, whatever their kind (a controller and a drive that speak alike): what one leaves out, of timings, retries and
-    options of the protocol, is as the first said, and anything else than that raises InvalidCommand. Another protocol
-    at the same address is another node.
+    Raises InvalidCommand for an address that the protocol does not have. All handles with the same protocol and address
+    share the node, whatever their class (for example a controller and a drive with the same protocol). Timings, retries
+    and protocol options that a handle leaves out are those of the first handle; different ones raise InvalidCommand.
+    Another protocol at the same address is another node.
     """
 
     profile: ClassVar[Profile]
@@ -50,7 +50,7 @@ class Handle(ABC):
 
     @abstractmethod
     def point(self, item: str) -> Point[Any]:
-        """Return the point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
+        """Return the point for an ITEM of the command line. Raises InvalidCommand if it does not exist."""
 
     @overload
     async def read(self, item: Any, **options: Unpack[ReadOptions]) -> Any: ...
@@ -59,11 +59,11 @@ class Handle(ABC):
     async def read(self, item: Any, count: int, **options: Unpack[ReadOptions]) -> Any: ...
 
     async def read(self, item: Any, count: int | None = None, **options: Unpack[ReadOptions]) -> Any:
-        """Return the value of an item; with `count`, a tuple of the values of so many items from there on.
+        """Return the value of an item, or with `count` a tuple of the values of this item and those after it.
 
-        Several items can take several exchanges: their values are then not all of one moment. `RequestOptions` lists
-        the options; `start_within` is for each exchange. Raises InvalidCommand, before anything is sent, for an item
-        that does not exist.
+        Several items may need several exchanges, so their values may not be from the same moment. The options are those
+        of `RequestOptions`; `start_within` applies to each exchange. Raises InvalidCommand, before anything is sent,
+        for an item that does not exist.
         """
         if count is None:
             return await self.point(item).read(**options)
@@ -74,9 +74,9 @@ class Handle(ABC):
     async def write(self, item: Any, *values: Any, **options: Unpack[WriteOptions]) -> None:
         """Write a value to an item, or several values to this item and those after it.
 
-        Several values can take several exchanges: if one fails, the values before it are stored. `RequestOptions` lists
-        the options; `verify` reads back when all are written. Raises InvalidCommand, before anything is sent, for a
-        value that cannot be sent.
+        Several values may need several exchanges: if one fails, the values before it are stored. The options are those
+        of `RequestOptions`; `verify` reads back after all are written. Raises InvalidCommand, before anything is sent,
+        for a value that cannot be sent.
         """
         points = [self.point(name) for name in self._names(item, values)]
         commands = [encoder(point)(value) for point, value in zip(points, values, strict=True)]
@@ -89,12 +89,13 @@ class Handle(ABC):
                 raise VerifyFailed(f"{point.item} reads {found!r} after {value!r} was written", node=self.node)
 
     def use_sync_reads(self, *, probe: str | None = None, sync_reads: Sequence[str] = ()) -> None:
-        """Set the probe and the sync reads of the node, by items, where the usual ones do not fit this device.
+        """Set the probe and the sync reads of the node, by items, if the defaults do not suit this device.
 
-        The probe is the read that is sent to a node that may be dead. Sync reads are sent where the line must prove
-        that replies match requests: name several cheap items that the device has, whose replies begin differently.
-        What is left out stays as it is. All handles of the node are concerned. Raises InvalidCommand for an item that
-        does not exist, and if another handle has set other ones. On the line of another program it changes nothing.
+        The probe is the read that is sent to a node that may be dead. Sync reads are sent if the line must prove that
+        replies match requests: name several cheap items that the device has and whose replies begin differently. What
+        is left out stays unchanged. The setting applies to all handles of the node. Raises InvalidCommand for an item
+        that does not exist, and if another handle has set different ones. On the line of another program it has no
+        effect.
         """
         self.node.use_sync_reads(
             None if probe is None else self.point(probe).command, [self.point(item).command for item in sync_reads]
@@ -102,12 +103,13 @@ class Handle(ABC):
 
     @asynccontextmanager
     async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Self]:
-        """Return, for `async with`, this handle for a sequence of requests: nothing but what is urgent comes between.
+        """Return this handle for an exclusive sequence of requests, for `async with`. Only urgent requests go between
+        them.
 
-        From when the first of them is sent, the line is held until the block is left, `max_hold` seconds at most (up to
-        5), to the end of the exchange that is on the wire then; what is asked in it later raises HoldEnded, and is not
-        sent. Only what is asked of the handle that the block is given is of the sequence: anything else, of this
-        program too, waits.
+        The line is held from the first request until the block is left, for at most `max_hold` seconds (up to 5) and to
+        the end of the exchange that is then on the wire. Later requests in the block raise HoldEnded and are not sent.
+        Only requests of the handle returned for the block belong to the sequence; all other requests, of this program
+        too, wait.
         """
         async with self.node.exclusive(max_hold=max_hold) as held:
             handle = copy(self)
@@ -117,41 +119,41 @@ class Handle(ABC):
     @classmethod
     @abstractmethod
     def items(cls) -> tuple[str, ...]:
-        """Return the names (not the numbers) that `point` knows."""
+        """Return the names (not the numbers) that `point` accepts."""
 
     @classmethod
     def _names_of_items(cls) -> Mapping[str, str]:
-        """Return the names of those items that have one, by what a listener reads from the line."""
+        """Return the names of items by the keys that a listener reads from the line."""
         return {}
 
-    # what ITEM and VALUE mean where a person writes them
+    # ITEM and VALUE on the command line
 
     async def _read_item(self, item: str, **options: Any) -> Any:
-        """Read what ITEM names on the command line, in the way that is best for a single reading."""
+        """Read an ITEM of the command line, in the way that suits a single read best."""
         return await self.point(item).read()
 
     def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-        """Return what writes the values to ITEM and those after it, once it is sure that all of them can be sent.
+        """Return the writes of the values to ITEM and those after it, after all of them were checked.
 
-        `RequestOptions` says what the options are. Raises InvalidCommand.
+        The options are those of `RequestOptions`. Raises InvalidCommand.
         """
         names = self._names(item, values)
         return [self._prepare_one(name, value, **options) for name, value in zip(names, values, strict=True)]
 
     def _names(self, item: str, values: Sequence[Any]) -> tuple[str, ...]:
-        """Return the items to which values go. Raises InvalidCommand if there are no values."""
+        """Return the items that the values are written to. Raises InvalidCommand if there are no values."""
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write to {item}")
         return self._run_items(item, len(values)) if len(values) > 1 else (item,)
 
     def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
-        """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
+        """Return the write of one value to ITEM. Raises InvalidCommand for a value that cannot be sent."""
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
-        # Not `self.write`: a handle may accept less there than it has points for (MSC: no flags).
+        # Not `self.write`: it may accept fewer items than there are points (MSC: no flags).
         return lambda: Handle.write(self, item, value, **options)
 
     def _run_items(self, item: str, count: int) -> tuple[str, ...]:
-        """Return what each of `count` values from ITEM on is called: 1.17, 1.18, ... Raises InvalidCommand."""
+        """Return the names of `count` items from ITEM on: 1.17, 1.18, ... Raises InvalidCommand."""
         first, colon, kind = item_text(item).partition(":")
         suffix = f":{kind}" if colon and not is_decimal(kind) else ""
         menu, dot, number = first.rpartition(".")
@@ -159,10 +161,10 @@ class Handle(ABC):
             raise InvalidCommand(f"several values begin at a number, not at {item!r}")
         return tuple(f"{menu}{dot}{int(number) + i:0{len(number)}d}{suffix}" for i in range(count))
 
-    if not TYPE_CHECKING:  # a type checker would take every name for one of these
+    if not TYPE_CHECKING:  # a type checker would accept every name
 
         def __getattr__(self, name: str) -> Any:
-            """Say what replaces a method of 0.2."""
+            """Name the replacement of a method of 0.2."""
             if name in ("read_run", "read_block"):
                 raise AttributeError(f"{type(self).__name__}.{name} is now read: read(item, count)")
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
@@ -172,32 +174,32 @@ class Handle(ABC):
 
 
 def checked_count(count: int) -> int:
-    """Return how many items to read. Raises InvalidCommand unless it is a whole number from 1 to 65536."""
+    """Return a number of items. Raises InvalidCommand unless it is a whole number from 1 to 65536."""
     return whole_number(count, 1, MOST_ITEMS, "a count of items")
 
 
 async def read_each(node: Requester, commands: Iterable[Command[T]], options: ReadOptions) -> tuple[T, ...]:
-    """Return the values of several reads, made one after the other as one call."""
+    """Return the values of several reads that form one call, made one after the other."""
     requests = SeveralRequests(node, options)
     return tuple([await requests.request(command) for command in commands])
 
 
 def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
-    """Return what makes the command that writes a value. Raises InvalidCommand for a point that is read-only."""
+    """Return the function that makes the write command of a value. Raises InvalidCommand for a read-only point."""
     if point.encode is None:
         raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
     return point.encode
 
 
 def item_text(item: str) -> str:
-    """Return the item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    """Return the item. Raises InvalidCommand for a number: 1.10 would become 1.1, and 7 may mean `element(7)`."""
     if not isinstance(item, str):
         raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
     return item
 
 
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
-    """Return the error for an item that does not exist: it says what would do, and the nearest name."""
+    """Return the error for an item that does not exist, with the valid form and the nearest name."""
     return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")
 
 

@@ -1,8 +1,9 @@
-"""The limits of one line, held where writes pass: no name of a quantity, and no way to write it, goes round them.
+"""The limits of one line, checked for all writes: under every name of a quantity, and in every way to write it.
 
-A write passes if it is within the limits of each quantity that it changes, at each node that hears it. Where a step is
-limited, one write at a time is under way, counted from what the one before left there; the value is read first where
-that is not known. Nothing waits for that in an urgent write, whose step is not limited; and no limit holds a stop.
+A write passes if it is within the limits of each quantity that it changes, at each node that receives it. With a
+limited step, one write at a time is in progress, and its step counts from the value left by the previous one. If that
+value is not known, it is read first. An urgent write does not wait for this: its step is not limited. A stop is not
+limited at all.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from busmaster.errors import GarbledReply, InvalidCommand, NoReply, NotStarted, 
 
 
 class NodeLimits:
-    """Those of one node, and what is known of the quantities whose steps are limited."""
+    """The limits of one node, and the known values of quantities with a limited step."""
 
     def __init__(self, node: Requester) -> None:
         self.node = node
@@ -30,9 +31,9 @@ class NodeLimits:
         self.known: dict[Limit, Any] = {}
         """The last confirmed values, in their own units."""
         self.writing = asyncio.Lock()
-        """Held while a write whose step is limited is under way."""
+        """Held while a write with a limited step is in progress."""
         self.urgent = 0
-        """How many urgent writes there were."""
+        """Number of urgent writes so far."""
 
     def touched_by(self, changes: Mapping[Hashable, Any]) -> list[Limit]:
         return [limit for limit in self.limits if limit.touched_by(changes)]
@@ -45,7 +46,7 @@ class Limiter:
         self._of: dict[Requester, NodeLimits] = {}
 
     def add(self, node: Requester, limit: Limit) -> None:
-        """Hold a further limit: what is already limited stays so."""
+        """Add a limit. Existing limits stay."""
         self._of.setdefault(node, NodeLimits(node)).limits.append(limit)
 
     def of(self, node: Requester) -> tuple[Limit, ...]:
@@ -53,22 +54,22 @@ class Limiter:
         return tuple(self._of[node].limits) if node in self._of else ()
 
     def drop(self, node: Requester, limit: Limit) -> None:
-        """Hold it no longer; the others stay."""
+        """Remove one limit. The others stay."""
         if node in self._of and limit in self._of[node].limits:
             self._of[node].limits.remove(limit)
             self._of[node].known.pop(limit, None)
 
     def forget(self, node: Requester) -> None:
-        """Forget what the node held: it was away, and may hold something else."""
+        """Forget the known values of a node that was away: it may have other values now."""
         if node in self._of:
             self._of[node].known.clear()
 
     def forget_node(self, node: Requester) -> None:
-        """Hold no limit of this node any more: it is gone."""
+        """Remove all limits of a node that was removed."""
         self._of.pop(node, None)
 
     def check(self, node: Requester, command: Command[Any]) -> None:
-        """Raise InvalidCommand, naming node and limit, for what may not be written. Of steps nothing is said."""
+        """Raise InvalidCommand with node and limit for a write that is not allowed. Steps are not checked here."""
         for one in self._reached(node):
             changes = _changes(node, command)
             for limit in one.touched_by(changes):
@@ -83,18 +84,18 @@ class Limiter:
         stop: bool = False,
         within: Requester | None = None,
     ) -> AsyncIterator[RequestOptions]:
-        """Let a write pass, or raise InvalidCommand before anything is sent. Yields the options that are left for it.
+        """Check a write, or raise InvalidCommand before anything is sent. Yields its remaining options.
 
-        Raises NotStarted where the value before it is needed and cannot be read, Superseded where an urgent write came
-        first. A `stop` passes whatever the limits, and what the node holds after it is not known. `within` is the node
-        for the sequence that the write is of: only so can the value before it be read meanwhile.
+        Raises NotStarted if the current value is needed and cannot be read, and Superseded if an urgent write came
+        first. A `stop` passes without a check, and the value after it is not known. `within`: the node of the write's
+        sequence, which is the only way to read the value during the sequence.
         """
         urgent = options.priority is Priority.URGENT
         reached = list(self._reached(node))
         if not stop:
             self.check(node, command)
         for one in reached:
-            one.urgent += urgent  # one that was just refused is not sent, and overtakes nothing
+            one.urgent += urgent  # a write that was just rejected is not sent, and overtakes nothing
         if not stop:
             reached = [one for one in reached if one.touched_by(_changes(node, command))]
         async with AsyncExitStack() as held:
@@ -121,7 +122,7 @@ class Limiter:
         command: Command[Any],
         options: RequestOptions,
     ) -> RequestOptions:
-        """Wait for the writes before this one, then look how far it goes."""
+        """Wait for the previous writes, then check the step of this one."""
         began, changes = node.now(), _changes(node, command)
         seen = [one.urgent for one in reached]
         patience = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
@@ -136,7 +137,7 @@ class Limiter:
         except TimeoutError as late:
             if isinstance(late, NotStarted):
                 raise
-            raise NotStarted("its value before it was not known in time", node=node, command=str(command)) from None
+            raise NotStarted("the current value was not read in time", node=node, command=str(command)) from None
         if seen != [one.urgent for one in reached]:
             raise Superseded("overtaken by an urgent write to the same node", node=node, command=str(command))
         self.check(node, command)  # other limits may be held by now
@@ -145,7 +146,7 @@ class Limiter:
         return _shortened(options, node.now() - began)
 
     def _reached(self, node: Requester) -> Iterator[NodeLimits]:
-        """Yield the limits of those that hear what is sent to a node: of all, where it stands for all."""
+        """Yield the limits of the nodes that receive a write: of all nodes for a broadcast."""
         profile = node.profile
         if node.address != profile.broadcast:
             if node in self._of:
@@ -156,7 +157,7 @@ class Limiter:
 
 
 def _steps(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any]) -> Iterator[tuple[NodeLimits, Limit]]:
-    """Yield the limits to the step of what a write changes."""
+    """Yield the step limits of what a write changes."""
     return ((one, limit) for one in reached for limit in one.touched_by(changes) if limit.max_step is not None)
 
 
@@ -171,7 +172,7 @@ def _changes(node: Requester, command: Command[Any]) -> Mapping[Hashable, Any]:
 
 
 def _remember(one: NodeLimits, node: Requester, command: Command[Any]) -> None:
-    """Remember what was confirmed. A write to all is confirmed by none, nor is what a stop left half written."""
+    """Store confirmed values. A write to all nodes is not confirmed, nor is one that a stop interrupted."""
     changes = _changes(node, command)
     for limit in one.touched_by(changes):
         one.known.pop(limit, None)
@@ -197,12 +198,12 @@ async def _value_now(node: Requester, limit: Limit, command: Command[Any], optio
     try:
         return limit.decode(await node.request(limit.read, priority=options.priority))
     except (NoReply, GarbledReply, Refused) as error:
-        what = f"its value before it is not known, and could not be read: {error.what}"
+        what = f"the current value, needed for max_step, could not be read: {error.what}"
         raise NotStarted(what, node=node, command=str(command), hint=error.hint) from error
 
 
 def _shortened(options: RequestOptions, by: float) -> RequestOptions:
-    """Return the options of what has waited already."""
+    """Return the options of a request that has already waited."""
     left = {
         name: max(0.0, limit - by)
         for name in ("start_within", "finish_within")

@@ -1,4 +1,4 @@
-"""What may be written to one quantity of a node."""
+"""Limits for writes to one quantity of a node."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
 
 ROUNDING = 1e-6
-"""A value may be so far beyond its limit, of its size: what is written is rounded to what the line carries."""
+"""Relative tolerance of limits: written values are rounded to the resolution of the protocol."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Limit:
-    """What may be written to what `read` reads, whatever it is called and however it is written.
+    """Limits for writes to the quantity that `read` reads, under any name and in any way it is written.
 
-    `minimum`, `maximum` and `max_step`, the largest change from the last confirmed value, are in the unit of what
-    `decode` makes of what is read; None for no such limit. `name` is what messages call it. Raises InvalidCommand for
-    limits between which nothing is, and for what cannot be limited: a run, a word that is never written.
+    `minimum`, `maximum` and `max_step` (largest change from the last confirmed value) are in the unit of the decoded
+    value (`decode`); None for no limit. `name` is used in messages. Raises InvalidCommand for limits that allow no
+    value, and for quantities that cannot be limited: runs, and words that are never written.
     """
 
     name: str
@@ -47,18 +47,18 @@ class Limit:
         return self.read.places
 
     def touched_by(self, changes: Mapping[Hashable, Any]) -> bool:
-        """Return whether a write changes it, or a part of it."""
+        """Return True if a write changes the quantity or a part of it."""
         return any(place in changes for place in self.places)
 
     def value_after(self, changes: Mapping[Hashable, Any]) -> Any:
-        """Return what it holds after a write. Raises InvalidCommand for one that changes only a part of it."""
+        """Return its value after a write. Raises InvalidCommand for a write that changes only a part of it."""
         assert isinstance(self.read, Placed)
         if any(changes.get(place) is None for place in self.places):
             raise InvalidCommand(f"{self.name} has limits: write it as a whole, and alone, so that they can be held")
         return self.decode(self.read.shown(changes))
 
     def check(self, value: Any) -> None:
-        """Raise InvalidCommand, naming the limit, for a value that may not be written."""
+        """Raise InvalidCommand with the limit for a value that must not be written."""
         if not self.writable:
             raise InvalidCommand(f"{self.name} may not be written: it is declared writable = false")
         if self.minimum is not None and not (value >= self.minimum or _equal(value, self.minimum)):
@@ -67,7 +67,7 @@ class Limit:
             raise InvalidCommand(f"{self.name} = {self.text(value)} is above its maximum of {self.text(self.maximum)}")
 
     def check_step(self, before: Any, value: Any) -> None:
-        """Raise InvalidCommand, naming the limit, for a value too far from the one before."""
+        """Raise InvalidCommand with the limit for a value that is too far from the current one."""
         step = abs(value - before)
         if self.max_step is not None and not (step <= self.max_step or _equal(step, self.max_step)):
             raise InvalidCommand(

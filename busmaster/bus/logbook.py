@@ -1,4 +1,4 @@
-"""What goes into the log (R14): changes of state, and no more often than a person can read."""
+"""The log of a line (R14): changes of state, not more often than a person can read."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from busmaster.bus.alarms import AlarmChanged, BusEvent
 logger = logging.getLogger("busmaster")
 
 PAUSE = 10.0
-"""Seconds in which a thing that happens again and again is logged once; the next line says how often it was."""
+"""Seconds for which a repeated message is logged once. The next line has the number of repetitions."""
 
 
 class Logbook:
@@ -32,8 +32,7 @@ class Logbook:
         self._written: dict[Hashable, tuple[float, int]] = {}
 
     def note(self, event: BusEvent, now: float) -> None:
-        """Write a line for a change of node or line, a collision, another maximum reply delay, a failed opening, an
-        alarm."""
+        """Log a change of a node or the line, a collision, a new maximum reply delay, a failed opening, or an alarm."""
         if isinstance(event, NodeChanged):
             level = logging.WARNING if event.after is Health.DOWN else logging.INFO
             text = f"{event.node.label} is {event.after.value} (was {event.before.value})"
@@ -67,15 +66,15 @@ class Logbook:
             level = logging.WARNING if event.active else logging.INFO
             self._write((AlarmChanged, event.point.key, event.limit, event.active), level, event.text, now)
         elif isinstance(event, CameUnexpected) and event.collision:
-            text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"
+            text = f"the echo differs from the bytes sent: a collision ({event.data.hex(' ')})"
             self._write(CameUnexpected, logging.WARNING, text, now)
 
     def failed_hook(self, label: str, error: Exception) -> None:
-        """Write that a user's on_return hook raised."""
+        """Log that a user's on_return hook raised an exception."""
         logger.error("%s: the on_return hook of %s failed", self._name, label, exc_info=error)
 
     def failed_choice(self, group: str, error: Exception) -> None:
-        """Write that a merge raised, or that a protocol could not say what an exchange costs."""
+        """Log that a merge, or the line time of a protocol's exchange, raised an exception."""
         logger.error("%s: the exchanges of poll group %r could not be chosen", self._name, group, exc_info=error)
 
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What the value of a point means: its names, how it is shown, when it is passed on, and what it must not leave."""
+"""The meaning of a point's value: names, display, report by exception, and alarm limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from busmaster.errors import InvalidCommand
 
 
 class MeansNothing(InvalidCommand):
-    """What is said of a point means nothing. `field` is the one that says so, `fault` what is wrong with it."""
+    """An invalid meaning. `field`: the field concerned; `fault`: what is wrong with it."""
 
     def __init__(self, field: str, fault: str) -> None:
         self.field = field
@@ -23,9 +23,9 @@ class MeansNothing(InvalidCommand):
 
 BIT_NAME = re.compile(r"[^\W\d][\w-]*")
 MOST_DIGITS = 15
-"""Behind them a float says nothing."""
+"""A float has no more significant digits."""
 SHARE = 0.01
-"""Of what lies between low and high: the hysteresis where none is given."""
+"""Default hysteresis as a share of the range between low and high."""
 OF_QUANTITIES = {
     "precision": "",
     **dict.fromkeys(("low", "high", "hysteresis"), "; for each of its changes, and these alone, write deadband = 0"),
@@ -34,9 +34,9 @@ OF_QUANTITIES = {
 
 
 class Named(int):
-    """A whole number and what it is called: it counts, compares and is stored as the number, and prints with both.
+    """A whole number with a name. It counts, compares and is stored as the number, and prints with both.
 
-    `label` is the label of the number, or the names of the bits that are set: "READY|FAULT".
+    `label`: the label of the number, or the names of the bits that are set: "READY|FAULT".
     """
 
     label: str
@@ -52,18 +52,18 @@ class Named(int):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meaning:
-    """Say what the value of a point means. Raises MeansNothing, an InvalidCommand, for what means nothing.
+    """The meaning of a point's value. Raises MeansNothing, an InvalidCommand, for an invalid combination.
 
         status = replace(drive.point("11"), meaning=Meaning(bits={"READY": 0, "FAULT": 3}))
         group.add(status, *status.bits)
 
-    `precision` is how many decimals are shown to people, 0 to 15; what is computed with and stored is
-    not rounded. `bits` names bits of a word, 0 the lowest, each of which is a point of its own; `labels` names whole
-    numbers. With `deadband` outputs are told a value only where it is further than that from what they were told
-    last, 0 for every change; with `heartbeat` at the latest after so many seconds. A value above `high` or below
-    `low` begins an alarm, which ends when it is back by `hysteresis`; that is a hundredth of what is between the
-    two, or of the one that is given, where it is left out. All but seconds is in the unit of the value.
-    `alarm_if_set` and `alarm_if_clear` name bits of `bits` that begin an alarm while they are 1, or 0.
+    `precision`: decimals for display, 0 to 15; calculations and stored values are not rounded. `bits`: names of bits of
+    a word, 0 the lowest; each is a point of its own. `labels`: names of whole numbers. `deadband`: outputs get a value
+    only if it differs from the last one sent by more than this; 0 for every change. `heartbeat`: they get it after this
+    many seconds at the latest. A value above `high` or below `low` begins an alarm, which ends when the value has
+    returned by `hysteresis`; by default a hundredth of the range between the two, or of the one that is given. All
+    except seconds are in the unit of the value. `alarm_if_set`, `alarm_if_clear`: names of `bits` that begin an alarm
+    while they are 1, or 0.
     """
 
     precision: int | None = None
@@ -82,7 +82,7 @@ class Meaning:
             raise MeansNothing(name, fault)
 
     def faults(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong, each with the name of the field that says so."""
+        """Yield the faults, each with the name of its field."""
         yield from self._faults_of_names()
         for name in ("precision", "deadband", "heartbeat", "low", "high", "hysteresis"):
             value = getattr(self, name)
@@ -103,7 +103,7 @@ class Meaning:
             if getattr(self, name) is not None:
                 yield name, f"is for quantities, and this number has {'bits' if self.bits else 'labels'}{instead}"
         if (self.bits or self.labels) and self.deadband:
-            yield "deadband", "of a number with names is 0: every change is told"
+            yield "deadband", "of a number with names is 0: every change is reported"
         holders: dict[int, str] = {}
         for name, bit in self.bits.items():
             if not BIT_NAME.fullmatch(name):
@@ -139,12 +139,12 @@ class Meaning:
 
     @property
     def watched(self) -> bool:
-        """Return whether it has a limit whose crossing is told."""
+        """Return True if it has a limit that can cause an alarm."""
         return self.low is not None or self.high is not None
 
     @property
     def margin(self) -> float:
-        """Return by how much a value must be back for its alarm to end."""
+        """Return the hysteresis."""
         if self.hysteresis is not None:
             return self.hysteresis
         if self.low is not None and self.high is not None:
@@ -152,7 +152,7 @@ class Meaning:
         return SHARE * abs(self.low or self.high or 0.0)
 
     def of_bit(self, name: str) -> Meaning:
-        """Return the meaning of one of its bits: an alarm is a flag above false, or below true."""
+        """Return the meaning of one of its bits: its alarm is above false, or below true."""
         return Meaning(
             deadband=self.deadband,
             heartbeat=self.heartbeat,
@@ -163,16 +163,16 @@ class Meaning:
 
     @property
     def by_exception(self) -> bool:
-        """Return whether outputs are told only what is new."""
+        """Return True if outputs get only changes."""
         return self.deadband is not None or self.heartbeat is not None
 
     @property
     def names(self) -> bool:
-        """Return whether values, or bits of them, have names."""
+        """Return True if values, or bits of them, have names."""
         return bool(self.bits or self.labels)
 
     def number_of(self, label: str) -> int:
-        """Return the number that has this label. Raises InvalidCommand, with all labels, if none or several have it."""
+        """Return the number with this label. Raises InvalidCommand, with all labels, if none or several have it."""
         found = [number for number, name in self.labels.items() if name == label]
         if len(found) != 1:
             known = ", ".join(f"{name!r}" for name in self.labels.values())
@@ -182,7 +182,7 @@ class Meaning:
         return found[0]
 
     def named(self, value: Any) -> Any:
-        """Return the value with its names; as it is where it has none, or other ones from its protocol."""
+        """Return the value with its names; unchanged if it has none, or names from its protocol."""
         if not isinstance(value, int | float) or value != value // 1:
             return value
         number = int(value)
@@ -194,14 +194,14 @@ class Meaning:
 
 
 PLAIN = Meaning()
-"""Of a point of which nothing is said."""
+"""The meaning of a point without one."""
 
 
 def bit_of(value: Any, bit: int) -> bool:
-    """Return whether a bit of a word is set, or a number is among flags. Raises ValueError for what is no word."""
+    """Return True if a bit of a word is set, or a number is among flags. Raises ValueError for other values."""
     number = value.value if isinstance(value, Enum) else value
     if isinstance(number, frozenset | set):
         return bit in number
     if not isinstance(number, int | float) or not isfinite(number) or number != int(number):
-        raise ValueError("it is no word")
+        raise ValueError("it is not a word")
     return bool(int(number) >> bit & 1)

@@ -40,7 +40,7 @@ __all__ = ["Health", "Node", "NodeStatistics", "Priority", "Request", "Timeline"
 
 
 class HasNode(Protocol):
-    """A handle, or a point."""
+    """A handle or a point."""
 
     @property
     def node(self) -> Requester: ...
@@ -48,11 +48,11 @@ class HasNode(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Request(Generic[T]):
-    """One request to a node: what is to be done, how, and for whom; and what became of it once it is started.
+    """One request to a node, and its result once it is started.
 
-    `touches`, `stops_seen` and `stop` are those of `Requester.request`. `client` is the program that pays for the line
-    time, or the sequence that the request is part of; without it, the program that owns the line. `probe`: it is sent
-    to a node that is down, within the budget of probes.
+    `touches`, `stops_seen` and `stop`: see `Requester.request`. `client`: the program that is charged for the line
+    time, or the sequence that the request belongs to; by default the program that owns the line. `probe`: sent to a
+    node that is DOWN, within the probe budget.
     """
 
     command: Command[T]
@@ -63,48 +63,48 @@ class Request(Generic[T]):
     client: LineClient | None = None
     probe: bool = False
     transaction: Transaction | None = None
-    """What the line makes of it, from when it is started."""
+    """The arbiter's transaction, from the start of the request on."""
 
     @property
     def sent(self) -> bool:
-        """Whether an attempt of it was handed to the line."""
+        """True if an attempt was handed to the line."""
         return self.transaction is not None and self.transaction.attempts > 0
 
 
 class Node:
-    """One node, made by `Bus.node` or by a handle. Everything that is asked of it goes through `request`."""
+    """One node, made by `Bus.node` or by a handle. All requests to it go through `request`."""
 
     def __init__(self, line: SharedLine, record: NodeRecord, asked: Timings | Learned | None = None) -> None:
         self._shared = line
         self._record = record
         self.timings = record.timings
-        """As they were asked for: its record's maximum reply delay may have been raised since."""
+        """The timings as configured. The maximum reply delay of its record may have been raised since."""
         self._asked = Learned(record.timings) if isinstance(asked, Learned) else record.timings
         self._kinds: dict[Hashable, Command[Any]] = {}
-        """Of each kind of command that was asked of it, the first: the worst case calculates with them."""
+        """The first command of each kind that was sent to it. The worst case is calculated with them."""
         self._reply_time: float | None = None
-        """Seconds from a request to its reply, as poll groups measured them; before, as somebody said, or None."""
+        """Seconds from a request to its reply, measured by poll groups; before that, a given value or None."""
         self._measured = 0
         self._to_all = record.address == record.profile.broadcast
-        """Nobody answers at its address."""
+        """True for the broadcast address, from which no node replies."""
         self._kept = False
-        """Whether the program that owns the line has named it itself."""
+        """True if the program that owns the line has named the node itself."""
         self._borrowers = 0
-        """How many have it who will give it back."""
+        """Number of clients that will give it back."""
         self._returning = asyncio.Lock()
-        """Held while its hook runs."""
+        """Held while its on_return hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
         self._sync_reads: tuple[Command[Any] | None, tuple[Command[Any], ...]] = (None, ())
-        """The probe and the sync reads that handles have set."""
+        """The probe and the sync reads set by handles."""
 
     @classmethod
     def of(cls, owner: HasNode) -> Node:
-        """Return the node behind a handle or a point: what more can be asked of it than by those.
+        """Return the node behind a handle or a point, which offers more operations.
 
-        Raises InvalidCommand where its line is not this process's.
+        Raises InvalidCommand if its line belongs to another process.
         """
         if not isinstance(owner.node, cls):
-            raise InvalidCommand(f"{owner.node.label} is no node of a bus in this process")
+            raise InvalidCommand(f"{owner.node.label} is not a node of a bus in this process")
         return owner.node
 
     @property
@@ -124,20 +124,20 @@ class Node:
 
     @property
     def label(self) -> str:
-        """Return how messages call it: "node 5"."""
+        """Return its name in messages: "node 5"."""
         return self._record.label
 
     def _rename(self, label: str) -> None:
-        """Have messages call it so from now on."""
+        """Set its name in messages."""
         self._shared.arbiter.name_node(self._record, label)
 
     @property
     def stops(self) -> int:
-        """Return how often it was told to stop, by whatever handle."""
+        """Return the number of stop commands to this node, by any handle."""
         return self._record.stops
 
     def note_stop(self) -> None:
-        """Tell the line that this node is being told to stop: what was decided before must not undo it."""
+        """Count a stop command, so that a write decided before it cannot undo it."""
         self._shared.note_stop(self._record)
 
     def now(self) -> float:
@@ -145,23 +145,23 @@ class Node:
         return self._shared.now()
 
     def latest(self, point: Any, /) -> Sample[Any] | None:
-        """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
+        """Return the newest good sample of a point in any poll group. None if a write has made it stale."""
         return self._shared.latest(point)
 
     def _held(self, point: Any, /) -> Any:
-        """Return what a point of it would have read last, by whatever name it was polled, alone or with others.
+        """Return the value that a point would have read last, whichever point or batch read it.
 
-        None where that is not known, or may have been written since.
+        None if it is not known, or may have been written since.
         """
         return self._shared.held(self._record, point)
 
     def planned(self) -> PlannedNode:
-        """Return the node as the planner sees it, with its reply time as measured so far."""
+        """Return the node as the planner uses it, with its reply time measured so far."""
         record = self._record
         return PlannedNode(record.profile, record.address, record.timings, self._reply_time)
 
     def _note_wait(self, wait: float) -> None:
-        """Note that it took so many seconds to reply: the mean of the last replies is what planning goes by."""
+        """Record a reply time, in seconds. Planning uses the mean of the last replies."""
         # A moving mean: a drive gets slower when its program grows, and plans must follow.
         self._measured = min(self._measured + 1, REPLIES_REMEMBERED)
         known = wait if self._reply_time is None else self._reply_time
@@ -190,9 +190,9 @@ class Node:
         self._shared.arbiter.expect_hook(self._record, hook is not None)
 
     def _check_shared(self, profile: Profile, timings: Timings | Learned | None, retries: int | None) -> None:
-        """Raise InvalidCommand where somebody asks for this node with anything else than it was first asked with.
+        """Raise InvalidCommand if this node is requested with options that differ from those of the first call.
 
-        What is None was left open: a profile's `merge` too.
+        None means not specified, for a profile's `merge` too.
         """
         # The usual case, without building the table below.
         own = self.profile
@@ -208,19 +208,19 @@ class Node:
         for what, differs in wanted.items():
             if differs:
                 raise InvalidCommand(
-                    f"{self.label} is in use already, and now asked for with {what}: "
+                    f"{self.label} is already in use, and was requested again with {what}: "
                     "give all handles of an address the same options, or leave them out in all but the first"
                 )
 
     def merge_reads(self, merge: Merge, /) -> None:
-        """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
+        """Replace the merge of this node's profile. Poll groups use it for this node's reads from now on."""
         self._shared.arbiter.change_profile(self._record, replace(self._record.profile, merge=merge))
 
     def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
-        """Use these reads in place of its profile's; None or an empty sequence leaves what the profile has.
+        """Replace the probe and the sync reads of its profile. None or an empty sequence keeps those of the profile.
 
-        The probe is sent to a node that may be dead; a sync read is sent where the line must prove that replies match
-        requests. Raises InvalidCommand for a write, and if another handle of the node has set other ones.
+        The probe is sent to a node that may be dead. A sync read is sent if the line must prove that replies match
+        requests. Raises InvalidCommand for a write, and if another handle of the node has set different ones.
         """
         before = self._sync_reads
         wanted = (probe or before[0], tuple(sync_reads) or before[1])
@@ -229,7 +229,7 @@ class Node:
                 raise InvalidCommand(f"{self.label}: a probe or sync read must read, and {command} writes")
         if any(said and said != now for said, now in zip(before, wanted, strict=True)):
             raise InvalidCommand(
-                f"{self.label} is in use already, and now asked for with another probe or other sync reads: "
+                f"{self.label} is already in use, and was requested again with another probe or other sync reads: "
                 "give all handles of an address the same options, or leave them out in all but the first"
             )
         self._sync_reads = wanted
@@ -238,25 +238,26 @@ class Node:
         self._shared.arbiter.change_profile(self._record, changed)
 
     def limit(self, limit: Limit, /) -> None:
-        """Refuse, from now on, every write beyond a limit, whatever names it; writes to all nodes too."""
+        """Add a limit: reject every write that violates it, under any name of the quantity, and in writes to all nodes
+        too."""
         line = self._shared
         line.limiter = line.limiter or Limiter()
         line.limiter.add(self, limit)
 
     def lift(self, limit: Limit) -> None:
-        """Hold a limit no longer; the others stay."""
+        """Remove one limit. The others stay."""
         if self._shared.limiter is not None:
             self._shared.limiter.drop(self, limit)
 
     @property
     def limits(self) -> tuple[Limit, ...]:
-        """Return the limits that are held."""
+        """Return the active limits."""
         return () if self._shared.limiter is None else self._shared.limiter.of(self)
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
+        """Raise InvalidCommand if one of these writes violates a limit, before the first of several is sent.
 
-        A `stop` is held by no limit.
+        A `stop` is not limited.
         """
         if self._shared.limiter is not None and not stop:
             for command in commands:
@@ -271,22 +272,22 @@ class Node:
         stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> T:
-        """Run one command and return its value. `RequestOptions` says what the options are.
+        """Run one command and return its value. The options are those of `RequestOptions`.
 
-        A write beyond a limit of the node raises InvalidCommand; but for a `stop`, and for a write of the safe state,
-        which are held by none.
+        A write that violates a limit of the node raises InvalidCommand. A `stop` and a write of the safe state are not
+        limited.
 
-        `touches` is the command that reads what a write changes: samples of that which are older than the write are
-        marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the
-        node was told to stop since `stops` was that.
+        `touches`: the command that reads what the write changes. Samples of it that are older than the write become
+        stale; by default all samples of the node do. `stops_seen`: if the node was sent a stop since `stops` had this
+        value, raise Superseded and send nothing.
 
-        Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
+        Raises a BusError subclass. Cancelling it frees the caller immediately and does not disturb the line (R6).
         """
         chosen = self._options(options) if options else ORDINARY
         return await self._run(Request(command, chosen, touches, stops_seen, stop))
 
     async def timed_request(self, command: Command[T], **options: Unpack[CommandOptions]) -> tuple[T, Timeline]:
-        """Do what `request` does, and return beside the value the timeline that says why it took so long."""
+        """Run one command as `request` does. Returns the value and the timeline of the request."""
         request = Request(command, self._options(options))
         value = await self._run(request)
         assert request.transaction is not None
@@ -294,7 +295,7 @@ class Node:
 
     @asynccontextmanager
     async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
-        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`."""
+        """Return this node for one exclusive sequence of requests, for `async with`; see `Requester.exclusive`."""
         hold = self._hold(max_hold)
         try:
             yield _HeldNode(self, hold)
@@ -302,7 +303,8 @@ class Node:
             self._shared.release(hold)
 
     def _within(self, request: Request[Any]) -> Requester | None:
-        """Return the node for the sequence that a request is part of, if any. Raises HoldEnded if that is over."""
+        """Return the node of the sequence that a request belongs to, if any. Raises HoldEnded if the sequence has
+        ended."""
         hold = request.client
         if not isinstance(hold, Hold):
             return None
@@ -311,17 +313,17 @@ class Node:
         return _HeldNode(self, hold)
 
     def _hold(self, max_hold: float, client: LineClient | None = None) -> Hold:
-        """Return what the requests of one sequence, of a client of the line, name as their client.
+        """Return a hold that the requests of one sequence of a client use as their client. The caller must release it.
 
-        It is to be released. Raises InvalidCommand unless `max_hold` is above 0 s, and 5 s at most.
+        Raises InvalidCommand unless `max_hold` is above 0 s and at most 5 s.
         """
         self._shared.check_loop()
         return self._shared.arbiter.exclusive(self._record, client, checked_hold(max_hold, self.label))
 
     async def _run(self, request: Request[T]) -> T:
-        """Do what `request` does, with a request that says how far it has come, also once this was cancelled.
+        """Run a request that keeps its progress, also after a cancellation.
 
-        Raises HoldEnded if the sequence that it is part of is over.
+        Raises HoldEnded if its sequence has ended.
         """
         # Most requests are reads, and most lines have no limits: neither needs a check.
         limiter = self._shared.limiter
@@ -342,17 +344,17 @@ class Node:
         return value
 
     def _options(self, given: CommandOptions) -> RequestOptions:
-        """Return the options of a request that a caller gave. Raises InvalidCommand, naming the node."""
+        """Return the options of a caller. Raises InvalidCommand with the node's name."""
         options = RequestOptions.of(given, self.label)
         if options.verify:
-            raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
+            raise InvalidCommand(f"{self.label}: verify is only available for the write methods of a handle")
         return options
 
     def _start(self, request: Request[Any], waiter: Waiter | None = None) -> Transaction:
-        """Start a request: the one way by which anything is asked of a node. Limits were checked before.
+        """Start a request. All requests to a node start here. Limits were checked before.
 
-        `waiter` gets the value or the error, perhaps before this returns; without one, the transaction's tag is a
-        future that gets them. `give_up` takes the transaction once nobody waits for it. Raises what `request` raises
+        `waiter` gets the value or the error, possibly before this returns. Without one, the transaction's tag is a
+        future for them. Pass the transaction to `give_up` if its caller stops waiting. Raises what `request` raises
         before anything is sent.
         """
         record, line, command, options = self._record, self._shared, request.command, request.options
@@ -360,23 +362,25 @@ class Node:
             raise hold_ended(self, request.client.longest, command)
         if self._to_all and not command.writes:
             raise InvalidCommand(
-                f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
+                f"{self.profile.name}: address {self.address} is for writes to all nodes; no node replies to a read"
             )
-        if get_ident() != line.thread or not line.loop_runs():  # as check_loop does: this is done for every request
+        # same as check_loop, written out: this runs for every request
+        if get_ident() != line.thread or not line.loop_runs():
             if not line.running:
                 raise line.not_open(record=record, command=str(command))
             line.check_loop()
         if type(command) not in self._kinds:
             if not hasattr(command, "open"):
-                raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
+                raise InvalidCommand(f"{self.label}: {command!r} is not a command; read it through a handle or a point")
             self._kinds[type(command)] = command
-        # Checked here, in the same step in which it is queued: a stop cannot come in between.
+        # Checked in the same step in which it is queued, so that no stop can come in between.
         if request.stops_seen is not None and request.stops_seen != record.stops:
-            raise Superseded("the node was told to stop since this was decided", node=record, command=str(command))
-        # The line is being taken to its safe state: a late write of the application would undo it.
+            raise Superseded("the node was stopped after this write was decided", node=record, command=str(command))
+        # The safe state is being sent: a late write of the application would undo it.
         if line.only_safe and command.writes and not options.safe:
             raise Superseded(LEFT, node=record, command=str(command), hint="")
-        request.transaction = transaction = Transaction(  # by position: keywords cost more, for every request
+        # positional arguments: keywords cost more, and this runs for every request
+        request.transaction = transaction = Transaction(
             record,
             command,
             options.priority,
@@ -395,17 +399,18 @@ class Node:
         return transaction
 
     def _give_up(self, transaction: Transaction) -> None:
-        """Cancel what nobody waits for any more. A write that is on the wire ends before anything else can be read."""
+        """Cancel a transaction whose caller has gone. A write on the wire ends before anything else can be read."""
         line = self._shared
         line.pump.cancel(transaction)
-        # Its end is told to nobody, but what it may have changed is: samples that were read before it are stale now.
-        # The drive may have carried it out, so values that were read before can be wrong now.
+        # Its end is not reported, but the drive may have carried it out: samples read before it are stale now.
         if transaction.writes and transaction.attempts:
             line.touched(transaction, line.now())
 
     async def probe(self) -> bool:
-        """Ask the node's cheapest read now, once. Return True if it answered (a refusal is an answer), False if not, or
-        if it could not be asked."""
+        """Send the node's cheapest read once, now. Returns True if it replied (a refusal counts), else False.
+
+        Also returns False if the request could not be sent.
+        """
         request = Request(self.profile.probe, PROBE, probe=True)
         # A refusal proves that the node is there: that is what a probe is for.
         try:
@@ -413,15 +418,15 @@ class Node:
         except Refused:
             return True
         except BusError:
-            if request.transaction is None:  # the bus is not open: nothing is known of the node
+            if request.transaction is None:  # the bus is not open, so nothing is known about the node
                 raise
             return False
         return True
 
     def suspend(self, for_: float) -> None:
-        """Let it rest for maintenance: no polls, and NodeDown for requests, for so many seconds; 0 ends that now.
+        """Suspend the node for maintenance, in seconds: no polls, and NodeDown for requests. 0 ends the suspension.
 
-        A day at most: raises InvalidCommand for more.
+        Raises InvalidCommand for more than a day.
         """
         if seconds(for_, f"{self.label}: a suspension") > LONGEST_SUSPENSION:
             raise InvalidCommand(f"{self.label}: a suspension lasts {LONGEST_SUSPENSION:g} s at most, not {for_!r}")
@@ -429,24 +434,24 @@ class Node:
 
     @property
     def suspended(self) -> bool:
-        """Return whether it rests: its polls are not sent."""
+        """Return True while it is suspended: its polls are not sent."""
         return self._shared.now() < self._record.suspended_until
 
     def _times_to_keep(self) -> tuple[LearnedTimes, ...]:
-        """Return what `begin_with` may be given in the next run: the reply times that were learned and are trusted."""
+        """Return the trusted learned reply times, for `begin_with` in the next run."""
         record = self._record
         return () if record.learning is None else record.learning.to_keep(record.timings)
 
     def _begin_with(self, known: Iterable[LearnedTimes]) -> None:
-        """Begin with what an earlier run has learned of its reply times, before it is asked anything.
+        """Start with the reply times learned in an earlier run, before the first request.
 
-        That is trusted after twenty replies; where nothing is to be learned it is left out.
+        They are trusted after twenty replies. Ignored if learning is disabled.
         """
         if self._record.learning is not None:
             self._record.learning.begin_with(known)
 
     def statistics(self) -> NodeStatistics:
-        """Return counts and latencies since the bus was opened or its statistics were reset."""
+        """Return counters and latencies since the bus was opened or its statistics were reset."""
         self._shared.check_loop()
         record = self._record
         learning = record.learning
@@ -455,7 +460,7 @@ class Node:
 
 
 def _windows(asked: Timings | Learned | None, own: Timings | Learned) -> str:
-    """Return how two reply windows differ, for messages; "" where they do not."""
+    """Return the difference of two reply windows for messages; "" if they are equal."""
     if asked is None or (one := _window(asked)) == (other := _window(own)):
         return ""
     return f" (a reply window of {one}, not {other})"
@@ -466,7 +471,7 @@ def _window(timings: Timings | Learned) -> str:
 
 
 class _HeldNode(HeldNode):
-    """A node of this process, within one sequence."""
+    """A node of this process within one sequence."""
 
     def __init__(self, node: Node, hold: Hold) -> None:
         super().__init__(node)

@@ -1,4 +1,4 @@
-"""What can be said of a bus in advance: whether what is polled fits its line, and how long a request can wait."""
+"""Predictions for a bus: whether its polls fit the line, and how long a request can wait."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from busmaster.transport.endpoints import Endpoint
 
 
 class Outlook:
-    """The outlook of one bus. `nodes` and `groups` are its own, as they are when it is asked."""
+    """The predictions for one bus. `nodes` and `groups` are the bus's own and always current."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class Outlook:
         self._groups = groups
 
     def plan_steps(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge]) -> Generator[int, None, Plan]:
-        """Calculate what becomes of the groups, and of `more`, as `planning.plan_steps` does."""
+        """Calculate the load of the groups and of `more`, as `planning.plan_steps` does."""
         groups = []
         for group in tuple(self._groups.values()):
             groups.append(group.planned())
@@ -48,7 +48,7 @@ class Outlook:
         )
 
     def worst_case_wait(self, priority: Priority) -> float:
-        """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9)."""
+        """Return the longest time, in seconds, until a request of this class, made now, is sent (R9)."""
         arbiter = self._line.arbiter
         backlog = arbiter.dispatcher.backlog
         polls = arbiter.dispatcher.schedule.polls
@@ -72,7 +72,7 @@ class Outlook:
         return next((node.profile.line for node in self._nodes.values()), LineSettings(9600))
 
     def _asked(self) -> list[Read]:
-        """Return every kind of command that was asked of a node, once for all nodes with the same timings."""
+        """Return each kind of command sent to a node, once for all nodes with the same timings."""
         asked = {
             (id(node._record.profile), id(node._record.timings), kind): (node, command)
             for node in self._nodes.values()

@@ -1,4 +1,4 @@
-"""Points: the named readable, perhaps writable, quantities of a node."""
+"""Points: the named readable, and possibly writable, quantities of a node."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Point(Generic[T]):
-    """One quantity of one node: how it is read, what its value means, and how it is written if it may be.
+    """One quantity of one node: how it is read, what its value means, and how it is written.
 
-    `item` names it as the command line does ("axis0.position", "1.17"); `command` is the exchange behind it;
-    `decode` makes its value of what the command returns (a number into an IntFlag, a scaled integer into a
-    float); `encode` builds the write command of a value and raises InvalidCommand for one out of range.
-    `meaning` says what the value means to people, outputs and alarms. With `read_after_write`, a poll
-    group that has the point reads it when a write to it is confirmed, ahead of its next cycle.
-    Two points are equal if node, item and command are, so a point may be made anew each time it is asked for.
+    `item`: its name on the command line ("axis0.position", "1.17"). `command`: the read command. `decode`: converts the
+    command's result to the value (a number to an IntFlag, a scaled integer to a float). `encode`: makes the write
+    command of a value, and raises InvalidCommand for a value out of range. `meaning`: what the value means to people,
+    outputs and alarms. `read_after_write`: a poll group that has the point reads it after a confirmed write to it,
+    before its next cycle.
+
+    Two points are equal if node, item and command are equal, so a point can be created again each time.
     """
 
     node: Requester
@@ -40,23 +41,23 @@ class Point(Generic[T]):
 
     @property
     def key(self) -> str:
-        """Return node and item, as JSON output names a sample: "5/axis0.position"."""
+        """Return address and item, as in JSON output: "5/axis0.position"."""
         return f"{self.node.address}/{self.item}"
 
     @property
     def quantity(self) -> tuple[Requester, Command[Any]]:
-        """Return what it reads, by whatever name: a write to one point makes every point of its quantity stale."""
+        """Return node and command. A write to one point makes all points of the same quantity stale."""
         return self.node, self.command
 
     def value_of(self, raw: Any) -> T:
-        """Return the value that stands for what its command returned. Raises GarbledReply for what means nothing."""
+        """Return the value for a result of its command. Raises GarbledReply if the result cannot be decoded."""
         value: T = raw
         if self.decode is not None:
             try:
                 value = self.decode(raw)
-            except Exception as bad:  # a decoder may be the application's own
+            except Exception as bad:  # a decoder may be code of the application
                 raise GarbledReply(
-                    f"{raw!r} is no value of {self.item}: {bad}", node=self.node, command=str(self.command)
+                    f"{raw!r} is not a value of {self.item}: {bad}", node=self.node, command=str(self.command)
                 ) from bad
         if self.meaning.names:
             value = self.meaning.named(value)
@@ -64,20 +65,20 @@ class Point(Generic[T]):
 
     @property
     def writable(self) -> bool:
-        """Return whether the protocol has a write for it."""
+        """Return True if the protocol has a write for it."""
         return self.encode is not None
 
     @property
     def bits(self) -> tuple[Point[bool], ...]:
-        """Return the points of the bits that its meaning names: "status.READY".
+        """Return the points of its named bits: "status.READY".
 
-        They read what it reads, so that they are polled with it at no cost. They are read-only: no telegram writes one
-        bit and leaves the others as they are by then.
+        They use the same read, so polling them costs nothing extra. They are read-only: no telegram writes one bit
+        without the others.
         """
         return tuple(self.bit(name) for name in self.meaning.bits)
 
     def bit(self, name: str) -> Point[bool]:
-        """Return the point of one bit that its meaning names. Raises InvalidCommand for another name."""
+        """Return the point of one named bit. Raises InvalidCommand for an unknown name."""
         if name not in self.meaning.bits:
             raise InvalidCommand(f"{self.item} has no bit {name!r}; {meant(name, self.meaning.bits)}")
         number, of_word = self.meaning.bits[name], self.decode
@@ -98,12 +99,12 @@ class Point(Generic[T]):
         max_step: float | None = None,
         writable: bool = True,
     ) -> Limit:
-        """Refuse, from now on, every write to what it reads that leaves its limits: InvalidCommand, and nothing sent.
+        """Limit all writes to its quantity. A write outside the limits raises InvalidCommand, and nothing is sent.
 
-        They are in the point's unit, and hold whatever names the quantity, in lists, blocks and writes to all nodes
-        too, and beside those that it has already. `max_step` is the largest change from the last confirmed value, which
-        is read first if it is not known; an urgent write may take any step. A stop, such as `disable`, always passes.
-        Returns what `Node.lift` takes back.
+        The limits are in the point's unit. They apply to all names of the quantity, to lists, blocks and writes to all
+        nodes, and in addition to existing limits. `max_step`: largest change from the last confirmed value, which is
+        read first if it is not known; an urgent write may make any step. A stop such as `disable` always passes.
+        Returns the limit, for `Node.lift`.
         """
         limit = Limit(
             name=self.item,
@@ -119,14 +120,14 @@ class Point(Generic[T]):
         return limit
 
     async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> T:
-        """Return its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough.
+        """Read its value, or, with `max_age` in seconds, use a poll group's latest sample if it is new enough.
 
-        `RequestOptions` says what the other options are.
+        The other options are those of `RequestOptions`.
         """
         if max_age is not None:
             if max_age != inf:
                 max_age = seconds(max_age, f"{self.node.label}: max_age")
-            # whichever group has it: two groups may read one quantity, and a write makes both of their samples stale
+            # from any group: two groups may read one quantity, and a write makes the samples of both stale
             sample = self.node.latest(self)
             if sample is not None and sample.error is None and sample.age(self.node.now()) <= max_age:
                 value: T = sample.value

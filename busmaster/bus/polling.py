@@ -1,4 +1,4 @@
-"""Poll groups: points with a period, and the exchanges that bring their values."""
+"""Poll groups: points with a period, and the exchanges that read their values."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from busmaster.planning.merging import WEIGHING, Merge, Served, cheapest
 __all__ = ["GroupStatistics", "PollGroup", "Quality", "Sample", "Snapshot", "Stream"]
 
 WEIGHED_AGAIN = 8
-"""Cycles after which merges are weighed once more: by then reply times are measured."""
+"""Number of cycles after which merges are evaluated again, with measured reply times."""
 
 
 class _Read(NamedTuple):
-    """One exchange of a group: the points that it serves, each with its place in a batch's value (None: all of it).
+    """One exchange of a group: its points, each with its place in a batch's value (None: the whole value).
 
-    `bytes_time` is what its bytes take on the line up to the end of its reply, `unwaited` with what is behind it,
-    `steps` how often a reply is waited for, and `guess` what it takes as a whole while the node's reply time is
-    unknown. `blank` has all points of the group, in their order.
+    `bytes_time`: wire time until the end of the reply. `unwaited`: line time without the wait for replies. `steps`:
+    number of replies. `guess`: total line time while the node's reply time is unknown. `blank`: all points of the group
+    in order.
     """
 
     node: Node
@@ -59,13 +59,13 @@ class _Read(NamedTuple):
 
     @property
     def line_time(self) -> float:
-        """Return the seconds of the line that it takes, by the node's reply time as measured so far."""
+        """Return its line time in seconds, with the node's reply time measured so far."""
         wait = self.node._reply_time
         return self.guess if wait is None else self.unwaited + self.steps * wait
 
 
 class PollGroup(Cycles):
-    """Points that are read once a period. Made by `Bus.poll_group`; iterate it, or look at `latest`."""
+    """Points that are read once per period. Made by `Bus.poll_group`. Iterate over it, or read `latest`."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class PollGroup(Cycles):
         self._on_close = on_close
         self._priority = priority
         self._client = client
-        """Who pays for the line time; None: the line's owner."""
+        """The client that is charged for the line time; None: the line's owner."""
         self._merge = tuple(merge)
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
@@ -93,14 +93,14 @@ class PollGroup(Cycles):
         self._points: dict[Point[Any], Node] = {}
         self._watched: tuple[Point[Any], ...] = ()
         self.read_after_write: tuple[Point[Any], ...] = ()
-        """Those of its points that are read when a write to them is confirmed."""
+        """Those of its points that are read after a confirmed write to them."""
         self._between: dict[Point[Any], Sample[Any]] = {}
-        """What was read since the last cycle ended: the one that runs may have read before the write."""
+        """Samples read since the end of the last cycle: the running cycle may have read before the write."""
         self._told_outdated: dict[Point[Any], Sample[Any]] = {}
-        """The sample of each point that was reported as stale last."""
+        """The sample of each point that was last reported as stale."""
         self._tally = Tally(self._poll)
         self._good_at: dict[Point[Any], float] = {}
-        """When each point that cannot be read was last read, in seconds since 1970."""
+        """Time of the last good value of each point that cannot be read now, in seconds since 1970."""
         # the cycle that runs
         self._cycle = 0
         self._samples: dict[Point[Any], Sample[Any]] = {}
@@ -112,11 +112,11 @@ class PollGroup(Cycles):
 
     @property
     def points(self) -> tuple[Point[Any], ...]:
-        """Return the points that a cycle reads, in their order."""
+        """Return the points of a cycle, in order."""
         return tuple(self._points)
 
     def points_of(self, record: NodeRecord) -> list[Point[Any]]:
-        """Return those of its points that are of this node."""
+        """Return the points of this node."""
         return [point for point, node in self._points.items() if node._record is record]
 
     @property
@@ -126,39 +126,39 @@ class PollGroup(Cycles):
 
     @property
     def poll(self) -> Poll:
-        """Return the arbiter's side of the group."""
+        """Return the arbiter's poll of the group."""
         return self._poll
 
     @property
     def paused(self) -> bool:
-        """Return whether its cycles rest."""
+        """Return True while it is paused."""
         return self._poll.paused
 
     def add(self, *points: Point[Any]) -> None:
-        """Read these too, from the next cycle on; with hundreds of points, some milliseconds later.
+        """Add points, from the next cycle on; with hundreds of points, some milliseconds later.
 
-        Points that it has already are left alone. Raises InvalidCommand for a point of another bus, and for one of the
-        address at which all nodes listen and none answers.
+        Points that it already has are ignored. Raises InvalidCommand for a point of another bus, and for a point of the
+        broadcast address.
         """
         self._line.check_loop()
         fresh: dict[Point[Any], Node] = {}
         for point in points:
             node = point.node
-            # A point of another line would be read by nobody, without any error.
+            # A point of another line would silently never be read.
             if not isinstance(node, Node) or node._shared is not self._line:
                 raise InvalidCommand(f"poll group {self.name!r}: {point.key} belongs to another bus")
             if node.address == node.profile.broadcast:
                 raise InvalidCommand(
-                    f"poll group {self.name!r}: nobody answers a read of {point.key}, which is for all"
+                    f"poll group {self.name!r}: no node replies to a read of {point.key}, a broadcast address"
                 )
             if point not in self._points:
                 fresh[point] = node
-        # Only now: an error in the middle of the list must leave the group as it was.
+        # Only after all checks: an error in the middle of the list must leave the group unchanged.
         self._points.update(fresh)
         self._points_changed()
 
     def remove(self, *points: Point[Any]) -> None:
-        """Read these no more, from the next cycle on; with hundreds of points, some milliseconds later."""
+        """Remove points, from the next cycle on; with hundreds of points, some milliseconds later."""
         self._line.check_loop()
         for point in points:
             self._points.pop(point, None)
@@ -167,21 +167,21 @@ class PollGroup(Cycles):
         self._points_changed()
 
     def pause(self) -> None:
-        """Start no cycle, and count none missed, until `resume`."""
+        """Start no cycle until `resume`. These cycles do not count as missed."""
         self._poll.paused = True
 
     def resume(self) -> None:
-        """Go back on the grid. The time in between is no period."""
+        """Continue on the grid. The paused time does not count as a period."""
         if self._poll.paused:
             self._poll.paused = False
             self._tally.last = None
 
     def demand(self) -> None:
-        """Poll now, off the grid. A cycle that is running serves."""
+        """Run one cycle now, outside the grid. If a cycle is running, that one is used."""
         self._line.demand(self._poll)
 
     def close(self) -> None:
-        """End the group; its consumers end after what they hold."""
+        """Close the group. Its consumers end after the snapshots in their buffers."""
         self._line.check_loop()
         # close() may be called again by the bus that closes, or by `async with`.
         if self._poll.active:
@@ -193,31 +193,31 @@ class PollGroup(Cycles):
         self._end()
 
     def subscribe(self, buffer: int = 16, *, changes: bool = False) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more.
+        """Return a consumer that buffers this many snapshots. Close it when it is no longer used.
 
-        With `changes` it also gets what becomes of values between two cycles, each as a snapshot of these values alone.
+        With `changes` it also gets the changes between two cycles, each as a snapshot of the changed values.
         """
         self._line.check_loop()
         return super().subscribe(buffer, changes=changes)
 
     def statistics(self) -> GroupStatistics:
-        """Return an immutable snapshot of its counts."""
+        """Return an immutable snapshot of its counters."""
         self._line.check_loop()
         return self._tally.statistics(self._poll)
 
     @property
     def recent_periods(self) -> tuple[float, ...]:
-        """Return the seconds from cycle to cycle of the last thousand, without the time for which it was paused."""
+        """Return the seconds between the last thousand cycles, without paused time."""
         return tuple(self._tally.recent)
 
     def reset_statistics(self) -> None:
-        """Start its counts again; cycles keep their numbers."""
+        """Reset its counters. Cycles keep their numbers."""
         self._poll.jitter = Histogram()
         self._tally = Tally(self._poll)
 
     def planned(self) -> PlannedGroup:
-        """Return the group as the planner sees it, with reply times as measured so far."""
-        # Refused merges are left out: the plan must calculate with what the line really sends.
+        """Return the group as the planner uses it, with reply times measured so far."""
+        # Refused merges are left out: the plan must use the exchanges that are really sent.
         nodes = {node: node.planned() for node in set(self._points.values())}
         for node, plan in nodes.items():
             if self._refused and plan.profile.merge is not None:
@@ -227,9 +227,10 @@ class PollGroup(Cycles):
         return PlannedGroup(self.name, self._poll.period, reads, self._poll.phase, self._priority, merges)
 
     def sampled(self, transaction: Transaction) -> None:
-        """Make the samples of an exchange that is over. Runs in the pump: no user code but decoders."""
+        """Create the samples of a finished exchange. Runs in the pump: no user code except decoders."""
         read: _Read = transaction.tag
-        # Samples are made as each exchange ends: all of a large group's at the end of its cycle would hold the loop.
+        # Samples are made at the end of each exchange: making all of a large group at the end of its cycle would block
+        # the loop.
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
             self._samples = read.blank.copy()
@@ -240,7 +241,7 @@ class PollGroup(Cycles):
         self._line_time += read.line_time
         if transaction.error is None:
             _measure(transaction, read)
-        # A refused batch says nothing of its items: they are read one by one instead.
+        # A refused batch says nothing about its items: they are read one by one instead.
         elif read.served.batch and isinstance(transaction.error, Refused):
             self._refusals.append(read)
         for point, place in read.points:
@@ -251,10 +252,10 @@ class PollGroup(Cycles):
             self._qualities[sample.quality] += 1
 
     def cycle_finished(self) -> None:
-        """Hand the snapshot of a cycle round whose exchanges are over. Runs in the pump: no user code."""
+        """Publish the snapshot of a finished cycle. Runs in the pump: no user code."""
         poll = self._poll
         if poll.fresh is None:
-            poll.cost = self._line_time  # the cycle before says what one costs: nobody weighs all groups
+            poll.cost = self._line_time  # uses the cost of the last cycle, so that not all groups are calculated again
         if self._refusals:
             self._fall_back()  # no snapshot yet: the single reads follow in the same period
             return
@@ -273,7 +274,7 @@ class PollGroup(Cycles):
         ]
         self._tell(snapshot)
         self._line.alarms.look(self._watched, self._samples)
-        # Once: choosing anew whenever a mean moves would make the cycles differ for ever.
+        # Only once: a new choice with each change of a mean would make the cycles differ all the time.
         if poll.cycles == WEIGHED_AGAIN:
             self._choose()
 
@@ -283,12 +284,12 @@ class PollGroup(Cycles):
         quality = Quality.BAD
         if error is None:
             quality = Quality.LATE if transaction.late else Quality.GOOD
-            # One comparison on a line without writes; only then the search for the write that matters.
+            # One comparison on a line without writes; only then the search for the relevant write.
             if self._line.last_touched > transaction.started and self._line.is_stale(point, transaction.started):
                 quality = Quality.STALE
             try:
                 value = point.value_of(transaction.value if place is None else transaction.value[place])
-            except GarbledReply as bad:  # an error of its point alone: the exchange's other points are sound
+            except GarbledReply as bad:  # an error of this point only: the other points of the exchange are good
                 error, quality = bad, Quality.BAD
         timeline = transaction.timeline()
         finished = transaction.ended_at
@@ -296,16 +297,16 @@ class PollGroup(Cycles):
         return Sample(value, error, self._poll.due, timeline.started, finished, quality, timeline, wall)
 
     def _note_good(self, point: Point[Any]) -> None:
-        """Keep when a point was last read, as its sample of the cycle before is about to be replaced by an error."""
+        """Store when a point was last read, because its last good sample is about to be replaced by an error."""
         before = None if self.latest is None else self.latest.samples.get(point)
-        # Kept only while a point fails: for all others the sample itself has the time.
+        # Stored only while a point fails: otherwise the sample has the time.
         if before is not None and before.error is None:
             self._good_at[point] = before.wall
 
     def good_at(self, point: Point[Any]) -> float | None:
-        """Return when a point was last read without an error, in seconds since 1970; None if it never was.
+        """Return when a point was last read without an error, in seconds since 1970; None if never.
 
-        May be called in any thread.
+        Thread-safe.
         """
         sample = None if self.latest is None else self.latest.samples.get(point)
         if sample is None or sample.error is not None:
@@ -313,11 +314,11 @@ class PollGroup(Cycles):
         return sample.wall
 
     def _age(self) -> None:
-        """Mark the samples that were read before a write to their point that ended meanwhile."""
+        """Mark samples as stale that were read before a write to their point that has ended in the meantime."""
         if self._line.last_touched <= self._poll.started:
             return
         for transaction in self._poll.results:
-            # Per node first: most nodes of a line are never written.
+            # Checked per node first: most nodes of a line are never written.
             if not self._line.written_since(transaction.node, transaction.started):
                 continue
             for point, _ in transaction.tag.points:
@@ -334,7 +335,7 @@ class PollGroup(Cycles):
     # between two cycles
 
     def take_reading(self, read: Point[Any], reading: Transaction) -> None:
-        """Take the value that a read of one of its quantities brought, if it is younger than what the group has."""
+        """Use the value of a read of one of its quantities if it is newer than the group's sample."""
         latest = self.latest
         # Before the first cycle there is no snapshot that the value could replace.
         if latest is None or not self._poll.active:
@@ -357,9 +358,9 @@ class PollGroup(Cycles):
         self._line.alarms.look([point for point in self._watched if point in fresh], fresh)
 
     def report_outdated(self, record: NodeRecord, when: float) -> None:
-        """Report to consumers of changes which values a write that ended just now has made stale."""
+        """Report to consumers of changes which values a write that has just ended has made stale."""
         latest = self.latest
-        # Without consumers of changes nothing is calculated: this runs at every confirmed write.
+        # Calculated only if there are consumers of changes: this runs for every confirmed write.
         if latest is None or not self._consumers_of_changes:
             return
         to_all, before = record.address == record.profile.broadcast, nextafter(when, -inf)
@@ -377,7 +378,7 @@ class PollGroup(Cycles):
             self._tell_change(Outdated(self.name, latest.cycle, *times, self._poll.missed, wall, outdated))
 
     def _use_readings(self) -> None:
-        """Let no value of the cycle that ends now replace a younger one that was read after a write."""
+        """Keep values that were read after a write, if the finished cycle has read them before the write."""
         for point, reading in self._between.items():
             sample = self._samples.get(point)
             if sample is None or reading.started is None or not _is_older(sample, reading.started):
@@ -397,24 +398,24 @@ class PollGroup(Cycles):
         self._choose()
 
     def _watch(self, points: tuple[Point[Any], ...]) -> None:
-        """Look for alarms of these points from now on, and of no others."""
+        """Set the points that are checked for alarms."""
         before, self._watched = self._watched, points
-        # in this order: an alarm of a point that stays goes on
+        # in this order, so that the alarm of a point that stays continues
         self._line.alarms.watch(points)
         self._line.alarms.forget(before)
 
     def _choose(self) -> None:
-        """Choose the exchanges anew: a piece at a time, so that the line goes on (see Schedule.prepare)."""
+        """Choose the exchanges again, in slices, so that the line continues (see Schedule.prepare)."""
         self._poll.preparation = self._choosing()
         self._line.prepare(self._poll)
 
     def _choosing(self) -> Iterator[int]:
-        """Give the poll its transactions and its cost, if they are other ones than it has."""
-        for merged in (True, False):  # a merge that fails costs its savings, not the group
+        """Give the poll its transactions and its cost, if they have changed."""
+        for merged in (True, False):  # if a merge fails, the group runs without merges
             try:
                 reads = yield from self._reads(merged)
                 break
-            except Exception as bug:  # a merge may be the application's own
+            except Exception as bug:  # a merge may be code of the application
                 self._line.logbook.failed_choice(self.name, bug)
         else:
             return
@@ -432,7 +433,7 @@ class PollGroup(Cycles):
         poll.cost = sum(read.line_time for read in reads)
 
     def _reads(self, merged: bool) -> Generator[int, None, list[_Read]]:
-        """Choose the reads: points with one command share an exchange, and merges are taken where they are cheaper."""
+        """Choose the reads: points with the same command share an exchange, and merges are used if they are cheaper."""
         behind: dict[Node, dict[Command[Any], list[Point[Any]]]] = {}
         for point, node in tuple(self._points.items()):
             # Points that read the same (a word and its bits) share one exchange.
@@ -469,7 +470,7 @@ class PollGroup(Cycles):
         return _Read(node, served, points, bytes_time, unwaited, 1 + len(exchange.later), guess, blank)
 
     def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
-        """Return the same merge without what this node (or any, if None) has refused."""
+        """Return the merge without the commands that this node (None: any node) has refused."""
         refused = {command for who, command in self._refused if node in (None, who)}
 
         def sound(commands: Sequence[Command[Any]]) -> Sequence[Batch]:
@@ -478,18 +479,18 @@ class PollGroup(Cycles):
         return sound if refused else merge
 
     def _fall_back(self) -> None:
-        """Ask the commands of a refused batch at once, one by one: the refusal says nothing of them."""
+        """Send the commands of a refused batch now, one by one: the refusal says nothing about them."""
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
         self._line.demand(self._poll)
 
 
 def _is_older(sample: Sample[Any], started: float) -> bool:
-    """Return whether a sample was read, or given up, before a read that began then."""
+    """Return True if a sample was read, or failed, before a read that began at `started`."""
     return (sample.finished if sample.started is None else sample.started) < started
 
 
 def _measure(transaction: Transaction, read: _Read) -> None:
-    """Note what the node takes to reply, as the mean over the last of its replies."""
-    if transaction.attempts == 1:  # of a repeated one, the time includes what the failed attempts cost
+    """Update the mean reply time of the node."""
+    if transaction.attempts == 1:  # the time of a retried request includes its failed attempts
         read.node._note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.steps)

@@ -1,4 +1,4 @@
-"""Reads of points after confirmed writes to them: what `read_after_write` of a point asks for."""
+"""Reads of points after confirmed writes to them (`read_after_write`)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from busmaster.errors import BusError, InvalidCommand
 
 
 class ReadsAfterWrites:
-    """The reads of one line after writes: they are reads of the line's owner, in the class of its polls.
+    """The reads of one line after writes. They belong to the line's owner and have the priority of its polls.
 
-    The confirmation of a write never waits for its read, and commands go before it as they go before polls. Where
-    more writes to the same quantity are confirmed before its read is sent, that one read serves all of them. A read
-    that cannot be sent within the period of the group is given up: the next poll brings the value.
+    The confirmation of a write never waits for its read, and commands go before it. If several writes to the same
+    quantity are confirmed before its read is sent, one read serves all of them. A read that cannot be sent within the
+    period of the group is dropped: the next poll reads the value.
     """
 
     def __init__(
@@ -33,27 +33,27 @@ class ReadsAfterWrites:
         self._groups = groups
         self._start = start
         self._waiting: set[object] = set()
-        """The quantities that are being read, or wait to be."""
+        """The quantities with a queued or running read."""
         self.reset()
 
     def reset(self) -> None:
-        """Start the counts again."""
+        """Reset the counters."""
         self.read = 0
-        """Reads that brought a value."""
+        """Reads that returned a value."""
         self.failed = 0
-        """Reads that were not sent in time, or not answered."""
+        """Reads that were not sent in time, or had no reply."""
         self.shared = 0
-        """Writes that needed no read of their own, because one that waited served them too."""
+        """Writes that were served by the queued read of an earlier write."""
 
     def note(self, write: Transaction, when: float) -> None:
-        """Read what a write has changed that ended just now: if it is confirmed, and a polled point asks for it."""
+        """Start the reads after a write that has just ended, if it is confirmed and a polled point requests it."""
         if write.error is not None or write.phase is not ENDED:
             return  # unconfirmed: its points are stale until they are polled
         before = nextafter(when, float("-inf"))
         for group in self._groups.values():
             for point in group.read_after_write:
                 node = Node.of(point)
-                # not after a write to all: no node confirms that, and a read of each would hold up the line
+                # not after a write to all nodes: it is not confirmed, and reading each node would occupy the line
                 if node._record is write.node and self._line.is_stale(point, before):
                     self._want(point, node, group.period)
 
@@ -65,7 +65,7 @@ class ReadsAfterWrites:
         self._start(self._read(point, node, within))
 
     async def _read(self, point: Point[Any], node: Node, within: float) -> None:
-        """Read a point once, and give its value to the groups that poll it."""
+        """Read a point once and pass its value to the groups that poll it."""
         options = RequestOptions(priority=Priority.POLL, start_within=within)
         try:
             request = Request(point.command, options)
@@ -74,7 +74,7 @@ class ReadsAfterWrites:
             self.read += 1
             for group in self._groups.values():
                 group.take_reading(point, request.transaction)
-        except (BusError, InvalidCommand):  # InvalidCommand: the bus was closed, or the node given back, meanwhile
+        except (BusError, InvalidCommand):  # InvalidCommand: the bus was closed or the node given back in the meantime
             self.failed += 1
         finally:
             self._waiting.discard(point.quantity)

@@ -1,4 +1,4 @@
-"""What handles and points need of a node, whoever owns its line; and the options that their coroutines take."""
+"""The interface of a node for handles and points, wherever its line is, and the options of requests."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 
 def checked_priority(value: Priority | int) -> Priority:
-    """Return the class that `value` is, or is the number of. Raises InvalidCommand for anything else."""
+    """Return a priority from a Priority or its number. Raises InvalidCommand for any other value."""
     return Priority(whole_number(value, min(Priority), max(Priority), "a priority"))
 
 
@@ -47,7 +47,7 @@ def checked_retries(value: int) -> int:
 
 
 class ReadOptions(TypedDict, total=False):
-    """The keyword arguments of what reads: see `RequestOptions`. None is as good as left out."""
+    """Keyword arguments of reading methods; see `RequestOptions`. None is the same as omitted."""
 
     priority: Priority | None
     start_within: float | None
@@ -56,30 +56,30 @@ class ReadOptions(TypedDict, total=False):
 
 
 class CommandOptions(ReadOptions, total=False):
-    """The keyword arguments of what runs one command."""
+    """Keyword arguments of methods that run one command."""
 
     idempotent: bool | None
     safe: bool | None
 
 
 class WriteOptions(CommandOptions, total=False):
-    """The keyword arguments of a handle's `write`."""
+    """Keyword arguments of a handle's `write`."""
 
     verify: bool | None
 
 
 @dataclass(frozen=True, slots=True)
 class RequestOptions:
-    """How a request is to be made. Raises InvalidCommand for what is no such option.
+    """Options of a request. Raises InvalidCommand for invalid values.
 
-    `priority`: its class, a Priority or its number. `start_within`, in seconds: NotStarted if it could not be sent by
-    then; for each exchange, where a call takes several. `finish_within`, in seconds, for the call as a whole: a caller
-    who gives up knows what became of it. NotStarted: nothing was sent. WriteUnconfirmed: a write, or a part of it, was
-    sent, and how it ended is not known. NoReply: a read was sent, and not answered yet. What is on the wire by then
-    runs out unheard, and is not repeated. `retries`, 0 to 100, in place of the node's. `idempotent`: whether a write
-    may be repeated after an unknown outcome (R7), in place of what its command says. `verify`: a handle's `write`
-    reads back what it wrote, and raises VerifyFailed if that differs. `safe`: this write is of the safe state in which
-    a line is left, and accepted when no other is (`ext.take_only_safe_writes`); no limit of its point holds it.
+    `priority`: its class, a Priority or its number. `start_within`: seconds after which an unsent request fails with
+    NotStarted; applies to each exchange if a call takes several. `finish_within`: seconds for the whole call. Then the
+    caller gets NotStarted if nothing was sent, WriteUnconfirmed if a write or a part of it was sent and its outcome is
+    unknown, or NoReply if a read was sent and not answered yet. An exchange on the wire is finished without its caller
+    and not repeated. `retries`: 0 to 100, instead of the node's. `idempotent`: a write may be repeated after an unknown
+    outcome (R7), instead of the command's own setting. `verify`: a handle's `write` reads the value back and raises
+    VerifyFailed if it differs. `safe`: the write belongs to the safe state in which a line is left. It is accepted when
+    other writes are not (`ext.take_only_safe_writes`) and is not limited.
     """
 
     priority: Priority = COMMAND
@@ -91,7 +91,7 @@ class RequestOptions:
     safe: bool = False
 
     def __post_init__(self) -> None:
-        # A bare 0 is not the member URGENT: such a write would pass R7 by.
+        # A bare 0 is not the member URGENT, and such a write would bypass R7.
         if type(self.priority) is not Priority:
             object.__setattr__(self, "priority", checked_priority(self.priority))
         if self.start_within is not None:
@@ -103,7 +103,7 @@ class RequestOptions:
 
     @classmethod
     def of(cls, given: WriteOptions | CommandOptions | ReadOptions, label: str) -> RequestOptions:
-        """Return what a caller gave. Raises InvalidCommand, naming the node, for what is no such option."""
+        """Return the options of a caller. Raises InvalidCommand with the node's name for invalid options."""
         chosen = cast("dict[str, Any]", {name: value for name, value in given.items() if value is not None})
         try:
             return cls(**chosen)
@@ -112,11 +112,12 @@ class RequestOptions:
 
 
 ORDINARY = RequestOptions()
-"""Those of a caller who gave none."""
+"""The options of a caller that gave none."""
 
 
 class Requester(Protocol):
-    """One node of a line. `Node` is one; so is whatever passes the requests on to the process that owns the line."""
+    """One node of a line. Implemented by `Node`, and by objects that pass requests to the process that owns the
+    line."""
 
     @property
     def line(self) -> str:
@@ -125,7 +126,7 @@ class Requester(Protocol):
 
     @property
     def label(self) -> str:
-        """Return what messages call it: "node 5"."""
+        """Return its name in messages: "node 5"."""
         ...
 
     @property
@@ -140,11 +141,11 @@ class Requester(Protocol):
 
     @property
     def stops(self) -> int:
-        """Return how often it was told to stop, by whatever handle, of whatever program."""
+        """Return the number of stop commands to this node, by any handle of any program."""
         ...
 
     def note_stop(self) -> None:
-        """Tell the line that this node is being told to stop: what was decided before must not undo it."""
+        """Count a stop command, so that a write decided before it cannot undo it."""
         ...
 
     def now(self) -> float:
@@ -152,25 +153,25 @@ class Requester(Protocol):
         ...
 
     def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
+        """Return the newest good sample of a point in any poll group. None if a write has made it stale."""
         ...
 
     def merge_reads(self, merge: Merge, /) -> None:
-        """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
+        """Replace the merge of this node's profile. Poll groups use it for this node's reads from now on."""
         ...
 
     def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
-        """Use these reads in place of its profile's; None or an empty sequence leaves what the profile has."""
+        """Replace the probe and the sync reads of its profile. None or an empty sequence keeps those of the profile."""
         ...
 
     def limit(self, limit: Limit, /) -> None:
-        """Refuse, from now on, every write beyond a limit, whatever names what it writes."""
+        """Add a limit: reject every write that violates it, under any name of the quantity."""
         ...
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
+        """Raise InvalidCommand if one of these writes violates a limit, before the first of several is sent.
 
-        A `stop` is held by no limit.
+        A `stop` is not limited.
         """
         ...
 
@@ -184,28 +185,29 @@ class Requester(Protocol):
         stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> T:
-        """Run one command and return its value. One that stops the node (`stop`) is held by no limit.
+        """Run one command and return its value. A command that stops the node (`stop`) is not limited.
 
-        `touches` is the command that reads what a write changes: samples of that which are older than the write are
-        marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the
-        node was told to stop since `stops` was that. Raises a BusError subclass. Cancelling it frees the caller at once
-        and never disturbs the line (R6).
+        `touches`: the command that reads what the write changes. Samples of it that are older than the write become
+        stale; by default all samples of the node do. `stops_seen`: if the node was sent a stop since `stops` had this
+        value, raise Superseded and send nothing. Raises a BusError subclass. Cancelling it frees the caller immediately
+        and does not disturb the line (R6).
         """
         ...
 
     def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
-        """Return, for `async with`, this node for a sequence of requests: nothing but what is urgent comes between.
+        """Return this node for an exclusive sequence of requests, for `async with`. Only urgent requests go between
+        them.
 
-        From when the first of them is sent, the line is held until the block is left, `max_hold` seconds at most (up to
-        5), to the end of the exchange that is on the wire then; what is asked in it later raises HoldEnded, and is not
-        sent. Only what is asked of the node that the block is given is of the sequence: anything else, of this program
-        too, waits.
+        The line is held from the first request until the block is left, for at most `max_hold` seconds (up to 5) and to
+        the end of the exchange that is then on the wire. Later requests in the block raise HoldEnded and are not sent.
+        Only requests to the node returned for the block belong to the sequence; all other requests, of this program
+        too, wait.
         """
         ...
 
 
 class NodeSource(Protocol):
-    """What has nodes: a bus, wherever its line is."""
+    """An object that has nodes: a bus, wherever its line is."""
 
     def node(
         self, profile: Profile, address: int, /, *, timings: Timings | Learned | None = None, retries: int | None = None
@@ -215,17 +217,17 @@ class NodeSource(Protocol):
 
 
 class SeveralRequests:
-    """The requests of one call, one after the other, by the call's options: `finish_within` is for all of them.
+    """The requests of one call, one after the other. `finish_within` applies to all of them together.
 
-    Once a part is written, what cannot be sent any more ends as WriteUnconfirmed: NotStarted would say that nothing
-    was. Raises InvalidCommand for a write to all nodes that is to be verified.
+    If a part is written and the rest cannot be sent, the call raises WriteUnconfirmed: NotStarted would mean that
+    nothing was sent. Raises InvalidCommand for a write to all nodes with `verify`.
     """
 
     def __init__(self, node: Requester, given: WriteOptions | ReadOptions) -> None:
         self._node = node
         chosen = RequestOptions.of(given, node.label) if given else ORDINARY
         if chosen.verify and node.address == node.profile.broadcast:
-            raise InvalidCommand(f"{node.profile.name}: a write to all cannot be verified: nobody answers a read")
+            raise InvalidCommand(f"{node.profile.name}: a write to all cannot be verified: no node replies to a read")
         self.verify = chosen.verify
         self._finish_by = None if chosen.finish_within is None else node.now() + chosen.finish_within
         several = {name: value for name, value in given.items() if name not in ("verify", "finish_within")}
@@ -234,13 +236,13 @@ class SeveralRequests:
         self._written = False
 
     async def request(self, command: Command[T], *, touches: Command[Any] | None = None) -> T:
-        """Run one more command. Raises as `Requester.request`."""
+        """Run the next command. Raises as `Requester.request` does."""
         value = await self._in_time(command, self._options, "only a part of it was written", touches)
         self._written = self._written or command.writes
         return value
 
     async def read_back(self, command: Command[T]) -> T:
-        """Read what was written, by the call's priority and within its time."""
+        """Read the written value back, with the call's priority and within its time."""
         return await self._in_time(command, self._reading, "acknowledged, but not read back")
 
     async def _in_time(

@@ -1,4 +1,4 @@
-"""What a cycle brings of one point: its value, when it was asked for, and how good it is."""
+"""The result of one point in a cycle: value, time and quality."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ T = TypeVar("T")
 
 
 class Quality(enum.Enum):
-    """GOOD; LATE: begun after `late_after`; STALE: older than a write to it; BAD: no value; OVERHEARD: taken
-    from another master's exchange, of which a listener may have missed a part."""
+    """Quality of a value.
+
+    GOOD. LATE: the reply began after `late_after`. STALE: older than a write to it. BAD: no value. OVERHEARD: received
+    from another master's exchange, of which a part may have been missed.
+    """
 
     GOOD = "good"
     LATE = "late"
@@ -23,15 +26,15 @@ class Quality(enum.Enum):
 
     @property
     def is_current(self) -> bool:
-        """The value was read by this line's own master, and nothing is known that would have changed it since."""
+        """True if this line's master read the value, and no later write is known."""
         return self in (Quality.GOOD, Quality.LATE)
 
 
 class Sample(NamedTuple, Generic[T]):
-    """One point's outcome in one cycle. Times are the bus's clock (`bus.now()`), in seconds.
+    """One point's result in one cycle. Times are on the bus's clock (`bus.now()`), in seconds.
 
-    `value` is None where there is an `error`. `wall` is `finished` by the machine's clock, in seconds since 1970: one
-    look at that clock serves a cycle, and one that was set is followed with the next.
+    `value` is None if there is an `error`. `wall`: `finished` in seconds since 1970, by the machine's clock. That clock
+    is read once per cycle, so setting it takes effect with the next cycle.
     """
 
     value: T
@@ -44,5 +47,5 @@ class Sample(NamedTuple, Generic[T]):
     wall: float
 
     def age(self, now: float) -> float:
-        """Return the seconds since the value was asked for."""
+        """Return the seconds since the value was requested."""
         return now - (self.finished if self.started is None else self.started)

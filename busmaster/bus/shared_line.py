@@ -1,4 +1,5 @@
-"""What the nodes and the poll groups of one bus share: its line, its clocks, and what writes have made stale."""
+"""State shared by the nodes and poll groups of one bus: the line, its clocks, and which values writes have made
+stale."""
 
 from __future__ import annotations
 
@@ -29,11 +30,11 @@ from busmaster.planning import Sharing
 from busmaster.transport.pump import Pump
 
 CLOCK_WAS_SET = 0.005
-"""Seconds by which two clocks do not differ by themselves between two looks at them."""
+"""Difference in seconds above which the machine's clock counts as set."""
 
 
 class SharedLine:
-    """The line of one bus. `name` is its port's."""
+    """The line of one bus. `name` is its port's name."""
 
     def __init__(self, name: str, arbiter: Arbiter) -> None:
         self.name = name
@@ -43,63 +44,63 @@ class SharedLine:
         self.logbook = Logbook(name)
         self.losses = LossLog()
         self.limiter: Limiter | None = None
-        """None while nothing is limited."""
+        """None while no limit is set."""
         self.clients = 0
-        """How many other programs share the line."""
+        """Number of other programs that share the line."""
         self.closed = False
         self.only_safe = 0
-        """How many have said that no write is to be accepted but those of the safe state."""
+        """Number of callers that currently allow only writes of the safe state."""
         self.thread = 0
-        """In which its loop runs; 0 while the bus is not open."""
+        """Thread of its event loop; 0 while the bus is not open."""
         self.loop_runs: Callable[[], bool] = lambda: False
         self.on_stop: list[Callable[[NodeRecord], None]] = []
-        """Told, at once, when a node is told to stop."""
+        """Called immediately when a node is stopped."""
         self.on_touched: list[Callable[[NodeRecord, float], None]] = []
-        """Told, at once, of which node a write is over, and when it ended."""
+        """Called immediately when a write has ended, with the node and the time."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
         self.answers_of: dict[str, list[Answer]] = {}
-        """What its last cycle brought, by the group's name."""
+        """Replies of the last cycle, by the group's name."""
         self.last_touched = -inf
-        """When the last write to anything ended."""
+        """When the last write to any node ended."""
         self._all_touched = -inf
         self._touched: dict[object, float] = {}
         self._written: dict[NodeRecord, float] = {}
         self._wall_offset = inf
 
     def take_writes_again(self) -> None:
-        """Accept every write again, unless somebody else has said otherwise."""
+        """Accept all writes again, unless another caller still allows only safe writes."""
         self.only_safe -= 1
 
     @property
     def running(self) -> bool:
-        """Whether the bus is open, though its line may be down."""
+        """True while the bus is open, even if its line is down."""
         return self.thread != 0
 
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Note that the bus is open from now on, and used from this thread, by this loop."""
+        """Open the bus: it is used from this thread and by this loop from now on."""
         self.loop_runs = loop.is_running
         self.pump.bind(loop)
         self.losses.lost(self.now(), "its port is not open yet")
         self.thread = get_ident()
 
     def unbind(self) -> None:
-        """Note that the bus is open no longer."""
+        """Mark the bus as not open."""
         self.thread = 0
 
     # what holds now
 
     @property
     def condition(self) -> LineCondition:
-        """Return whether the line is lost while the bus is open, since when, and why. May be called in any thread."""
+        """Return whether the line is lost while the bus is open, since when, and why. Thread-safe."""
         lost = self.running and self.arbiter.state is LineState.OFFLINE
         return self.losses.condition if lost else PRESENT
 
     def as_of_now(self, point: Point[Any], sample: Sample[Any]) -> Sample[Any]:
-        """Return a sample with the quality that it has now, perhaps long after it was read.
+        """Return a sample with its current quality, possibly long after it was read.
 
-        While the line is lost it is bad, and its error says why. After a write to what the point reads it is stale.
-        Every consumer that shows a value later than its cycle takes it from here. May be called in any thread.
+        While the line is lost it is bad, with an error that says why. After a write to its quantity it is stale. Every
+        consumer that shows a value later than its cycle uses this. Thread-safe.
         """
         if sample.error is not None:
             return sample
@@ -111,19 +112,19 @@ class SharedLine:
         return sample
 
     def is_outdated(self, point: Point[Any], asked: float) -> bool:
-        """Return whether a good value that was asked for then has been stale or bad at any time since."""
+        """Return True if a good value requested at `asked` has been stale or bad at any time since."""
         return self.losses.condition.since > asked or self.is_stale(point, asked)
 
     # time
 
     def now(self) -> float:
-        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
+        """Return the time of the bus's clock, in seconds. All times of the bus use this clock."""
         return self.pump.clock()
 
     def wall_offset(self) -> float:
-        """Return what is to be added to a time of the bus's clock for seconds since 1970, by the machine's clock now.
+        """Return the offset from the bus's clock to seconds since 1970, by the machine's clock.
 
-        It stays the same to the bit until that clock is set.
+        The value stays exactly the same until the machine's clock is set.
         """
         offset = time.time() - self.now()
         if abs(offset - self._wall_offset) > CLOCK_WAS_SET:
@@ -133,24 +134,23 @@ class SharedLine:
     # polls
 
     def prepare(self, poll: Poll) -> None:
-        """Do what a poll group's new preparation says, while the line goes on."""
+        """Run the new preparation of a poll group while the line continues."""
         self.arbiter.dispatcher.prepare_poll(poll, self.now())
         self.pump.turn()
 
     def demand(self, poll: Poll) -> None:
-        """Do what `PollGroup.demand` does."""
+        """Implement `PollGroup.demand`."""
         self.check_loop()
         self.arbiter.demand(poll, self.now())
         self.pump.turn()
 
     def remove_poll(self, poll: Poll) -> None:
-        """End it; what it has on the wire goes unheard."""
+        """Remove a poll. The reply of its exchange on the wire is ignored."""
         self.arbiter.remove_poll(poll, self.now())
         self.pump.turn()
 
     def latest(self, point: Point[Any]) -> Sample[Any] | None:
-        """Return the youngest good sample of this point in any group; None where a write has made it stale, or the line
-        is lost."""
+        """Return the newest good sample of this point in any group; None if it is stale or the line is lost."""
         if self.condition.is_lost:
             return None
         youngest = None
@@ -163,14 +163,15 @@ class SharedLine:
         return youngest
 
     def held(self, node: NodeRecord, point: Point[Any]) -> Any:
-        """Return what a point would have read last, by what was read under whatever name, alone or with others.
+        """Return the value that a point would have read last, whichever point or batch read it.
 
-        None where that is not known, or may have been written since.
+        None if it is not known, or may have been written since.
         """
         answers = [answer for cycle in self.answers_of.values() for answer in cycle if answer.node is point.node]
         answers.sort(key=lambda answer: answer.started)
         found = [raw for one in answers if not self.is_stale(point, one.started) for raw in one.found(point.command)]
-        # stale is what a write changed by its name: a part of it may have another
+        # A write makes values stale by the name of the quantity. The same value may be read under another name, as part
+        # of a batch.
         if not found:
             untouched = (one for one in answers if not self.written_since(node, one.started))
             found = composed(point.command, untouched, node.profile)
@@ -182,13 +183,13 @@ class SharedLine:
     # nodes
 
     def note_stop(self, record: NodeRecord) -> None:
-        """Do what `Node.note_stop` does."""
+        """Implement `Node.note_stop`."""
         self.arbiter.note_stop(record)
         for told in self.on_stop:
             told(record)
 
     def forget_node(self, node: Requester, record: NodeRecord) -> None:
-        """Ask a node nothing more by itself, and forget what is known of it: nobody uses it any more."""
+        """Remove a node that is no longer used, and its state."""
         self.arbiter.remove_node(record)
         if self.limiter is not None:
             self.limiter.forget_node(node)
@@ -212,43 +213,43 @@ class SharedLine:
         return Sharing(self.clients, self.arbiter.longest_hold)
 
     def ahead(self, priority: Priority) -> int:
-        """Return how many requests of this program wait already that go before another of this class."""
+        """Return how many queued requests of this program go before another one of this class."""
         dispatcher = self.arbiter.dispatcher
         queues = dispatcher.writes.queues.values()
         parked = sum(write.phase is Phase.PARKED and write.client is None for queue in queues for write in queue)
         return dispatcher.backlog.waiting_of(priority, None) + parked
 
     def release(self, hold: Hold) -> None:
-        """Hold the line no longer for a sequence of requests."""
+        """End an exclusive sequence."""
         self.arbiter.release(hold, self.now())
         self.pump.turn()
 
     def suspend(self, record: NodeRecord, seconds: float) -> None:
-        """Do what `Node.suspend` does."""
+        """Implement `Node.suspend`."""
         self.check_loop()
         self.arbiter.dispatcher.suspend(record, self.now() + seconds)
         self.pump.turn()
 
     def touched(self, write: Transaction, when: float) -> None:
-        """Note that a write is over: what was asked before is not newer than what it changed."""
+        """Record that a write has ended: values requested before that time are not newer than the write."""
         self._touched[write.touches] = self._written[write.node] = self.last_touched = when
         if write.node.address == write.node.profile.broadcast:
             self._all_touched = when
         if isinstance(write.touches, tuple) and isinstance(write.command, Changing):
-            # what has another name, or is read in another run, may share a place with it
+            # the same place can have another name, or be read in another run
             for place in write.command.changes(write.node.profile):
                 self._touched[write.touches[0], place] = when
         for told in self.on_touched:
             told(write.node, when)
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
-        """Return whether a write to this node, or to a point of it, has ended since then."""
+        """Return True if a write to this node, or to a point of it, has ended since then."""
         return max(self._written.get(node, -inf), self._all_touched) > started
 
     def is_stale(self, point: Point[Any], started: float) -> bool:
-        """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
+        """Return True if a write to the point's quantity, or to its whole node, has ended since its read began."""
         touched = self._touched
-        # Of the quantity: points of other names and scales read it too. A read that starts as the write ends is fresh.
+        # By quantity: points with other names and scales read it too. A read that starts when the write ends is fresh.
         if max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started:
             return True
         places = point.command.places if isinstance(point.command, Placed) else ()
@@ -257,15 +258,13 @@ class SharedLine:
     # misuse
 
     def check_loop(self) -> None:
-        """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
+        """Raise InvalidCommand if an open bus is used from another thread or another event loop."""
         if self.running and (get_ident() != self.thread or not self.loop_runs()):
             self._check_elsewhere()
 
     def _check_elsewhere(self) -> None:
-        """Check a use while its loop does not run here: right only in its own thread, between two runs of the loop.
-
-        Raises InvalidCommand elsewhere.
-        """
+        """Check a use while the loop is not running here: allowed only in its own thread, between two runs of the
+        loop."""
         if get_ident() != self.thread or running_loop() is not None:
             raise InvalidCommand(
                 f"the bus on {self.name} was used from thread {current_thread().name!r} outside the "
@@ -274,7 +273,7 @@ class SharedLine:
             )
 
     def not_open(self, *, record: NodeRecord | None = None, command: str | None = None) -> BusClosed:
-        """Return the error for what needs an open bus, before it is entered or after it was left."""
+        """Return the error for an operation that needs an open bus."""
         if not self.closed:
             error = BusClosed("the bus is not open", node=record, command=command)
         else:
@@ -285,7 +284,7 @@ class SharedLine:
 
 
 def running_loop() -> asyncio.AbstractEventLoop | None:
-    """Return the event loop of asyncio that runs in this thread, or None."""
+    """Return the asyncio event loop that runs in this thread, or None."""
     try:
         return asyncio.get_running_loop()
     except RuntimeError:

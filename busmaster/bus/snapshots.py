@@ -1,4 +1,4 @@
-"""What the consumers of a poll group get: snapshots, statistics, and the streams they come in."""
+"""Snapshots and statistics of a poll group, and the streams that deliver them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ T = TypeVar("T")
 
 RECENT_PERIODS = 1000
 NO_SAMPLES = dict.fromkeys(Quality, 0)
-"""To be copied: a count of each quality."""
+"""Template for counting samples by quality. Copy it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot(Mapping[Point[Any], Sample[Any]]):
-    """One cycle of a poll group. `missed` counts the cycles that could not start since the group was made.
+    """One cycle of a poll group. `missed`: cycles that could not start since the group was made.
 
-    Times are the bus's clock (`bus.now()`), in seconds; `wall` is `finished` in seconds since 1970.
+    Times are on the bus's clock (`bus.now()`), in seconds; `wall` is `finished` in seconds since 1970.
     """
 
     group: str
@@ -45,7 +45,7 @@ class Snapshot(Mapping[Point[Any], Sample[Any]]):
         return self.samples[point]
 
     def wall_at(self, moment: float) -> float:
-        """Return a time of the bus's clock in seconds since 1970, by what the machine's clock said in this cycle."""
+        """Return a time of the bus's clock in seconds since 1970, by the machine's clock of this cycle."""
         return self.wall + (moment - self.finished)
 
     def __iter__(self) -> Iterator[Point[Any]]:
@@ -56,25 +56,25 @@ class Snapshot(Mapping[Point[Any], Sample[Any]]):
 
 
 class Outdated(Snapshot):
-    """The values of a group that a write has made stale between two cycles: with the time of the write."""
+    """The values of a group that a write between two cycles has made stale, with the time of the write."""
 
     __slots__ = ()
 
 
 class ReadAfterWrite(Snapshot):
-    """The values of a group that were read after a write, between two cycles. `latest` of the group has them too."""
+    """The values of a group that were read after a write, between two cycles. The group's `latest` has them too."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
 class GroupStatistics:
-    """Of a group since it was made, or its statistics were reset; times in seconds.
+    """Statistics of a group since it was made or they were reset. Times in seconds.
 
-    `period` as asked, `achieved` as seen (mean), without the time for which it was paused. `jitter` runs from a cycle's
-    due time to its start, `cycle_time` to its last value. `good`, `late`, `stale` and `bad` count samples. What its
-    cycles waited for before they started, on average: `exchanges_ahead` of others, and `quiet_time_ahead` seconds after
-    somebody's uncertain outcome.
+    `period`: as configured. `achieved`: mean measured period, without paused time. `jitter`: from a cycle's due time to
+    its start. `cycle_time`: to its last value. `good`, `late`, `stale`, `bad`: number of samples. Mean wait of its
+    cycles before they started: `exchanges_ahead` of other requests, and `quiet_time_ahead` seconds of
+    resynchronisation.
     """
 
     cycles: int
@@ -92,7 +92,7 @@ class GroupStatistics:
 
 
 class Tally:
-    """What a group counts; the rest is counted by its poll."""
+    """The counters of a group that are not in its poll."""
 
     __slots__ = (
         *("cycle_time", "cycles", "exchanges_ahead", "last", "missed", "periods", "recent", "samples"),
@@ -101,12 +101,12 @@ class Tally:
 
     def __init__(self, poll: Poll) -> None:
         self.missed = poll.missed
-        """Missed before the count began."""
+        """Cycles missed before the count began."""
         self.cycles = 0
         self.last: float | None = None
-        """When the cycle before began; None where there was none, or a pause since."""
+        """When the previous cycle began; None if there was none, or after a pause."""
         self.spanned = 0.0
-        """Seconds from cycle to cycle, of all `periods` that were seen."""
+        """Total seconds of all `periods` counted."""
         self.periods = 0
         self.recent: deque[float] = deque(maxlen=RECENT_PERIODS)
         self.exchanges_ahead = 0
@@ -115,9 +115,9 @@ class Tally:
         self.samples = NO_SAMPLES.copy()
 
     def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
-        """Count a cycle that is over, with so many samples of each quality.
+        """Count a finished cycle, with the number of samples of each quality.
 
-        What its first exchange waited for is what the cycle waited for.
+        The wait of its first exchange is the wait of the cycle.
         """
         for quality, number in qualities.items():
             self.samples[quality] += number
@@ -135,7 +135,7 @@ class Tally:
                 self.quiet_time_ahead += transaction.quiet_time_ahead
 
     def statistics(self, poll: Poll) -> GroupStatistics:
-        """Return an immutable snapshot of the group's counts."""
+        """Return an immutable snapshot of the group's counters."""
         cycles = self.cycles
         return GroupStatistics(
             cycles=cycles,
@@ -154,7 +154,7 @@ class Tally:
 
 
 class Stream(Generic[T]):
-    """One consumer, at its own pace: bounded, it drops the oldest and counts them in `dropped`."""
+    """One consumer with a bounded buffer. If it is too slow, the oldest items are dropped and counted in `dropped`."""
 
     def __init__(self, listeners: list[Stream[T]], buffer: int) -> None:
         self._listeners = listeners
@@ -171,22 +171,22 @@ class Stream(Generic[T]):
         while not self._items:
             if self._closed:
                 raise StopAsyncIteration
-            # A new event only when the old one was used, and shared until then: of two tasks that wait on one stream,
-            # one would else wait on an event that nobody knows any more.
+            # A new event only after the old one was set, shared until then: otherwise one of two tasks that wait on the
+            # same stream could wait on an event that is never set.
             if self._arrived.is_set():
                 self._arrived = anyio.Event()
             await self._arrived.wait()
         return self._items.popleft()
 
     def close(self) -> None:
-        """Give it nothing more; what it holds can still be read."""
+        """Add no further items. Items in the buffer can still be read."""
         self._closed = True
         if self in self._listeners:
             self._listeners.remove(self)
         self._arrived.set()
 
     def put(self, item: T) -> None:
-        """Give the consumer one more; the oldest is dropped where it does not keep up."""
+        """Add an item. Drops the oldest one if the buffer is full."""
         if len(self._items) == self._items.maxlen:
             self.dropped += 1
         self._items.append(item)
@@ -194,21 +194,21 @@ class Stream(Generic[T]):
 
 
 class Cycles:
-    """The cycles of a poll group, for whoever reads them: iterate it, or look at `latest`."""
+    """The cycles of a poll group. Iterate over it, or read `latest`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.latest: Snapshot | None = None
-        """That of its last cycle."""
+        """Snapshot of its last cycle."""
         self._consumers: list[Stream[Snapshot]] = []
         self._consumers_of_changes: list[Stream[Snapshot]] = []
         self._over = False
 
     def subscribe(self, buffer: int = 16, *, changes: bool = False) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more.
+        """Return a consumer that buffers this many snapshots. Close it when it is no longer used.
 
-        With `changes` it also gets what becomes of values between two cycles, each as a snapshot of these values alone:
-        `Outdated` and `ReadAfterWrite`.
+        With `changes` it also gets the changes between two cycles, each as a snapshot of the changed values: `Outdated`
+        and `ReadAfterWrite`.
         """
         if self._over:
             raise BusClosed(f"poll group {self.name!r} is closed")
@@ -224,7 +224,7 @@ class Cycles:
 
     def _tell(self, snapshot: Snapshot) -> None:
         self.latest = snapshot
-        self._tell_change(snapshot)  # first: outputs must have a cycle before a program acts on it
+        self._tell_change(snapshot)  # first: outputs must get a cycle before a program acts on it
         for consumer in self._consumers:
             consumer.put(snapshot)
 
@@ -233,7 +233,7 @@ class Cycles:
             consumer.put(snapshot)
 
     def _end(self) -> None:
-        """End those who read it, after what they hold."""
+        """End all consumers after the snapshots in their buffers."""
         self._over = True
         for consumer in (*self._consumers, *self._consumers_of_changes):
             consumer.close()

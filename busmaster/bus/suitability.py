@@ -1,4 +1,4 @@
-"""Whether a protocol goes with a line: with the others on it, and with its settings."""
+"""Checks that a protocol suits a line: the other protocols on it, and its settings."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from busmaster.transport.tcp import TcpPort
 
 
 def check_company(profile: Profile, present: Iterable[Profile]) -> None:
-    """Raise InvalidCommand for a protocol whose nodes cannot be on one line with those of the protocols present."""
+    """Raise InvalidCommand if nodes of this protocol cannot share a line with those of the protocols present."""
     for other in present:
         if not profile.may_share_with(other):
             raise InvalidCommand(
-                f"{profile.name} and {other.name} nodes cannot share a line, since they would take each other's frames "
-                "for their own: give each protocol a line and a bus of its own"
+                f"{profile.name} and {other.name} nodes cannot share a line, because they would misread each other's "
+                "frames: give each protocol a line and a bus of its own"
             )
 
 
 def check_settings(profile: Profile, endpoint: Endpoint) -> None:
-    """Warn of line settings that are none of the protocol's.
+    """Warn of line settings that the protocol does not have.
 
-    A line in memory has no settings that could be wrong; behind a port of raw TCP the framing is the server's.
+    A line in memory has no settings; behind a port of raw TCP the serial server sets the framing.
     """
     settings = endpoint.settings
     if settings is None or not isinstance(endpoint, SerialPort | TcpPort):

@@ -1,4 +1,4 @@
-"""Whoever hears every byte of a line: a recorder, those who look at the wire. They come and go while it runs."""
+"""The taps of a line (a recorder, or viewers of the traffic). They can be added and removed while it runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from busmaster.transport.pump import Pump
 
 
 class Taps:
-    """The taps of one line. A line that nobody taps pays nothing for it."""
+    """The taps of one line. An untapped line has no extra cost."""
 
     def __init__(self, pump: Pump, first: Tap | None = None) -> None:
         self._pump = pump
@@ -16,14 +16,14 @@ class Taps:
             self.add(first)
 
     def add(self, tap: Tap) -> None:
-        """Have `tap` told of all that passes from now on; of the exchange that is on the wire, perhaps only the end."""
+        """Pass all traffic to `tap` from now on. Of the exchange on the wire it may see only the end."""
         self._taps.append(tap)
         if len(self._taps) == 1:
             self._pump.arbiter.set_tapped(True)
         self._set()
 
     def remove(self, tap: Tap) -> None:
-        """Tell `tap` nothing more."""
+        """Pass no more traffic to `tap`."""
         self._taps.remove(tap)
         if not self._taps:
             self._pump.arbiter.set_tapped(False)

@@ -135,7 +135,7 @@ def test_a_sequence_whose_time_is_over_says_so_and_others_go_on() -> None:
             await asyncio.sleep(0.3)
             assert waits.done()
             with pytest.raises(
-                HoldEnded, match=r"node 1: the 0\.2 s for which the line was held .* \(max_hold\)"
+                HoldEnded, match=r"node 1: the sequence has ended: its 0\.2 s have passed.* max_hold"
             ) as ended:
                 await held.read(9)
             assert isinstance(ended.value, NotStarted)
@@ -164,7 +164,7 @@ def test_a_hold_that_cannot_be_is_refused(wrong: float) -> None:
             async with first.exclusive(max_hold=wrong):
                 pass
         async with first.exclusive() as held:
-            with pytest.raises(InvalidCommand, match="is held already"):
+            with pytest.raises(InvalidCommand, match="is already held"):
                 async with held.exclusive():
                     pass
 

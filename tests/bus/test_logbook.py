@@ -50,7 +50,7 @@ def test_r14_unexpected_bytes_are_counted_and_not_logged_but_a_collision_is(line
     logbook = Logbook("line")
     logbook.note(CameUnexpected(b"\x15"), 0.0)
     logbook.note(CameUnexpected(b"\x07\x31", collision=True), 0.0)
-    assert lines.messages == ["line: the echo differs from what was sent: a collision (07 31)"]
+    assert lines.messages == ["line: the echo differs from the bytes sent: a collision (07 31)"]
 
 
 def test_r14_a_raised_max_reply_delay_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:

@@ -62,7 +62,7 @@ def test_a_bit_is_read_off_words_and_flags(value: Any, bit: int, is_set: bool) -
 
 @pytest.mark.parametrize("value", [0.5, nan, inf, "text", (1, 2), None])
 def test_what_is_no_word_has_no_bits(value: Any) -> None:
-    with pytest.raises(ValueError, match="no word"):
+    with pytest.raises(ValueError, match="not a word"):
         bit_of(value, 0)
 
 

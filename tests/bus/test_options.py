@@ -220,7 +220,7 @@ def test_a_request_decided_before_the_node_was_told_to_stop_is_not_sent() -> Non
         await node.request(hcp2.Write(1, (1.0,)), stops_seen=seen)
         Hcp2Controller(bus, 1).node.note_stop()
         other.note_stop()
-        with pytest.raises(Superseded, match="told to stop since this was decided"):
+        with pytest.raises(Superseded, match="stopped after this write was decided"):
             await node.request(hcp2.Write(1, (2.0,)), stops_seen=seen)
         assert (device.comms[1], node.stops, other.stops) == (1.0, seen + 1, 1)
 

@@ -100,7 +100,7 @@ def test_a_handle_that_says_something_else_is_refused_and_replaces_nothing(
 ) -> None:
     node = Node.of(first(bus))
     before = (node.profile, node.profile.merge, node.timings, node._record.retries)
-    with pytest.raises(InvalidCommand, match=f"in use already, and now asked for with {what}"):
+    with pytest.raises(InvalidCommand, match=f"already in use, and was requested again with {what}"):
         second(bus)
     assert (node.profile, node.profile.merge, node.timings, node._record.retries) == before
     assert bus.nodes == (node,)

@@ -61,7 +61,7 @@ def test_two_documents_give_one_rate_and_no_other() -> None:
 @pytest.mark.parametrize("endpoint", [SerialPort("/dev/ttyS0", baudrate=19200), TcpPort("10.0.0.5", 1, baudrate=19200)])
 def test_another_rate_is_warned_about_when_the_first_handle_is_made(endpoint: Endpoint) -> None:
     bus = Bus(endpoint)
-    with pytest.warns(UserWarning, match=r": MSC nodes speak at 9600 baud alone, not at 19200$") as told:
+    with pytest.warns(UserWarning, match=r": MSC nodes support only 9600 baud, not 19200$") as told:
         bus.node(msc.PROFILE, 1)
     bus.node(msc.PROFILE, 2)  # not said again: it would be an error here
     assert len(told) == 1

@@ -169,7 +169,7 @@ class RemoteBus:
         said = self._named.setdefault(node, (timings, retries))
         if timings not in (None, said[0]) or retries not in (None, said[1]):
             raise InvalidCommand(
-                f"{node.label} is in use already, and now asked for with other timings or retries: "
+                f"{node.label} is already in use, and was requested again with other timings or retries: "
                 "give all handles of an address the same options, or leave them out in all but the first"
             )
         if self._link is not None:

@@ -147,7 +147,7 @@ class RemoteNode:
         """Do what `request` does, within a sequence of this program, if it is given the number of one."""
         chosen = RequestOptions.of(options, self.label) if options else ORDINARY
         if chosen.verify:
-            raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
+            raise InvalidCommand(f"{self.label}: verify is only available for the write methods of a handle")
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
         link, room = self._bus.opened(self, command), self._bus.room
