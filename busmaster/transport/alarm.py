@@ -1,10 +1,10 @@
-"""One timer of a line, which fires when it is due.
+"""One timer of a line, which fires at its deadline.
 
-An event loop rounds its timers up to the next millisecond, since that is the unit of its system call. For a reply
-window of 50 ms that is nothing; for the pause of 1.75 ms that Modbus wants before every request it is a third more,
-each time. So what is due soon is given to a timer of the kernel's that the loop reads like a port (timerfd). Where
-there is none (another system, a loop that reads no descriptors, a loop that keeps a time of its own) the loop's
-timer serves for everything, and the log says so once.
+An event loop rounds its timers up to the next millisecond, the unit of its system call. For a reply window of 50 ms
+that is negligible. For the pause of 1.75 ms before each Modbus request it is up to a third more, each time. So a near
+deadline uses a kernel timer (timerfd) that the loop reads like a port. If there is none (another system, a loop that
+cannot read descriptors, a loop with a virtual clock), the loop's timer is used for all deadlines, and this is logged
+once.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from busmaster.transport.clock import clock_of, is_virtual
 logger = logging.getLogger("busmaster")
 
 SOON = 0.02
-"""What is due within so many seconds is worth a timer of the kernel's; of a longer wait a millisecond is little."""
+"""Deadlines within this many seconds use the kernel timer. For longer waits a millisecond is negligible."""
 TFD_NONBLOCK = os.O_NONBLOCK
 TFD_CLOEXEC = os.O_CLOEXEC
 CLOCK_MONOTONIC = 1  # linux/time.h; what time.monotonic() reads
 TFD_TIMER_ABSTIME = 1
 EXPIRATIONS = 8
-"""Bytes of a timerfd's count of expirations."""
+"""Size in bytes of a timerfd's count of expirations."""
 
 
 class Alarm:
-    """Calls `ring` once, when it is due, by the clock of the loop (`clock_of`). A later `set` replaces an earlier one.
+    """Calls `ring` once at its deadline, by the clock of the loop (`clock_of`). A later `set` replaces an earlier one.
 
-    What is SOON rings never too early. A longer wait may, on uvloop: its timers count from the beginning of the loop's
-    turn. Whoever is rung looks at the clock.
+    A deadline within SOON never fires too early. A longer one can, on uvloop: its timers count from the beginning of
+    the loop's turn. The callback must check the clock.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
@@ -42,12 +42,12 @@ class Alarm:
         self._clock = clock_of(loop)
         self._ring = ring
         self._handle: asyncio.TimerHandle | None = None
-        # A timer of the kernel's would ring in the machine's time.
+        # A kernel timer uses the machine's time and not the loop's virtual time.
         self._precise = None if is_virtual(loop) else kernel_timer(loop, self._on_expiry)
         self._is_set = False
 
     def set(self, when: float) -> None:
-        """Ring at that time; at once, but never within this call, if it is over."""
+        """Set the deadline. If it has passed, fire immediately, but never within this call."""
         self.cancel()
         seconds = when - self._clock()
         if seconds < SOON and self._precise is not None:
@@ -57,14 +57,14 @@ class Alarm:
             self._handle = self._loop.call_later(max(seconds, 0.0), self._on_time)
 
     def cancel(self) -> None:
-        """Do not ring."""
+        """Cancel the deadline."""
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None
-        self._is_set = False  # a timer of the kernel's that still expires finds nobody waiting
+        self._is_set = False  # an expiry of the kernel timer that is already pending is then ignored
 
     def close(self) -> None:
-        """Never ring again, and give the descriptor back."""
+        """Cancel the deadline and close the descriptor."""
         self.cancel()
         if self._precise is not None:
             self._loop.remove_reader(self._precise.descriptor)
@@ -82,7 +82,7 @@ class Alarm:
 
 
 class KernelTimer:
-    """A timerfd, which a loop reads like a port. Raises OSError where the system has none."""
+    """A timerfd, which a loop reads like a port. Raises OSError if the system has none."""
 
     def __init__(self) -> None:
         self.descriptor = call_system("timerfd_create", CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC)
@@ -92,9 +92,10 @@ class KernelTimer:
         self._pointer = ctypes.pointer(self._when)
 
     def set(self, when: float) -> None:
-        """Expire once, at that time by time.monotonic(), in seconds; at once if it is over.
+        """Expire once at this time of time.monotonic(), in seconds; immediately if it has passed.
 
-        To say in how long would add what it takes to say it, some 20 us on a core that has just woken up.
+        An absolute time, because a relative one would be late by the time of the call, some 20 us on a core that has
+        just woken up.
         """
         whole = int(when)
         self._when.seconds = whole
@@ -102,19 +103,19 @@ class KernelTimer:
         self._settime(self.descriptor, TFD_TIMER_ABSTIME, self._pointer, None)
 
     def has_expired(self) -> bool:
-        """Return whether it has since it was set last: one that was set again meanwhile has not."""
+        """Return True if it has expired since it was last set."""
         try:
             return len(os.read(self.descriptor, EXPIRATIONS)) == EXPIRATIONS
         except BlockingIOError:
             return False
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the descriptor."""
         os.close(self.descriptor)
 
 
 class ItimerSpec(ctypes.Structure):
-    """What the system calls `struct itimerspec`: an interval, which stays 0, and the first expiration."""
+    """`struct itimerspec` of Linux: an interval, which stays 0, and the first expiration."""
 
     _fields_ = (
         ("interval_seconds", ctypes.c_long),
@@ -125,7 +126,7 @@ class ItimerSpec(ctypes.Structure):
 
 
 def call_system(name: str, *arguments: int | bytes) -> int:
-    """Call a function of the C library that Python does not have. Raises OSError where it fails, or does not exist."""
+    """Call a function of the C library that Python does not have. Raises OSError if it fails or does not exist."""
     try:
         result = int(getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments))
     except AttributeError as error:
@@ -137,7 +138,7 @@ def call_system(name: str, *arguments: int | bytes) -> int:
 
 
 def kernel_timer(loop: asyncio.AbstractEventLoop, on_expiry: Callable[[], None]) -> KernelTimer | None:
-    """Return a timer that this loop reads; None where there is none, which the log says once a process."""
+    """Return a timer that this loop reads; None if there is none, which is logged once per process."""
     try:
         timer = KernelTimer()
     except OSError as error:
@@ -147,12 +148,12 @@ def kernel_timer(loop: asyncio.AbstractEventLoop, on_expiry: Callable[[], None])
         loop.add_reader(timer.descriptor, on_expiry)
     except NotImplementedError:
         timer.close()
-        tell_once(f"a {type(loop).__name__} reads no descriptors")
+        tell_once(f"a {type(loop).__name__} cannot read descriptors")
         return None
     return timer
 
 
 @cache
 def tell_once(why: str) -> None:
-    """Say in the log that pauses are rounded up."""
+    """Log that pauses are rounded up."""
     logger.info("pauses of the line are rounded up to the next millisecond: %s", why)

@@ -1,4 +1,4 @@
-"""Which clock a loop keeps."""
+"""The clock of an event loop."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable
 
 VIRTUAL = 1.0
-"""A loop whose time differs by more seconds than this from the machine's keeps a time of its own."""
+"""A loop whose time differs from the machine's by more seconds than this has a virtual clock."""
 
 
 def is_virtual(loop: asyncio.AbstractEventLoop) -> bool:
-    """Return whether the loop keeps a time of its own."""
+    """Return True if the loop has a virtual clock."""
     return abs(loop.time() - time.monotonic()) > VIRTUAL
 
 
 def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
-    """Return the loop's own clock if its time is virtual; else the machine's, which is finer than some loops'."""
+    """Return the loop's own clock if it is virtual, else the machine's, which is finer than that of some loops."""
     return loop.time if is_virtual(loop) else time.monotonic

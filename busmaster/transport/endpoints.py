@@ -1,4 +1,4 @@
-"""What an endpoint is, and the URLs that name one."""
+"""The contract of an endpoint, and the URLs of endpoints."""
 
 from __future__ import annotations
 
@@ -21,80 +21,80 @@ HOST_PORT = re.compile(r"[\w.-]+:\d+")
 
 
 class Endpoint(Protocol):
-    """A way to a line: a frozen value that can be opened again and again."""
+    """A way to reach a line: a frozen value that can be opened repeatedly."""
 
     @property
     def name(self) -> str:
-        """Return how messages call it: the path, or "host:port"."""
+        """Return its name in messages: the path, or "host:port"."""
         ...
 
     @property
     def settings(self) -> LineSettings | None:
-        """Return where tau comes from; None where nobody said: a TCP port without `baudrate`."""
+        """Return the line settings, from which tau is calculated; None if unknown (a TCP port without `baudrate`)."""
         ...
 
     @property
     def echo(self) -> bool:
-        """Return whether what is sent comes back as received (two-wire adapters)."""
+        """Return True if sent bytes are received too (two-wire adapters)."""
         ...
 
     @property
     def receive_latency(self) -> float:
-        """Return the seconds that received bytes may lie in an adapter or a server before they get here."""
+        """Return the seconds for which an adapter or a server can hold received bytes."""
         ...
 
     @property
     def paced(self) -> bool | None:
-        """Return whether bytes leave at the baud rate; None: not known before it is open (see `is_paced`)."""
+        """Return True if bytes leave at the baud rate; None if not known before it is open (see `is_paced`)."""
         ...
 
     def presence(self) -> Hashable | None:
-        """Return what is seen of the device without opening it: it changes when one comes. None: nothing is seen.
+        """Return a value that changes when the device appears, without opening it. None if this cannot be observed.
 
-        It is asked several times a second while the line is down, on the loop, and returns at once. An endpoint may
-        have a method `folders()` too, which returns the folders in which an entry comes, or its rights change, when the
-        device comes back: then they are watched, and it is asked when something happens there.
+        It is called several times per second on the loop while the line is down, and must return immediately. An
+        endpoint may also have a method `folders()`, which returns the folders in which an entry appears, or its
+        permissions change, when the device returns. Then the folders are watched, and `presence` is called after a
+        change in them.
         """
         ...
 
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> asyncio.Transport:
-        """Open it; `connection_made` has been called when this returns. Raises LineDown.
+        """Open the port; `connection_made` has been called when this returns. Raises LineDown.
 
-        `only` is the device to open, as the transport of an earlier opening tells it in its extra info "identity"
-        (None where a device cannot be told from another): where another has its name now, that is left alone.
-
-        The transport writes at once when nothing is buffered, and calls `pause_writing` and `resume_writing` as soon
-        as anything is. It calls `connection_lost` exactly once: with None only if it was closed from here (or by a
-        TCP peer in good order), else with the cause.
+        `only`: the device to open, from the extra info "identity" of an earlier transport (None if devices cannot be
+        distinguished). If another device has its name now, it is not opened. The transport must write immediately if
+        nothing is buffered, and call `pause_writing` and `resume_writing` as soon as anything is. It calls
+        `connection_lost` exactly once: with None only if it was closed locally (or in good order by a TCP peer), else
+        with the cause.
         """
         ...
 
 
 def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
-    """Return whether bytes leave `transport` at the baud rate, so that an earlier reply cannot be one (R4)."""
+    """Return True if bytes leave `transport` at the baud rate, so that bytes that arrive too early cannot be a reply
+    (R4)."""
     return bool(transport.get_extra_info("paced", False) if endpoint.paced is None else endpoint.paced)
 
 
 def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
-    """Return the endpoint that `url` names: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
+    """Return the endpoint for a URL: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
 
-    `defaults` fills the line settings that the URL of a serial port or of an RFC 2217 port leaves open; behind a TCP
-    port they are the server's.
-    Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
+    `defaults`: line settings for a serial port or an RFC 2217 port whose URL leaves them out; behind a TCP port the
+    server sets them. Raises InvalidCommand, with the nearest option, for an invalid URL.
     """
     if not isinstance(url, str):
-        raise InvalidCommand(f"a port is named by text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
+        raise InvalidCommand(f"a port must be text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
     if is_served(url):
         raise InvalidCommand(
-            f"{url} is a line that a busmaster serves, which read, write, poll and scan take: here a port is needed, "
-            "and a serial server is written socket://HOST:PORT"
+            f"{url} is the address of a running line, for read, write, poll and scan. A port is needed here; "
+            "write a serial server as socket://HOST:PORT"
         )
     if "://" not in url:
         path, _, query = url.partition("?")
         if HOST_PORT.fullmatch(path) and not path.startswith(USB):  # usb:12345678 looks like a host and its port
-            raise InvalidCommand(f"{path!r} is no device path; a TCP port is written socket://{path}")
+            raise InvalidCommand(f"{path!r} is not a device path; write a TCP port as socket://{path}")
         return SerialPort(path, **_with_line(path, _options(query, SERIAL_OPTIONS), defaults))
     scheme = url.partition("://")[0]
     if scheme == "rfc2217":
@@ -109,7 +109,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
 
 
 def is_served(address: str) -> bool:
-    """Return whether an address is that of a line which another program serves, and no port of this one's."""
+    """Return True if this is the address of a line that another program serves, and not a port."""
     return address.startswith(("unix:", "tcp://"))
 
 
@@ -135,9 +135,9 @@ def _address(url: str) -> tuple[str, int, str]:
 
 
 def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[str, Any]:
-    """Parse `a=1&b=2` by the table of what is known."""
+    """Parse `a=1&b=2` with the table of known options."""
     options: dict[str, Any] = {}
-    for key, text in parse_qsl(query, keep_blank_values=True):  # an empty value is to be refused, not passed over
+    for key, text in parse_qsl(query, keep_blank_values=True):  # an empty value must be rejected, not skipped
         if key not in known:
             raise InvalidCommand(f"no such port option {key!r}; {meant(key, known)}")
         try:

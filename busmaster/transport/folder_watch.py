@@ -39,7 +39,7 @@ class FolderWatch:
             loop.add_reader(self._descriptor, self._on_readable)
         except NotImplementedError:
             os.close(self._descriptor)
-            raise OSError(f"a {type(loop).__name__} reads no descriptors") from None
+            raise OSError(f"a {type(loop).__name__} cannot read descriptors") from None
 
     def follow(self, folders: Callable[[], tuple[str, ...]]) -> None:
         """Watch these folders too. Raises OSError where one cannot be watched.

@@ -1,4 +1,4 @@
-"""Who has a serial port open, who has locked it, and who may open it. Linux only: elsewhere nobody is found."""
+"""Which process has a serial port open or locked, and who may open it. Linux only: other systems find no process."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Holder:
 
 
 def holders(path: str, *, proc: Path = PROC) -> tuple[Holder, ...]:
-    """Return who has it open, of the processes that we may look into (root sees all)."""
+    """Return the processes that have it open, among those that this user can inspect (root: all)."""
     device = os.path.realpath(path)
     return tuple(_holder(pid, proc) for pid in _pids(proc) if _has_open(proc / str(pid), device))
 
 
 def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
-    """Return who has locked it (flock), by the kernel's own table; None if nobody is found there."""
+    """Return the process that has locked it (flock), from the kernel's table, or None."""
     try:
         inode = os.stat(path)
         table = (proc / "locks").read_text()
@@ -48,7 +48,7 @@ def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
 
 
 def owning_group(path: str) -> str:
-    """Return the group that may open it, by name where it has one."""
+    """Return the group of the port, by name if it has one."""
     gid = os.stat(path).st_gid
     try:
         return grp.getgrgid(gid).gr_name
@@ -57,15 +57,15 @@ def owning_group(path: str) -> str:
 
 
 def how_to_open(path: str) -> str:
-    """Return what a user can do who has no permission to open it.
+    """Return a hint for a user without permission to open it.
 
-    To join the group root would give far more than a port, and to join a group without rights opens nothing.
+    Joining the group root would grant far more than a port, and joining a group without permissions has no effect.
     """
     status = os.stat(path)
     if status.st_gid != 0 and status.st_mode & GROUP_OPENS == GROUP_OPENS:
         return f"join its group: `sudo usermod -aG {owning_group(path)} $USER`, then log in again"
     return (
-        f"its group {owning_group(path)} is not one to join: have a udev rule give it to a group, such as "
+        f"its group {owning_group(path)} should not be joined: set another group with a udev rule, such as "
         'SUBSYSTEM=="tty", GROUP="dialout", MODE="0660"'
     )
 
@@ -78,9 +78,9 @@ def _pids(proc: Path) -> list[int]:
 
 
 def _has_open(process: Path, device: str) -> bool:
-    """Return whether it has it open; False too where we may not look, or it has just ended.
+    """Return True if the process has it open. False if it cannot be inspected or has just ended.
 
-    To know a node (O_PATH) is not to have it open.
+    An O_PATH descriptor does not count as open.
     """
     with contextlib.suppress(OSError):
         for number in os.listdir(process / "fd"):
@@ -99,7 +99,8 @@ def _flags(descriptor: Path) -> int:
 
 
 def serves(process: Path, device: str) -> bool:
-    """Return whether it has the other end of this pseudo-terminal open: then it is the line, not a second master."""
+    """Return True if the process has the other end of this pseudo-terminal open: then it is the line, not a second
+    master."""
     for descriptor in process.glob("fdinfo/*"):
         with contextlib.suppress(OSError):
             index = re.search(r"^tty-index:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)

@@ -1,6 +1,6 @@
-"""Which device stands behind the name of a port: names go to whoever comes next, a line does not (R13).
+"""Identity of the device behind a port's name: another device can get the same name, but must not be opened (R13).
 
-Linux only. Nothing here may run on a loop: whoever reads of a USB device waits while the kernel resets it.
+Linux only. Must not run on an event loop: reading from a USB device blocks while the kernel resets it.
 """
 
 from __future__ import annotations
@@ -20,45 +20,45 @@ from busmaster.errors import LineDown
 SYS = Path("/sys")
 """Where the kernel describes its devices."""
 DEV = Path("/dev")
-"""Where the nodes of the devices are."""
+"""Folder of the device nodes."""
 LINKS = Path("/dev/serial")
-"""Where udev keeps lasting names: by-id, by-path."""
+"""Folder of udev's permanent names: by-id, by-path."""
 USB = "usb:"
-"""Begins a name that is a serial number, and perhaps an interface: usb:A500ABC, usb:A500ABC:1."""
+"""Prefix of a name by serial number, with an optional interface: usb:A500ABC, usb:A500ABC:1."""
 
 MOST_LINKS = 40
-"""Symbolic links on one way, as many as the kernel follows."""
+"""Maximum number of symbolic links in a path, as in the kernel."""
 LEVELS = "", "/..", "/../..", "/../../.."
-"""From what the kernel calls a tty's device up to the USB interface that it is a part of: CDC adapters have the tty at
-the interface, all others one level below, those behind another driver (HID) two or more."""
+"""Relative paths from the kernel's device of a tty up to its USB interface. CDC adapters have the tty at the interface,
+all others one level below, those behind another driver (HID) two or more."""
 UNIX98_PTYS = range(136, 144)
 BSD_PTYS = 3
 """The major device numbers of Linux's pseudo-terminals (Documentation/admin-guide/devices.txt)."""
 
 
 class Identity(Protocol):
-    """One device, told from every other. `str` is how messages call it."""
+    """Identity of one device. `str` returns its name in messages."""
 
     @property
     def advice(self) -> str:
-        """What to try where another device has its name."""
+        """Hint if another device has its name."""
         ...
 
     def accepts(self, found: Identity) -> bool:
-        """Return whether `found` is this device, come back."""
+        """Return True if `found` is the same device after its return."""
         ...
 
     def is_behind(self, descriptor: int) -> bool:
-        """Return whether this open port is this device. Raises OSError if it has just gone."""
+        """Return True if this open port is this device. Raises OSError if it has just disappeared."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class UsbDevice:
-    """One serial port of a USB adapter, as the kernel describes it.
+    """One serial port of a USB adapter, as described by the kernel.
 
-    `kind` is "vendor:product", `serial` the adapter's serial number or "", `number` tells several ports on one
-    interface apart, `place` is the physical USB port that it is plugged in to, such as 1-1.2.
+    `kind`: "vendor:product". `serial`: serial number of the adapter, or "". `number`: number of the port on the
+    interface. `place`: physical USB port of the adapter, such as 1-1.2.
     """
 
     path: str
@@ -72,9 +72,9 @@ class UsbDevice:
 
 @dataclass(frozen=True, slots=True)
 class UsbIdentity:
-    """A port of a USB adapter, known by its serial number, or by where it is plugged in if it has none of its own.
+    """A port of a USB adapter, identified by its serial number, or by its USB port if it has no unique serial number.
 
-    `alone`: no other adapter that is plugged in has this serial number (cheap ones have all the same).
+    `alone`: no other connected adapter has this serial number (some cheap ones all have the same).
     """
 
     device: UsbDevice
@@ -91,8 +91,8 @@ class UsbIdentity:
     def advice(self) -> str:
         if self.device.serial and self.alone:
             name = f"{USB}{self.device.serial}" + (f":{self.device.interface}" if self.device.interface else "")
-            return f"name it {name}, which finds it wherever it is, or restart to go on with the other"
-        return f"plug it in at {self.device.place} again, or restart to go on with the other"
+            return f"name it {name}, which finds it at any USB port, or restart to use the other device"
+        return f"plug it in at {self.device.place} again, or restart to use the other device"
 
     def accepts(self, found: Identity) -> bool:
         if not isinstance(found, UsbIdentity) or _marks(self.device) != _marks(found.device):
@@ -105,14 +105,14 @@ class UsbIdentity:
 
 
 class PtyIdentity:
-    """A pseudo-terminal, and the symbolic links by which it was found.
+    """A pseudo-terminal, and the symbolic links that lead to it.
 
-    Its number, and with that its inode number, go to the next one when it is gone, and a chmod changes its times. So
-    its node is held: a node that is still in its folder is still the same. Holding it keeps neither it nor its
-    number in use.
+    When it disappears, the next one gets its number and with it its inode number, and a chmod changes its times. So its
+    node is kept open: a node that is still in its folder is the same. The open descriptor keeps neither the
+    pseudo-terminal nor its number in use.
     """
 
-    advice = "restart to go on with the other, or name it by a symbolic link, which is followed when it is made anew"
+    advice = "restart to use the other device, or use a symbolic link as the port's name: it is followed when recreated"
 
     _node = -1
 
@@ -129,7 +129,7 @@ class PtyIdentity:
         return f"the pseudo-terminal made at {self._made:%Y-%m-%dT%H:%M:%S}.{self._made.microsecond // 1000:03d}Z"
 
     def accepts(self, found: Identity) -> bool:
-        """Accept a link that was made anew: it vouches for what it leads to; one left behind by the dead does not."""
+        """Accept the same node, or a symbolic link that was created anew. An old link to a new node is not accepted."""
         if not isinstance(found, PtyIdentity):
             return False
         made_anew = found._links != self._links and found._links != ()
@@ -142,12 +142,12 @@ class PtyIdentity:
 
 @dataclass(frozen=True, slots=True)
 class TtyIdentity:
-    """A port that stays where it is (a UART on the board, a card): its name and its device number."""
+    """A port at a fixed place (a UART on the board, a card): its name and its device number."""
 
     path: str
     number: int
 
-    advice = "restart to go on with the other"
+    advice = "restart to use the other device"
 
     def __str__(self) -> str:
         return f"{self.path} ({os.major(self.number)}:{os.minor(self.number)})"
@@ -160,28 +160,28 @@ class TtyIdentity:
 
 
 class Scan:
-    """The USB serial ports that are plugged in, read at most once, when they are first needed.
+    """The connected USB serial ports, read at most once and only if needed.
 
-    One attempt to open a port asks for them several times. Each reading opens eight files per adapter.
+    One attempt to open a port needs them several times, and each scan opens eight files per adapter.
     """
 
     @cached_property
     def devices(self) -> list[UsbDevice]:
-        """All of them, in the order of their names."""
+        """All of them, sorted by name."""
         return usb_devices()
 
 
 def resolve(name: str, scan: Scan | None = None) -> str:
     """Return the path of the device that a port's name stands for now.
 
-    That is the name itself, unless it is usb:SERIAL or usb:SERIAL:INTERFACE. Raises LineDown, saying what is there.
+    The name itself, unless it is usb:SERIAL or usb:SERIAL:INTERFACE. Raises LineDown with a list of connected ports.
     """
     if not name.startswith(USB):
         return name
     wanted = name.removeprefix(USB)
     scan = scan or Scan()
     there = scan.devices
-    serial, _, interface = wanted.rpartition(":")  # a serial number may have colons of its own
+    serial, _, interface = wanted.rpartition(":")  # a serial number may contain colons
     numbered = (serial, int(interface)) if interface.isdecimal() else None
     found = [device for device in there if device.serial == wanted] or [
         device for device in there if (device.serial, device.interface) == numbered
@@ -190,14 +190,14 @@ def resolve(name: str, scan: Scan | None = None) -> str:
         case [device]:
             return device.path
         case []:
-            others = f"there is {_listed(there, scan)}" if there else "no USB serial port was found"
-            raise LineDown(f"{name} is not plugged in: {others}", hint="plug it in, or use one that is there")
+            others = f"connected: {_listed(there, scan)}" if there else "no USB serial port was found"
+            raise LineDown(f"{name} is not plugged in: {others}", hint="plug it in, or use one of the connected ports")
         case _:
-            raise LineDown(f"{name} could be any of {_listed(found, scan)}", hint="say which, by one of these names")
+            raise LineDown(f"{name} could be any of {_listed(found, scan)}", hint="use one of these names")
 
 
 def identify(path: str, scan: Scan | None = None) -> Identity:
-    """Return which device has this name now. Raises OSError where there is none, or it goes away meanwhile."""
+    """Return the identity of the device with this name. Raises OSError if it does not exist or disappears."""
     status = os.stat(path)
     device = usb_device(status.st_rdev)
     if device is not None:
@@ -205,14 +205,14 @@ def identify(path: str, scan: Scan | None = None) -> Identity:
         return UsbIdentity(device, alone=not any(_is_double(device, other) for other in there))
     if is_pty(path):
         return PtyIdentity(path)
-    # Where the kernel describes devices at all, one that it does not describe has just gone.
+    # If the kernel describes devices, one without a description has just disappeared.
     if stat.S_ISCHR(status.st_mode) and entry(status.st_rdev).parent.is_dir() and not entry(status.st_rdev).exists():
         raise OSError(errno.ENODEV, os.strerror(errno.ENODEV), path)
     return TtyIdentity(os.path.realpath(path), status.st_rdev)
 
 
 def lasting_name(device: UsbDevice, scan: Scan | None = None) -> str:
-    """Return a name that stays this adapter's whatever else is plugged in; "" where it can have none."""
+    """Return a name that this adapter keeps whatever else is connected; "" if there is none."""
     alike = [other for other in (scan or Scan()).devices if other.serial == device.serial]
     if device.serial and len(alike) == 1:
         return f"{USB}{device.serial}"
@@ -223,12 +223,12 @@ def lasting_name(device: UsbDevice, scan: Scan | None = None) -> str:
 
 
 def usb_device(number: int) -> UsbDevice | None:
-    """Return the USB serial port with this device number; None if that is no such port. Raises OSError as it goes."""
+    """Return the USB serial port with this device number, or None. Raises OSError if it disappears."""
     return _described(str(entry(number)))
 
 
 def usb_devices() -> list[UsbDevice]:
-    """Return all USB serial ports that are plugged in now, in the order of their names."""
+    """Return all connected USB serial ports, sorted by name."""
     try:
         names = sorted(os.listdir(SYS / "class/tty"))
     except OSError:
@@ -237,10 +237,10 @@ def usb_devices() -> list[UsbDevice]:
 
 
 def all_ttys() -> Hashable | None:
-    """Return what is seen of all ttys without reading of any device: it changes when one comes, or its rights change.
+    """Return a value that changes when a tty appears or its permissions change, without reading from any device.
 
-    The kernel describes an adapter before its node exists, and udev gives the node its group later still. A program
-    without root's rights can open it only then. None where the kernel describes no ttys.
+    The kernel describes an adapter before its node exists, and udev sets the node's group later still. Only then can a
+    program without root permissions open it. None if the kernel describes no ttys.
     """
     try:
         names = sorted(os.listdir(SYS / "class/tty"))
@@ -250,7 +250,7 @@ def all_ttys() -> Hashable | None:
 
 
 def node_at(path: str) -> Hashable | None:
-    """Return what tells the node that this path leads to from the next one; None where there is none."""
+    """Return a value that distinguishes the node at this path from the next one; None if there is none."""
     try:
         status = os.stat(path)
     except OSError:
@@ -259,9 +259,9 @@ def node_at(path: str) -> Hashable | None:
 
 
 def folders_to(path: str) -> tuple[str, ...]:
-    """Return the folders in which something changes when a device comes to this path, by way of symbolic links or not.
+    """Return the folders in which an entry changes when a device appears at this path, through symbolic links or not.
 
-    In place of a folder that does not exist it is the nearest one above: udev removes /dev/serial with its last link.
+    A missing folder is replaced by its nearest existing parent: udev removes /dev/serial with its last link.
     """
     found: list[str] = []
     while len(found) < MOST_LINKS:
@@ -277,20 +277,20 @@ def folders_to(path: str) -> tuple[str, ...]:
 
 
 def is_pty(device: int | str) -> bool:
-    """Tell a pseudo-terminal by the device number of a descriptor or a path: a name can be a symlink to anything."""
+    """Return True for a pseudo-terminal, by its device number: a name can be a symlink to anything."""
     major = os.major(os.stat(device).st_rdev)
     return major in UNIX98_PTYS or major == BSD_PTYS
 
 
 def entry(number: int) -> Path:
-    """Return where the kernel describes the device with this number; a pseudo-terminal is not there."""
+    """Return where the kernel describes the device with this number. Pseudo-terminals are not described."""
     return SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 
 
 def _described(tty: str) -> UsbDevice | None:
-    """Return the USB serial port that is described in this folder; None for a tty that is none.
+    """Return the USB serial port described in this folder; None for other ttys.
 
-    Paths are text here, and the kernel follows the links in them: pathlib and realpath took half of the time of a scan.
+    Paths are text here, and the kernel follows their links: pathlib and realpath took half of the time of a scan.
     """
     port = f"{tty}/device"
     interface = next((f"{port}{up}" for up in LEVELS if os.path.exists(f"{port}{up}/bInterfaceNumber")), None)
@@ -301,7 +301,8 @@ def _described(tty: str) -> UsbDevice | None:
     maker = _optional(f"{adapter}/manufacturer") or _optional(f"{adapter}/product")
     serial, number = _optional(f"{adapter}/serial"), _optional(f"{port}/port_number")
     kind = ":".join(_read(f"{adapter}/{name}") for name in ("idVendor", "idProduct"))
-    return UsbDevice(  # what must be there was read last: had the adapter gone, this would not be reached
+    # the mandatory files were read last: if the adapter had disappeared, an error would have been raised
+    return UsbDevice(
         path=f"{DEV}/{settings['DEVNAME']}",
         maker=maker or kind,
         kind=kind,
@@ -336,7 +337,7 @@ def _marks(device: UsbDevice) -> tuple[str, str, int, int]:
 
 
 def _is_double(device: UsbDevice, other: UsbDevice) -> bool:
-    """Return whether these are two adapters that claim the same serial number."""
+    """Return True if these are two adapters with the same serial number."""
     return (device.kind, device.serial) == (other.kind, other.serial) and device.place != other.place
 
 
@@ -355,7 +356,7 @@ def _link(path: str, folder: str) -> str:
 
 
 def _links(path: str) -> Iterator[tuple[int, int, int]]:
-    """Yield what tells each symbolic link on the way from one that is made in its place later."""
+    """Yield a value for each symbolic link on the path that changes if the link is created anew."""
     while os.path.islink(path):
         link = os.lstat(path)
         yield link.st_dev, link.st_ino, link.st_ctime_ns

@@ -1,8 +1,8 @@
-"""What the kernel knows of an open port and asyncio does not tell.
+"""State of an open port that the kernel knows and asyncio does not report.
 
-What lies unread, what has not left yet, and what a serial driver has counted. Nothing here waits, and nothing is asked
-on the hot path of a port that never held anything: of what lies unread or unsent when a deadline falls due, of the
-counts when somebody looks at them.
+Unread bytes, unsent bytes, and the counters of a serial driver. No function here blocks. The hot path of a port that
+never held bytes back makes no query: unread and unsent bytes are queried when a deadline expires, counters when they
+are displayed.
 """
 
 from __future__ import annotations
@@ -20,55 +20,55 @@ from collections.abc import Callable
 from busmaster.arbiter.counters import DriverErrors
 
 DELAYED_ACK = 0.050
-"""Seconds for which a healthy peer may keep an acknowledgement back (Linux: 40 ms)."""
+"""Seconds for which a healthy peer may delay an acknowledgement (Linux: 40 ms)."""
 SIOCOUTQNSD = 0x894B
-"""linux/sockios.h: bytes that were not sent yet; SIOCOUTQ, the same number as TIOCOUTQ, also counts those under way."""
+"""linux/sockios.h: bytes not sent yet. SIOCOUTQ, the same number as TIOCOUTQ, includes those on the way."""
 TCP_INFO_TIMES = struct.Struct("68xII")
 """struct tcp_info (linux/tcp.h): the smoothed round trip time and its variation, in microseconds."""
 TIOCGICOUNT = 0x545D
 FRAME, OVERRUN, PARITY, BRK, BUF_OVERRUN = range(6, 11)
 """struct serial_icounter_struct (linux/serial.h): where its counts are, in ints."""
 DAMAGE = FRAME, PARITY, BRK
-"""Those of them that a tty marks."""
+"""The errors that a tty marks."""
 ICOUNTER_SIZE = 20
 WRAP = 0xFFFFFFFF
 
 
 class OpenPort:
-    """A port without a descriptor that we know: all that can be asked is its transport's own buffer."""
+    """A port without a known descriptor: only its transport's buffer can be queried."""
 
     stuck_because = "the port does not take it; open it again"
     flow_controlled = False
-    """The other end may stop what is sent, for as long as it likes."""
+    """The other end can stop the output for any time."""
 
     def __init__(self, transport: asyncio.Transport) -> None:
         self._buffered = _buffer_of(transport)
 
     def unread(self) -> bool:
-        """Return whether bytes have come that were not handed over yet, as far as can be seen.
+        """Return True if received bytes were not passed on yet, as far as can be determined.
 
-        A loop that was blocked may run a timer before it reads: a late reply would lie there, and the silence that R3
-        waits for would be a mistake.
+        A loop that was blocked may run a timer before it reads. A late reply would then lie unread, and the silence
+        that R3 requires would be wrong.
         """
         return False
 
     def unsent(self, waited: float) -> int | None:
-        """Return how many bytes have not left, `waited` seconds after the last write; None if that cannot be told."""
+        """Return the number of bytes that have not left, `waited` seconds after the last write; None if unknown."""
         return None if self._buffered is None else self._buffered()
 
     def discard_unsent(self) -> None:
-        """See to it that what has not left never leaves when the transport is aborted."""
+        """Ensure that unsent bytes are never sent after the transport is aborted."""
 
     def errors(self) -> DriverErrors | None:
-        """Return what its driver has counted since it was opened or reset; None where there is none that counts."""
+        """Return the driver's counters since the port was opened or they were reset; None if there are none."""
         return None
 
     def is_break(self) -> bool:
-        """Return whether what a tty marks as a break, and hands over now, was one, as far as the driver tells."""
+        """Return True if a byte marked as a break was one, as far as the driver reports it."""
         return True
 
     def reset(self) -> None:
-        """Start the driver's counts again."""
+        """Reset the driver's counters."""
 
 
 class _Descriptor(OpenPort):
@@ -83,7 +83,7 @@ class _Descriptor(OpenPort):
         return bool(found) and found[0][1] & select.POLLIN > 0
 
     def _count(self, request: int) -> int:
-        """Return a number that an ioctl tells; 0 where it tells nothing."""
+        """Return the result of an ioctl that returns a number; 0 if it fails."""
         answer = array.array("i", [0])
         try:
             fcntl.ioctl(self._fd, request, answer)
@@ -110,17 +110,17 @@ class Tty(_Descriptor):
         now, before = self._counted(), self._before
         if now is None or before is None:
             return None
-        # The counts have 32 bits, and wrap.
+        # The counters have 32 bits and wrap around.
         framing, overruns, parity, breaks, lost = (
             (now[field] - before[field]) & WRAP for field in (FRAME, OVERRUN, PARITY, BRK, BUF_OVERRUN)
         )
         return DriverErrors(framing, parity, breaks, overruns, lost)
 
     def is_break(self) -> bool:
-        """Return whether the driver has counted a break that was not marked yet.
+        """Return True if the driver has counted a break that was not marked yet.
 
-        A tty marks a break by the same bytes as a damaged byte 00, and on a line at a wrong rate there are many of
-        those. The marks of a driver that has counted nothing at all are believed.
+        A tty marks a break with the same bytes as a damaged byte 00, of which there are many at a wrong baud rate. If
+        the driver has counted no error at all, its marks are trusted.
         """
         now = self._counted()
         if now is None or self._opened is None or not any(now[field] != self._opened[field] for field in DAMAGE):
@@ -133,10 +133,10 @@ class Tty(_Descriptor):
     def reset(self) -> None:
         self._before = self._counted()
         self._breaks = 0 if self._before is None else self._before[BRK]
-        """The driver's count of breaks up to the last one that was marked."""
+        """The driver's count of breaks up to the last marked one."""
 
     def _counted(self) -> array.array[int] | None:
-        """Return the driver's counts since it was loaded; None where it keeps none, as for a pty."""
+        """Return the driver's counters since it was loaded; None if it has none, as for a pty."""
         counts = array.array("i", [0] * ICOUNTER_SIZE)
         try:
             fcntl.ioctl(self._fd, TIOCGICOUNT, counts)
@@ -146,9 +146,9 @@ class Tty(_Descriptor):
 
 
 class Socket(_Descriptor):
-    """A TCP connection. What was sent and is not acknowledged may stand still on the way."""
+    """A TCP connection. Sent bytes that are not acknowledged may be stuck on the way."""
 
-    stuck_because = "the network or the server stands still; check both"
+    stuck_because = "the network or the serial server does not respond; check both"
 
     def __init__(self, transport: asyncio.Transport, sock: socket.socket) -> None:
         super().__init__(transport, sock.fileno())
@@ -157,7 +157,7 @@ class Socket(_Descriptor):
         self.reset()
 
     def unsent(self, waited: float) -> int | None:
-        """Count what is under way only if its acknowledgement is later than is usual on this path."""
+        """Count unsent bytes. Bytes on the way count only if their acknowledgement is later than usual on this path."""
         under_way = waited >= DELAYED_ACK and waited >= self._usual_acknowledgement()
         return (super().unsent(waited) or 0) + self._count(termios.TIOCOUTQ if under_way else SIOCOUTQNSD)
 
@@ -170,12 +170,12 @@ class Socket(_Descriptor):
         self._before = None if self._remote is None else self._remote()
 
     def discard_unsent(self) -> None:
-        """Have the connection reset: closing would leave it to the kernel, which goes on sending."""
+        """Make the connection end with a reset: after a normal close the kernel would continue to send."""
         with contextlib.suppress(OSError):  # it may be gone already
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     def _usual_acknowledgement(self) -> float:
-        """Return it in seconds, as the kernel calculates for its own repeats; 0 where it does not tell."""
+        """Return its usual time, in seconds, as the kernel calculates it for retransmissions; 0 if unknown."""
         if not hasattr(socket, "TCP_INFO"):
             return 0.0
         try:
@@ -187,7 +187,7 @@ class Socket(_Descriptor):
 
 
 def open_port(transport: asyncio.Transport) -> OpenPort:
-    """Return what can be asked of the port behind this transport."""
+    """Return the port object for this transport."""
     device = transport.get_extra_info("serial")
     if device is not None:
         return Tty(transport, device.fileno(), device.rtscts)
@@ -196,7 +196,7 @@ def open_port(transport: asyncio.Transport) -> OpenPort:
 
 
 def _buffer_of(transport: asyncio.Transport) -> Callable[[], int] | None:
-    """Return what tells how much the transport still has to write; None for one that does not tell."""
+    """Return a function for the number of buffered bytes of the transport; None if it has none."""
     try:
         transport.get_write_buffer_size()
     except (AttributeError, NotImplementedError):

@@ -1,7 +1,7 @@
-"""Damaged bytes: how a tty is made to mark them, and how its marks are told from data.
+"""Damaged bytes: how a tty marks them, and how the marks are separated from data.
 
-With INPCK and PARMRK set, a tty says `FF 00 x` for a byte x with a parity or framing error, `FF 00 00` for a break, and
-doubles every sound byte FF, so that nothing else begins with `FF 00`.
+With INPCK and PARMRK set, a tty delivers `FF 00 x` for a byte x with a parity or framing error, and `FF 00 00` for a
+break. It doubles each valid byte FF, so that no data begins with `FF 00`.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from busmaster.arbiter.counters import Mark
 
 ESCAPE = 0xFF
 _INPUT_FLAGS = termios.INPCK | termios.PARMRK
-"""All that is set: whatever drops, changes or answers a byte (IGNPAR, IGNBRK, BRKINT, ISTRIP, INLCR, IXON, IMAXBEL ...)
-is cleared, whoever has left it set."""
+"""The only flags that are set. All flags that drop, change or answer bytes (IGNPAR, IGNBRK, BRKINT, ISTRIP, INLCR,
+IXON, IMAXBEL ...) are cleared, whichever program has set them."""
 
 MarkedByte = Callable[[bytes, Mark], None]
 
 
 class MarkingSerial(serial.Serial):
-    """pyserial's port, made to mark its errors again whenever it configures itself, which clears the flags for that."""
+    """pyserial's port, which marks errors again after each configuration: that clears the flags."""
 
     marks = False
-    """Whether errors are marked: not every driver does it."""
+    """True if errors are marked. Some drivers do not support it."""
 
     def _reconfigure_port(self, force_update: bool = False) -> None:
         super()._reconfigure_port(force_update)  # type: ignore[misc]  # its types leave it out
@@ -36,17 +36,17 @@ class MarkingSerial(serial.Serial):
 
 
 def mark_errors(descriptor: int) -> bool:
-    """Have the tty mark damaged bytes and pass all others unchanged. Return False where it refuses to mark."""
+    """Make the tty mark damaged bytes and pass all others unchanged. Returns False if it does not support marks."""
     settings = termios.tcgetattr(descriptor)
     settings[0] = _INPUT_FLAGS
     with contextlib.suppress(termios.error):
         termios.tcsetattr(descriptor, termios.TCSANOW, settings)
-    # Asked, since a driver may leave out a flag without an error.
+    # Read back, because a driver may ignore a flag without an error.
     return bool(termios.tcgetattr(descriptor)[0] & termios.PARMRK)
 
 
 def stop_marking(descriptor: int) -> None:
-    """Leave the tty as a program that knows no marks expects it: some drivers keep its flags when it is closed."""
+    """Restore the flags for programs that do not expect marks: some drivers keep them after a close."""
     with contextlib.suppress(termios.error):
         settings = termios.tcgetattr(descriptor)
         settings[0] &= ~_INPUT_FLAGS
@@ -54,20 +54,21 @@ def stop_marking(descriptor: int) -> None:
 
 
 def taker_of_marked_bytes(protocol: asyncio.Protocol) -> MarkedByte:
-    """Return the protocol's own `byte_marked(byte, mark)`; a protocol without it takes a damaged byte for data."""
+    """Return the protocol's `byte_marked(byte, mark)`. A protocol without it gets a damaged byte as data."""
     own: MarkedByte | None = getattr(protocol, "byte_marked", None)
     return own if own is not None else lambda byte, _: protocol.data_received(byte)
 
 
 class Unescape:
-    """Tells marks from data in what a marking tty says. An escape may be split over any number of reads."""
+    """Separates marks from data. An escape may be split over any number of reads."""
 
     def __init__(self) -> None:
         self.begun = b""
-        """The beginning of an escape, the rest of which has not come yet."""
+        """An incomplete escape."""
 
     def take(self, data: bytes) -> list[tuple[bytes, Mark | None]]:
-        """Return what this read adds, in order: sound bytes with None, each damaged byte alone with its mark."""
+        """Return the pieces of this read in order: valid bytes with None, each damaged byte separately with its
+        mark."""
         data = self.begun + data
         self.begun = b""
         pieces: list[tuple[bytes, Mark | None]] = []

@@ -1,4 +1,4 @@
-"""Work that may block for ever, done where it can hold up neither the loop nor the end of the program."""
+"""Runs work that may block forever where it blocks neither the loop nor the end of the program."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 def in_own_thread(work: Callable[[], T], name: str) -> Future[T]:
     """Run `work` in a daemon thread of its own, and return the future of its result.
 
-    A pool will not do: its threads are joined at exit, and a driver can keep one blocked for minutes.
+    A thread pool is not suitable: its threads are joined at exit, and a driver can block one for minutes.
     """
     future: Future[T] = Future()
 

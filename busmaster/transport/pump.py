@@ -1,8 +1,8 @@
-"""asyncio meets the arbiter: bytes and time in, bytes and events out.
+"""Connects asyncio to the arbiter: passes bytes and time in, and bytes and events out.
 
-The hot path: a reply arrives, the arbiter completes it and encodes the next request, and that request is written
-in the same callback. Only then are those told who wait. No task runs between a reply and the next request, and no
-user code runs in here.
+The hot path: a reply arrives, the arbiter completes it and encodes the next request, and that request is written in the
+same callback. Only then are the callers notified. No task runs between a reply and the next request, and no user code
+runs in this module.
 """
 
 from __future__ import annotations
@@ -26,18 +26,17 @@ from busmaster.transport.clock import clock_of
 from busmaster.transport.kernel import OpenPort, open_port
 
 STUCK_AFTER = 5.0
-"""Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
-network that lost a segment let go within one or two; whatever holds it longer does not fix by itself, and a request
-that old may move a machine when nobody expects it any more."""
+"""Seconds after which unsent output is discarded together with its connection. Flow control, a busy adapter or a lost
+TCP segment block for one or two seconds. A longer block does not resolve itself, and a request that old could move a
+machine unexpectedly."""
 
 
 class Waiter(Protocol):
-    """Who waits for what becomes of a transaction: a future, or what has more haste, is told at once, and is the
-    library's own. Nothing of it may raise, or ask anything of the line.
-    """
+    """Receives the result of a transaction immediately: a future or an internal object. It must not raise or use the
+    line."""
 
     def done(self) -> bool:
-        """Return whether it was told already, or waits no longer."""
+        """Return True if it has its result, or no longer waits."""
         ...
 
     def set_result(self, value: Any, /) -> None: ...
@@ -46,9 +45,9 @@ class Waiter(Protocol):
 
 
 class Pump(asyncio.Protocol):
-    """Owns the arbiter of one line. `on_sample`, `on_cycle` and `on_event` are the library's own and return at once.
+    """Owns the arbiter of one line. `on_sample`, `on_cycle` and `on_event` are internal and return immediately.
 
-    `name` is how errors call the port.
+    `name` is the port's name in errors.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class Pump(asyncio.Protocol):
         self.arbiter = arbiter
         self.clock: Callable[[], float] = time.monotonic
         self.tap: Tap | None = None
-        """Who hears every byte; the arbiter is to be tapped while there is one."""
+        """Receives every byte. The arbiter must be tapped while this is set."""
         self._on_sample = on_sample
         self._on_cycle = on_cycle
         self._on_event = on_event
@@ -77,7 +76,7 @@ class Pump(asyncio.Protocol):
         self._port: OpenPort | None = None
         self._written = -inf
         self._all_has_left = False
-        """The port was asked already: it holds nothing of what was written."""
+        """The port has already reported that it holds no written byte."""
         self._paused = False
         self._may_hold = False
         self._look: asyncio.TimerHandle | None = None
@@ -88,7 +87,7 @@ class Pump(asyncio.Protocol):
         self._run_out: anyio.Event | None = None
 
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Keep this loop's time."""
+        """Use the clock and the timers of this loop."""
         self._loop = loop
         self.clock = clock_of(loop)
         self._alarm = Alarm(loop, self._on_time)
@@ -96,13 +95,13 @@ class Pump(asyncio.Protocol):
     # what the bus calls
 
     def begin(self, transaction: Transaction, waiter: Waiter | None) -> None:
-        """Submit a transaction; `waiter` gets its value or its error, perhaps before this returns.
+        """Submit a transaction; `waiter` gets its value or its error, possibly before this returns.
 
-        Without a waiter, the transaction's tag becomes a future, which gets them.
+        Without a waiter, the transaction's tag becomes a future for them.
         """
         assert self._loop is not None
         transaction.tag = self._loop.create_future() if waiter is None else waiter
-        # A request that only waits changes nothing that is to be sent, reported or timed.
+        # A request that was only queued changes nothing that must be sent, reported or timed.
         if self.arbiter.submit(transaction, self.clock()):
             self.turn()
 
@@ -111,13 +110,15 @@ class Pump(asyncio.Protocol):
         self.arbiter.cancel(transaction, self.clock())
 
     def turn(self) -> None:
-        """Send what is to be sent, tell what has happened, and arm the one timer."""
+        """Send pending output, report events, and set the timer."""
         arbiter = self.arbiter
         data = arbiter.poll_transmit()
         if data is not None and self._transport is not None:
+            # R2: reply windows count from the time at which the port has the bytes, so the clock is read again after
+            # the write.
             self._transport.write(data)
             self._all_has_left = False
-            self._written = now = self.clock()  # again: the process may have stood still before it got here
+            self._written = now = self.clock()  # read again: the process may have been stopped in between
             arbiter.transmitted(now)
             if self.tap is not None:
                 self.tap.transmitted(now, data, arbiter.attempt)
@@ -127,10 +128,11 @@ class Pump(asyncio.Protocol):
         while event is not None:
             if type(event) is Transaction:
                 if event.writes and event.attempts:
-                    self._on_written(event, event.ended_at)  # before its caller wakes: no snapshot slips in between
+                    # before its caller wakes, so that no snapshot comes in between
+                    self._on_written(event, event.ended_at)
                 waiter = event.tag
                 if waiter is None or waiter.done():
-                    pass  # nobody waits for it any more
+                    pass  # the caller has gone
                 elif event.error is None:
                     waiter.set_result(event.value)
                 else:
@@ -148,30 +150,30 @@ class Pump(asyncio.Protocol):
                 self._on_event(event)
             event = arbiter.poll_event() if arbiter.events else None  # a call less on the way of a reply
         due = arbiter.poll_timeout()
-        # An alarm that rings too early changes nothing, so one is never moved to a later time.
+        # An early timer changes nothing, so it is never moved to a later time: that saves a system call per reply.
         if due < self._armed:
             self._arm(due)
         if self._run_out is not None and not self._runs():
             self._run_out.set()
 
     async def run_out(self) -> None:
-        """Return when nothing is on the wire, within one exchange, and whoever waited has been told."""
+        """Return when the line is idle, within one exchange, and all callers have been notified."""
         if self._runs():
             self._run_out = anyio.Event()
             await self._run_out.wait()
 
     def driver_errors(self) -> DriverErrors | None:
-        """Return what the driver of the port that is open has counted: the arbiter does not know of it."""
+        """Return the driver's counters of the open port. The arbiter has no access to them."""
         return None if self._port is None else self._port.errors()
 
     def reset_driver_errors(self) -> None:
-        """Start the counts of the driver of the port again, if one is open."""
+        """Reset the driver's counters of the open port, if any."""
         if self._port is not None:
             self._port.reset()
 
     def stop(self) -> None:
-        """Stop the timer: the bus is closed. Whoever still waits is told now, where nobody saw `run_out` through."""
-        while self.arbiter.failing:  # a few at a time: a thousand callers told in one turn held the loop for 5 ms
+        """Stop the timer, because the bus is closed. If `run_out` was cancelled, remaining callers are notified now."""
+        while self.arbiter.failing:  # in batches: notifying a thousand callers in one turn blocked the loop for 5 ms
             self.arbiter.handle_timeout(self.clock())
             self.turn()
         if self._alarm is not None:
@@ -196,13 +198,14 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         if self.tap is not None:
             self.tap.received(now, data, self.arbiter.attempt)
-        if self._held_since < inf:  # what was held may have left since: only then can this be its answer
+        # Bytes that were held may have left since the last query. Only then can these bytes be the reply (R2).
+        if self._held_since < inf:  # query again
             self._check_output(now)
         self.arbiter.data_received(data, now)
         self.turn()
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        """Take a byte that the UART found damaged; none where a serial server reports the error apart from its byte."""
+        """Process a byte that the UART marked as damaged; no byte if a serial server reports the error apart from it."""
         now = self.clock()
         if mark is Mark.BREAK and self._port is not None and not self._port.is_break():
             mark = Mark.DAMAGED
@@ -212,11 +215,11 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     def pause_writing(self) -> None:
-        """Note that the transport could not hand over all that was written: nothing runs out until it has."""
+        """Note that the transport could not pass on all bytes: no deadline expires until it has."""
         self._paused = self._may_hold = True
 
     def resume_writing(self) -> None:
-        """Note that the transport has handed over what was written."""
+        """Note that the transport has passed on all bytes."""
         self._paused = False
         self._look_again()
 
@@ -234,7 +237,7 @@ class Pump(asyncio.Protocol):
         return self.arbiter.state is LineState.EXCHANGE or self.arbiter.failing
 
     def _give_up_on(self, late: Overdue) -> None:
-        """Let its caller go and keep the exchange: a write on the wire is over before anything else can be read."""
+        """Fail the caller and keep the exchange: a write on the wire ends before anything else can be read."""
         transaction = late.transaction
         if transaction.writes:
             self._on_written(transaction, self.clock())
@@ -247,8 +250,9 @@ class Pump(asyncio.Protocol):
             self._armed = due
             self._alarm.set(due)
         if self.arbiter.state is LineState.HOLDOFF and self._port is not None and not self._all_has_left:
-            # It would be asked when the hold is over, when the next request waits for that. `inf`: nothing may be under
-            # way either, however short a time ago it was said, or it is asked again then.
+            # Queried here and not when the holdoff ends, because the next request waits for that. `inf`:
+            # acknowledgements may not be outstanding either, however recent the write is; otherwise it is queried again
+            # then.
             self._all_has_left = self._port.unsent(inf) == 0
 
     def _on_time(self) -> None:
@@ -256,7 +260,8 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         unread = False
         if self._port is not None:
-            # The kernel is asked only now, and before anything runs out: a blocked loop may run timers before it reads.
+            # The kernel is queried only now, before any deadline expires: a blocked loop may run timers before it
+            # reads.
             line_due = self.arbiter.line_due(now)
             caller_due = self.arbiter.answer_counts(now)
             if line_due or caller_due:
@@ -267,8 +272,7 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     def _look_after(self, now: float) -> None:
-        """See to it that what a port holds is noticed, be it let go before a deadline: it is asked when what was said
-        just now should have left."""
+        """Query the port when the sent bytes should have left, so that a port that holds bytes back is noticed."""
         if self._paused:
             self._check_output(now)
         elif self._loop is not None:
@@ -283,7 +287,7 @@ class Pump(asyncio.Protocol):
             self._arm(due)
 
     def _check_output(self, now: float) -> None:
-        """Tell the arbiter how much has not left yet, and give the port up where that is so for too long."""
+        """Report the number of unsent bytes to the arbiter, and close the port if they do not leave for too long."""
         if self._port is None:
             return
         count = self._port.unsent(now - self._written)
@@ -299,9 +303,9 @@ class Pump(asyncio.Protocol):
             self._give_up(self._port)
 
     def _give_up(self, port: OpenPort) -> None:
-        """Take the line down, and with it what has not left. The port is opened again as after any loss."""
-        self._gave_up = f"nothing has left {self._name} for {STUCK_AFTER:g} s: {port.stuck_because}"
+        """Close the port, which discards its unsent bytes. It is reopened as after any loss."""
+        self._gave_up = f"no byte has left {self._name} for {STUCK_AFTER:g} s: {port.stuck_because}"
         self._port = None
-        port.discard_unsent()  # before the abort, which would leave it to the kernel to send on
+        port.discard_unsent()  # before the abort, after which the kernel would continue to send
         if self._transport is not None:
             self._transport.abort()

@@ -1,4 +1,4 @@
-"""Keeps one endpoint connected."""
+"""Keeps an endpoint connected (R13)."""
 
 from __future__ import annotations
 
@@ -17,26 +17,25 @@ FIRST_DELAY = 0.1
 LONGEST_DELAY = 5.0
 CLOSE_DEADLINE = 1.0
 LOOK_EVERY = 0.2
-"""Seconds between two looks at whether the device is back, where no folder tells it."""
+"""Seconds between two checks whether the device is back, if folders are not watched."""
 LOOK_ANYWAY = 1.0
-"""Seconds between two looks where the folders are watched. In a container the kernel may describe a device whose node
-was there all the time, and a folder of another machine's file system tells nothing."""
+"""Seconds between two checks if the folders are watched. In a container the kernel may describe a device whose node
+existed all the time, and a folder of another machine's file system reports no changes."""
 LOOK_PAUSE = 0.02
-"""Seconds between two looks at least, however much happens in the folders."""
+"""Minimum seconds between two checks, however many changes the folders report."""
 
 
 class Connection:
-    """Gives `protocol` one transport after another, for as long as `run` runs.
+    """Gives `protocol` one transport after another while `run` runs.
 
-    The protocol hears `connection_made`, `data_received` and `connection_lost` as any asyncio protocol, the first and
-    the last once per connection; `connection_lost(None)` means closed from here, else the cause is a LineDown.
+    The protocol gets `connection_made`, `data_received` and `connection_lost` like any asyncio protocol, the first and
+    the last once per connection. `connection_lost(None)` means closed locally; else the cause is a LineDown. Between
+    attempts it waits `first_delay` seconds, doubled up to `longest_delay` and varied by a quarter (`jitter` is the
+    random source). The delay starts again after a connection that lasted longer than that. A device that returns is
+    noticed immediately. Only the device of the first opening is reopened, whatever has its name in the meantime.
 
-    Between attempts it waits `first_delay` seconds, doubled up to `longest_delay` and spread by a quarter (`jitter`
-    is where that comes from), and begins anew after a connection that lasted longer than that. A device that comes
-    back is noticed at once. Only the device of the first opening is opened again, whatever has its name meanwhile.
-
-    Whatever goes wrong in the background ends nothing: it is tried again. `on_failed` hears why, once until the
-    reason changes; a cause that has a cause of its own is a bug.
+    Errors in the background never stop it: the attempt is repeated. `on_failed` gets the cause, once until it changes.
+    A cause with a cause of its own is a bug.
     """
 
     def __init__(
@@ -61,42 +60,43 @@ class Connection:
         self._told: dict[str, str] = {}
         self._closing = asyncio.Event()
         self._stirred = asyncio.Event()
-        """There may be something to see: look now."""
+        """Set if a device may have appeared: check now."""
         self._watch: FolderWatch | None = None
 
     async def open(self) -> None:
-        """Open it once, now. Raises LineDown."""
-        self._came_back()  # what is there already is no return
+        """Open the endpoint once. Raises LineDown."""
+        self._came_back()  # a device that is already present is not a return
         link = _Link(self.endpoint.name, self._protocol, self._closing)
         transport = await self.endpoint.open(lambda: link, self._device)
-        # of this opening: the same device may have come back at another place, and is known from there on
+        # From this opening: the same device may have returned at another place, and is identified there from now on.
         self._device = transport.get_extra_info("identity")
         self._link = link
-        self._told.clear()  # it was open in between: the same reason is news again
-        if self._closing.is_set():  # closed while it opened: until now there was nothing to close
+        self._told.clear()  # it was open in the meantime: the same cause is reported again
+        if self._closing.is_set():  # closed during the opening, when there was nothing to close
             await self.close()
 
     async def try_open(self) -> None:
-        """Open it once, now, and tell why where that fails: `run` goes on trying."""
+        """Open the endpoint once, and report the cause if that fails: `run` tries again."""
         try:
             await self.open()
-        except Exception as error:  # not LineDown alone: any other would end the reconnecting, unseen
+        except Exception as error:  # not only LineDown: another error would silently end the reconnecting
             self._tell("open", error)
 
     def accept_device(self) -> None:
-        """Take whatever device has the port's name at the next opening, which comes soon."""
+        """Accept any device that has the port's name at the next opening, which follows soon."""
         self._device = self._seen = None
         self._stirred.set()
 
     async def run(self) -> None:
-        """Stay connected, opening as often as it takes, until `close` is called or this is cancelled."""
+        """Stay connected, and reopen as often as needed, until `close` is called or this is cancelled."""
         delay = self._first_delay
         try:
             while True:
                 lasted = await self._stay()
                 if self._closing.is_set():
                     return
-                if lasted > self._longest_delay:  # a port that opens and is lost at once is not hammered
+                # a port that opens and is lost immediately is not retried at the first delay
+                if lasted > self._longest_delay:
                     delay = self._first_delay
                 self._follow_folders()
                 returned = await self._wait(delay)
@@ -105,7 +105,7 @@ class Connection:
             self._leave_folders()
 
     async def close(self) -> None:
-        """Close it and return when that is done, within CLOSE_DEADLINE whatever the driver or the network does."""
+        """Close the endpoint, within CLOSE_DEADLINE whatever the driver or the network does."""
         self._closing.set()
         self._stirred.set()
         link = self._link
@@ -117,13 +117,13 @@ class Connection:
                 await link.lost.wait()
         except TimeoutError:
             pass
-        finally:  # when cancelled too: a bus that was left holds no port
+        finally:  # also after a cancellation: a closed bus must not hold its port
             if not link.lost.is_set():
                 link.transport.abort()
-        await asyncio.sleep(0)  # an aborted transport says so at the next turn of the loop
+        await asyncio.sleep(0)  # an aborted transport reports it at the next turn of the loop
 
     async def _stay(self) -> float:
-        """Open it unless it is, and wait for the loss. Returns for how many seconds it was open."""
+        """Open the endpoint if necessary, and wait for its loss. Returns the seconds for which it was open."""
         loop = asyncio.get_running_loop()
         since = loop.time()
         if self._link is None:
@@ -136,9 +136,9 @@ class Connection:
         return loop.time() - since
 
     async def _wait(self, delay: float) -> bool:
-        """Wait that long, spread by the jitter. Returns True, and earlier, if the device is seen to come back."""
+        """Wait `delay` seconds, varied by the jitter. Returns True, and earlier, if the device returns."""
         loop = asyncio.get_running_loop()
-        # spread, or all lines of a server that went away would come back to it at the same moments
+        # Varied: otherwise all lines of a server that was away would reconnect at the same moments.
         until = loop.time() + delay * self._jitter.uniform(0.75, 1.25)
         while (left := until - loop.time()) > 0:
             try:
@@ -151,7 +151,7 @@ class Connection:
             stirred = self._stirred.is_set()
             self._stirred.clear()
             if stirred and self._watch is not None:
-                self._follow_folders()  # before the look: what comes after it stirs again
+                self._follow_folders()  # before the check: a later change triggers another one
             if self._came_back():
                 return True
             if stirred:
@@ -159,7 +159,7 @@ class Connection:
         return False
 
     def _follow_folders(self) -> None:
-        """Watch the folders that now lead to the device, if this endpoint tells them and this system watches any."""
+        """Watch the folders that lead to the device, if the endpoint and the system support it."""
         folders = getattr(self.endpoint, "folders", None)
         if folders is not None:
             self._watch = watch_folders(self._watch, folders, self._stirred.set)
@@ -170,7 +170,7 @@ class Connection:
             self._watch = None
 
     def _came_back(self) -> bool:
-        """Return whether a device has come since the last look."""
+        """Return True if a device has appeared since the last check."""
         before = self._seen
         try:
             self._seen = self.endpoint.presence()
@@ -179,7 +179,7 @@ class Connection:
         return self._seen is not None and self._seen != before
 
     def _tell(self, doing: str, error: Exception) -> None:
-        """Say why this failed, unless it was for the same reason as the last time that this was tried."""
+        """Report why this failed, unless the cause is the same as at the last attempt."""
         cause = self._cause(error)
         if self._on_failed is None or self._told.get(doing) == str(cause):
             return
@@ -204,7 +204,7 @@ class Connection:
 
 
 class _Link(asyncio.Protocol):
-    """Stands between a transport and the protocol, to learn of the loss and to put it into words."""
+    """Stands between a transport and the protocol, to notice the loss and to describe its cause."""
 
     def __init__(self, name: str, protocol: asyncio.Protocol, closing: asyncio.Event) -> None:
         self.lost = asyncio.Event()
@@ -212,11 +212,11 @@ class _Link(asyncio.Protocol):
         self._name = name
         self._protocol = protocol
         self._closing = closing
-        self.data_received = protocol.data_received  # type: ignore[method-assign]  # no step more on the hot path
+        self.data_received = protocol.data_received  # type: ignore[method-assign]  # no additional call on the hot path
         self.byte_marked = taker_of_marked_bytes(protocol)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast("asyncio.Transport", transport)  # uvloop's are none by inheritance
+        self.transport = cast("asyncio.Transport", transport)  # uvloop's transports do not inherit from asyncio's
         self._protocol.connection_made(transport)
 
     def pause_writing(self) -> None:

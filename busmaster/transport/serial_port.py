@@ -1,11 +1,11 @@
-"""A serial port, on pyserial and pyserial-asyncio with the latter's traps fixed.
+"""A serial port, based on pyserial and pyserial-asyncio, with workarounds for problems of the latter.
 
-pyserial opens and configures the port. Inherited from pyserial-asyncio is little: how reader and writer are registered
-with the loop and removed, pausing and resuming of reading, the limits of the write buffer and the pausing of the
-protocol by them. Fixed is all that costs time or hides something: a write leaves at once instead of a turn of the loop
-later; reading asks no select(), which fails above descriptor 1023; every loss is reported, once, and never from within
-a write; bytes with parity or framing errors come marked; and nothing that can block (opening, configuring, draining,
-closing) runs on the loop's thread. Why stands at each method of `PortTransport`.
+pyserial opens and configures the port. From pyserial-asyncio only these parts are used: registering reader and writer
+with the loop, pausing and resuming reading, and the write buffer limits that pause the protocol. Replaced are all parts
+that cost time or hide errors: a write leaves immediately instead of one loop turn later; reading does not use select(),
+which fails above descriptor 1023; every loss is reported once, and never from within a write; bytes with parity or
+framing errors are marked; and calls that can block (open, configure, drain, close) do not run on the loop's thread.
+Each method of `PortTransport` gives its reason.
 """
 
 from __future__ import annotations
@@ -58,30 +58,30 @@ else:
     from serial_asyncio import SerialTransport as _SerialTransport
 
 OPEN_DEADLINE = 10.0
-"""Seconds after which an opening that does not come back is given up."""
+"""Seconds after which an opening that does not return is given up."""
 CLOSE_DEADLINE = 0.5
-"""Seconds for which `close` waits for the driver before it reports the port closed all the same."""
+"""Seconds for which `close` waits for the driver. Then the port is reported as closed anyway."""
 CLOSING_PATIENCE = 5.0
-"""Seconds for which an opening waits until this program's own earlier closing of the device is over. A driver that
-holds unsent bytes may take half a minute over it; it is waited for again at the next attempt."""
+"""Seconds for which an opening waits for this program's own earlier closing of the device. A driver that holds unsent
+bytes may take half a minute. The next attempt waits again."""
 IN_USE = errno.EBUSY, errno.EAGAIN
-"""The driver's flag, the lock."""
+"""The error of the driver's exclusive flag, and that of the lock."""
 READ_SIZE = 448
-"""Bytes of one read, more than any frame has. Python serves up to 512, its own header included, from a pool of its own;
-what is larger costs a call of malloc, and another to cut it to what came."""
+"""Bytes per read, more than any frame has. Python allocates up to 512 bytes, including its own header, from its own
+pool. A larger buffer costs a malloc, and a second one to shrink it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port of this machine, or a pty. Raises InvalidCommand for values that no port can have.
+    """A serial port of this machine, or a pty. Raises InvalidCommand for invalid values.
 
-    `path` is that of the device or of a symbolic link to it; or "usb:SERIAL", the USB adapter with this serial number
-    whatever its name is, or "usb:SERIAL:INTERFACE" where it has several ports.
-    `rs485`: let the kernel drive the transmitter (RTS high while sending), True or pyserial's `RS485Settings` for
-    other polarities and delays. `echo`: what is sent is received too. `low_latency`: set (True) or clear (False) the
-    driver's flag, None leaves it. `receive_latency`: seconds that the adapter may hold bytes back (FTDI: its
-    latency timer). `exclusive`: nobody else may open it meanwhile. `paced`: bytes leave at the baud rate; None
-    takes it from the device number (a pty is not paced).
+    `path`: the device or a symbolic link to it; or "usb:SERIAL" for the USB adapter with this serial number,
+    "usb:SERIAL:INTERFACE" if it has several ports. `rs485`: the kernel drives the transmitter (RTS high while sending);
+    True, or pyserial's `RS485Settings` for other polarities and delays. `echo`: the port receives its own
+    transmissions. `low_latency`: set (True) or clear (False) the driver's flag; None leaves it unchanged.
+    `receive_latency`: seconds for which the adapter can hold bytes (FTDI: its latency timer). `exclusive`: no other
+    program may open the port. `paced`: bytes leave at the baud rate; None decides by the device number (a pty is not
+    paced).
     """
 
     path: str
@@ -102,7 +102,7 @@ class SerialPort:
         if not self.path:
             raise InvalidCommand("a serial port needs a path, such as /dev/ttyUSB0")
         if self.path == identity.USB:
-            raise InvalidCommand("a USB adapter is named by its serial number, such as usb:A500ABC")
+            raise InvalidCommand("a USB adapter needs a serial number, such as usb:A500ABC")
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
         if self.rtscts and self.rs485:
@@ -111,7 +111,7 @@ class SerialPort:
 
     @property
     def name(self) -> str:
-        """Return what messages call the port: its path."""
+        """Return its name in messages: its path."""
         return self.path
 
     @property
@@ -120,14 +120,14 @@ class SerialPort:
         return LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
 
     def presence(self) -> Hashable | None:
-        """Tell what is seen of the node that the path (perhaps a symlink) leads to now.
+        """Return a value that changes when the node at the path (possibly a symlink) changes.
 
-        It is what is seen of all ttys where the path is a serial number.
+        For a serial number it covers all ttys.
         """
         return identity.all_ttys() if self._by_serial else identity.node_at(self.path)
 
     def folders(self) -> tuple[str, ...]:
-        """Return the folders in which an entry comes, or its rights change, when the device comes back."""
+        """Return the folders in which an entry appears, or its permissions change, when the device returns."""
         return (str(identity.DEV),) if self._by_serial else identity.folders_to(self.path)
 
     @property
@@ -137,19 +137,19 @@ class SerialPort:
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> PortTransport:
-        """Open and configure it in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
-        # In a thread: an open() on a USB adapter that hangs would stop every line of this loop.
+        """Open and configure the port in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
+        # In a thread: an open() that hangs on a USB adapter would block every line of this loop.
         opening = in_own_thread(functools.partial(_open, self, only), f"open {self.path}")
         try:
             async with asyncio.timeout(OPEN_DEADLINE):
                 device, paced, found = await asyncio.wrap_future(opening)
         except TimeoutError:
             opening.add_done_callback(_drop)
-            # some drivers let no opening return before the closing is over
+            # with some drivers an opening does not return before the closing has ended
             if any(closing.name == self.path for closing in tuple(_closings)):
                 raise _still_closing(self.path) from None
             raise LineDown(f"{self.path} did not open within {OPEN_DEADLINE:g} s", hint="replug the adapter") from None
-        # The thread cannot be cancelled, so whatever it opens later is released when it comes back.
+        # The thread cannot be cancelled, so the port it opens later is released when it returns.
         except asyncio.CancelledError:
             opening.add_done_callback(_drop)
             raise
@@ -163,10 +163,10 @@ class SerialPort:
 
 
 class PortTransport(_SerialTransport):
-    """pyserial-asyncio's transport, made to write at once, to report every loss and never to block or hang.
+    """pyserial-asyncio's transport, changed to write immediately, to report every loss, and never to block.
 
-    A damaged byte goes to the protocol's `byte_marked(byte, mark)`, in order with `data_received`; to that itself
-    where the protocol has no such method.
+    A damaged byte is passed to the protocol's `byte_marked(byte, mark)`, in order with `data_received`, or to
+    `data_received` if the protocol does not have that method.
     """
 
     def __init__(
@@ -186,16 +186,16 @@ class PortTransport(_SerialTransport):
         self._identity = found
         self._lost = False
         self._deadline: asyncio.TimerHandle | None = None
-        device.is_open = False  # the base class sets timeouts, which would configure an open port anew, on the loop
+        device.is_open = False  # the base class sets timeouts, which would reconfigure an open port on the loop
         super().__init__(loop, protocol, device)
-        # From here on the base class may change settings: `tune` relies on it.
+        # From here on settings may be changed: `tune` relies on it.
         device.is_open = True
-        self.set_write_buffer_limits(high=0)  # whatever is buffered pauses the protocol: it has not left yet
+        self.set_write_buffer_limits(high=0)  # R2: buffered bytes have not left, so any of them pauses the protocol
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """Return for `serial` pyserial's object, for `identity` the device's.
+        """Return pyserial's object for `serial`, the device's identity for `identity`.
 
-        For `paced` it is whether bytes leave at the baud rate.
+        For `paced`, return whether bytes leave at the baud rate.
         """
         return {"serial": self._serial, "paced": self._paced, "identity": self._identity}.get(name, default)
 
@@ -203,15 +203,15 @@ class PortTransport(_SerialTransport):
         return f"<{type(self).__name__} {self._port.name}{' closing' if self._closing else ''}>"
 
     async def tune(self, settings: LineSettings) -> None:
-        """Set the open port to another rate and framing. Raises LineDown where it does not take them.
+        """Change baud rate and framing of the open port. Raises LineDown if it does not accept them.
 
-        Of a pseudo-terminal, that takes no framing, the rate is set, and whether odd parity is meant.
+        For a pseudo-terminal, which has no framing, only the rate and odd parity are set.
         """
         change = functools.partial(_tune, self._port, self._serial, settings)
         await asyncio.wrap_future(in_own_thread(change, f"tune {self._port.path}"))
 
     def _read_ready(self) -> None:
-        """Read from the descriptor: pyserial's read asks select(), which fails above descriptor 1023."""
+        """Read from the descriptor: pyserial's read uses select(), which fails above descriptor 1023."""
         try:
             data = os.read(self._fd, READ_SIZE)
         except BlockingIOError:
@@ -219,7 +219,7 @@ class PortTransport(_SerialTransport):
         except OSError as error:
             self._lose(error)
             return
-        if not data:  # VMIN is 1, so nothing to read would be BlockingIOError: this is a hang-up
+        if not data:  # VMIN is 1, so no data would raise BlockingIOError: an empty read is a hang-up
             self._lose(None)
         elif (ESCAPE in data or self._escapes.begun) and self._serial.marks:
             self._take_marked(data)
@@ -234,10 +234,11 @@ class PortTransport(_SerialTransport):
                 self._byte_marked(piece, mark)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Write at once if nothing is buffered: else bytes would leave a turn of the loop later than their stamp."""
+        """Write immediately if nothing is buffered. Otherwise bytes would leave one loop turn after their time
+        stamp."""
         if self._closing:
-            return  # reported already, or asked for
-        # Bytes must not overtake those that are buffered.
+            return  # the loss was already reported, or the port is being closed
+        # Bytes must not overtake buffered ones.
         if not self._write_buffer:
             try:
                 sent = os.write(self._fd, data)
@@ -268,29 +269,29 @@ class PortTransport(_SerialTransport):
             self._maybe_resume_protocol()
 
     def close(self) -> None:
-        """Discard what has not left, close the device in a thread, then call `connection_lost(None)`.
+        """Discard unsent bytes, close the device in a thread, then call `connection_lost(None)`.
 
-        That call comes after CLOSE_DEADLINE at the latest: a stopped line never drains, and a driver may wait for it.
+        The call comes after CLOSE_DEADLINE at the latest: a blocked line never drains, and a driver may wait for it.
         """
         if self._closing:
             return
-        # Detached first: no byte may be delivered after close() was called.
+        # Detached first: no byte may be delivered after the call of close().
         closed = self._detach()
         self._deadline = self._loop.call_later(CLOSE_DEADLINE, self._report, None)
         asyncio.wrap_future(closed, loop=self._loop).add_done_callback(lambda _: self._report(None))
 
     def abort(self) -> None:
-        """Do what `close` does, without waiting for the device."""
+        """Close without waiting for the device."""
         if not self._closing:
             self._detach()
         self._loop.call_soon(self._report, None)
 
     def _lose(self, error: OSError | None) -> None:
-        """Give up a port that is gone: the protocol is told at the loop's next turn, never within its own `write`."""
+        """Handle a lost port. The protocol is notified at the loop's next turn, never within its own `write`."""
         self._detach()
         why = "it hung up" if error is None or error.errno == errno.EIO else error.strerror
         cause = LineDown(f"{self._port.name} was lost: {why}", hint="")
-        # Not at once: the protocol may be inside its own write() and would see its state change under it.
+        # Deferred: the protocol may be inside its own write(), during which its state must not change.
         self._loop.call_soon(self._report, cause)
 
     def _detach(self) -> Future[None]:
@@ -299,7 +300,7 @@ class PortTransport(_SerialTransport):
         self._remove_writer()
         self._write_buffer.clear()
         closing = _Closing(self._port.path, os.fstat(self._fd).st_rdev)
-        _closings.add(closing)  # before the thread runs, which takes it out
+        _closings.add(closing)  # before the thread starts, which removes it
 
         def release() -> None:
             try:
@@ -320,7 +321,7 @@ class PortTransport(_SerialTransport):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Closing:
-    """A closing of ours that may outlive CLOSE_DEADLINE: the device with this number is locked until it is over."""
+    """A closing that may take longer than CLOSE_DEADLINE. The device with this number is locked until it has ended."""
 
     name: str
     number: int
@@ -328,18 +329,18 @@ class _Closing:
 
 
 _closings: set[_Closing] = set()
-"""Of all ports of this program. Changed by the loop and by the threads that close: by single operations alone."""
+"""All running closings. Changed by the loop and by the closing threads, with atomic operations only."""
 
 
 def _still_closing(path: str) -> LineDown:
     return LineDown(
-        f"this program is still closing {path}: its driver does not let go of what was not sent",
-        hint="it can be opened when that is over; if it never is, check CTS, replug the adapter",
+        f"this program is still closing {path}: its driver holds unsent bytes",
+        hint="it can be opened after that; if that does not end, check CTS, replug the adapter",
     )
 
 
 def _own_closing(path: str) -> _Closing | None:
-    """Return our closing of the device that this path leads to, if it is not over."""
+    """Return the running closing of the device at this path, or None."""
     with contextlib.suppress(OSError):
         number = os.stat(path).st_rdev
         return next((closing for closing in tuple(_closings) if closing.number == number), None)
@@ -347,7 +348,7 @@ def _own_closing(path: str) -> _Closing | None:
 
 
 def _names_pty(path: str) -> bool:
-    """Return whether it is a pseudo-terminal; False also where nothing is there: opening it will say so."""
+    """Return True for a pseudo-terminal. False if the path does not exist: opening it reports that."""
     try:
         return is_pty(path)
     except OSError:
@@ -355,7 +356,7 @@ def _names_pty(path: str) -> bool:
 
 
 def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool, Identity]:
-    """Open and configure the device; also says whether it is paced, and which it is. Blocks. Raises LineDown."""
+    """Open and configure the device. Also returns whether it is paced, and its identity. Blocks. Raises LineDown."""
     scan = identity.Scan()
     # One scan of the ttys for both: a replug between two scans could make them disagree.
     port = replace(port, path=resolve(port.path, scan))
@@ -363,7 +364,7 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
     device = MarkingSerial()
     device.port = port.path
     device.baudrate, device.stopbits = port.baudrate, port.stopbits
-    if not _names_pty(port.path):  # a pty stays at 8N1, and the C library calls a change that changes nothing an error
+    if not _names_pty(port.path):  # a pty stays at 8N1, and the C library reports a change without effect as an error
         device.bytesize, device.parity = port.bytesize, port.parity
     device.rtscts = port.rtscts
     device.exclusive = True if port.exclusive else None
@@ -378,7 +379,7 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
     try:
         # The name may have been given to another adapter between the check and the open.
         if not found.is_behind(device.fileno()):
-            raise LineDown(f"{port.path} became another device while it was opened", hint="try again")
+            raise LineDown(f"{port.path} was replaced by another device while it was opened", hint="try again")
         _equip(port, device)
         return device, (not is_pty(device.fileno()) if port.paced is None else port.paced), found
     except BaseException as error:
@@ -389,10 +390,10 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
 
 
 def _open_device(device: MarkingSerial, path: str) -> None:
-    """Open it, and again where only a closing of ours was in the way. Raises LineDown, and what pyserial raises."""
+    """Open the device, and retry if only an own closing was in the way. Raises LineDown and pyserial's errors."""
     until = time.monotonic() + CLOSING_PATIENCE
     while True:
-        closing = _own_closing(path)  # before: one that ends while this fails leaves the device free
+        closing = _own_closing(path)  # read before the attempt: if the closing ends during it, the device is free
         try:
             device.open()
             return
@@ -404,7 +405,7 @@ def _open_device(device: MarkingSerial, path: str) -> None:
 
 
 def _found(port: SerialPort, only: Identity | None, scan: identity.Scan) -> Identity:
-    """Return which device has the name now. Raises LineDown, before it is touched, if that is another than `only`."""
+    """Return the identity of the device with this name. Raises LineDown, before touching it, if it is not `only`."""
     try:
         found = identify(port.path, scan)
     except OSError as error:
@@ -415,8 +416,8 @@ def _found(port: SerialPort, only: Identity | None, scan: identity.Scan) -> Iden
 
 
 def _equip(port: SerialPort, device: serial.Serial) -> None:
-    """Touch what only some drivers have only if it is asked for. Raises LineDown where it is refused."""
-    if port.exclusive:  # flock is advisory, and this does not stop root: only both together keep others out
+    """Set options that only some drivers support, if requested. Raises LineDown if they are rejected."""
+    if port.exclusive:  # flock is advisory, and TIOCEXCL does not stop root: only both together exclude other programs
         fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
     # Only if the user sets it: most adapters reject the ioctl, and a pty has none (ENOTTY).
     if port.rs485:
@@ -433,7 +434,7 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
         except ValueError:
             raise LineDown(
                 f"the driver of {port.path} has no low-latency flag",
-                hint="leave low_latency out; `busmaster doctor` tells what the adapter does",
+                hint="leave low_latency out; `busmaster doctor` shows what the adapter does",
             ) from None
 
 
@@ -450,7 +451,7 @@ def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> No
 
 
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
-    """Return why it did not open, in words, and what to try."""
+    """Return the error for a port that could not be opened, with a hint."""
     path, code = port.path, _code(error)
     if code in IN_USE:
         # The name of the other program saves a search: nearly always it is a second instance of the same one.
@@ -468,12 +469,12 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
     if code in (errno.EIO, errno.ENXIO, errno.ENODEV):
         return LineDown(f"there is no hardware behind {path}", hint="see `python -m serial.tools.list_ports`")
     if code in (errno.ENOTTY, errno.EISDIR):
-        return LineDown(f"{path} is no serial port", hint="see `python -m serial.tools.list_ports`")
+        return LineDown(f"{path} is not a serial port", hint="see `python -m serial.tools.list_ports`")
     return LineDown(f"cannot open {path}: {error if code is None else os.strerror(code)}")
 
 
 def _code(error: Exception) -> int | None:
-    """Return the errno behind an error of pyserial, which hides some in its text; None if there is none."""
+    """Return the errno of a pyserial error, which hides some in its text; None if there is none."""
     for raised in (error, error.__context__):
         if isinstance(raised, termios.error):
             return int(raised.args[0])
@@ -483,9 +484,9 @@ def _code(error: Exception) -> int | None:
 
 
 def _release(device: serial.Serial, exclusive: bool) -> None:
-    """Discard what has not left, give back the locks (they would outlive us where a pty stays open), and close.
+    """Discard unsent bytes, release the locks (they would remain on a pty that stays open), and close.
 
-    The flags are given back too, unless somebody else may be using the port with them.
+    The flags are restored too, unless another program may be using the port with them.
     """
     with contextlib.suppress(OSError, termios.error):
         termios.tcflush(device.fileno(), termios.TCOFLUSH)
@@ -500,7 +501,7 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
 
 
 def _drop(opening: Future[tuple[MarkingSerial, bool, Identity]]) -> None:
-    """Release what was opened, for nobody waits for this opening any more."""
+    """Release a port that was opened after its caller had stopped waiting."""
     if not opening.cancelled() and opening.exception() is None:
         device, *_ = opening.result()
         _release(device, True)

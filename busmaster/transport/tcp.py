@@ -15,20 +15,19 @@ from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport.identity import Identity
 
 CONNECT_DEADLINE = 5.0
-"""Seconds, name look-up included."""
+"""Seconds, including name resolution."""
 
-# A server that lost power or cable is found out within about 10 s, asked or not.
+# A server without power or network is detected within about 10 s, whether or not requests are sent.
 KEEP_ALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 10_000}
 
 
 @dataclass(frozen=True, slots=True)
 class TcpPort:
-    """A serial line behind a serial server that passes raw bytes (ser2net, Moxa and the like).
+    """A serial line behind a serial server that passes raw bytes (ser2net, Moxa and similar).
 
-    `baudrate` is the server's, so that reply windows run from the end of the request on the wire; without it they
-    run from the write. `receive_latency` in seconds is how long the server may hold bytes back (ser2net: 0.0033
-    unless `chardelay: false`). `paced` says that the server answers no sooner than the baud rate allows.
-    Raises InvalidCommand for values out of range.
+    `baudrate`: the server's. With it, reply windows start at the end of the request on the wire; without it, at the
+    write. `receive_latency`: seconds for which the server can hold bytes (ser2net: 0.0033 unless `chardelay: false`).
+    `paced`: the server never replies earlier than the baud rate allows. Raises InvalidCommand for values out of range.
     """
 
     host: str
@@ -54,39 +53,39 @@ class TcpPort:
 
     @property
     def name(self) -> str:
-        """Return what messages call the port: HOST:PORT."""
+        """Return its name in messages: HOST:PORT."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{host}:{self.port}"
 
     @property
     def settings(self) -> LineSettings | None:
-        """Return what tau is calculated from: the framing is the server's business."""
+        """Return the settings from which tau is calculated. The server sets the framing."""
         return None if self.baudrate is None else LineSettings(self.baudrate)
 
     def presence(self) -> None:
-        """Return None: whether a server is there again can only be found out by connecting."""
+        """Return None: whether a server is back can only be determined by connecting."""
         return None
 
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> asyncio.Transport:
-        """Connect; a server has no identity but its address. Raises LineDown, after CONNECT_DEADLINE at the latest."""
+        """Connect. A server's only identity is its address. Raises LineDown, after CONNECT_DEADLINE at the latest."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_DEADLINE):
                 transport, _protocol = await loop.create_connection(protocol_factory, self.host, self.port)
-        except TimeoutError:  # ahead of OSError, which it is one of
+        except TimeoutError:  # before OSError, its base class
             raise LineDown(
                 f"{self.name} did not answer within {CONNECT_DEADLINE:g} s", hint="check its address, power and network"
             ) from None
         except OSError as error:
             raise self._refusal(error) from None
         _find_out_a_dead_server(transport.get_extra_info("socket"))
-        transport.set_write_buffer_limits(high=0)  # any byte that is still here pauses the pump: it has not left (R2)
+        transport.set_write_buffer_limits(high=0)  # R2: buffered bytes have not left, so any of them pauses the pump
         return transport
 
     def _refusal(self, error: OSError) -> LineDown:
-        # With several addresses to try, asyncio raises one plain OSError that quotes them all.
+        # If it tries several addresses, asyncio raises one plain OSError that contains all errors.
         if isinstance(error, ConnectionRefusedError) or f"[Errno {errno.ECONNREFUSED}]" in str(error):
             return LineDown(
                 f"{self.name} refused the connection", hint="check that the server runs, and its port number"
@@ -98,8 +97,8 @@ class TcpPort:
 
 
 def _find_out_a_dead_server(sock: socket.socket) -> None:
-    """Have the kernel find out a dead server. TCP_NODELAY is asyncio's own default."""
+    """Enable keepalive so that the kernel detects a dead server. TCP_NODELAY is asyncio's default."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in KEEP_ALIVE.items():
-        if hasattr(socket, option):  # each system has some of them
+        if hasattr(socket, option):  # not every system has all of them
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)

@@ -97,7 +97,7 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
         ("/dev/ttyUSB0?baudrate=9600&stopbits=3", "stopbits='3': use 1, 1.5 or 2"),
         ("/dev/ttyUSB0?baudrate=9600&receive_latency=16ms", "use a number of seconds, such as 0.016"),
         ("?baudrate=9600", "a serial port needs a path"),
-        ("usb:?baudrate=9600", "a USB adapter is named by its serial number, such as usb:A500ABC"),
+        ("usb:?baudrate=9600", "a USB adapter needs a serial number, such as usb:A500ABC"),
         ("socket://server:4001?parity=E", "no such port option 'parity'; there are baudrate, echo"),
         ("socket://server", "'socket://server' is not of the form socket://HOST:PORT"),
         ("socket://:4001", "is not of the form"),
@@ -105,9 +105,9 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
         ("socket://server:70000", "is not of the form"),
         ("socket://server:4001/dev/ttyS0", "is not of the form"),
         ("socket://[::1:4001", "is not of the form"),
-        ("127.0.0.1:4001", "'127.0.0.1:4001' is no device path; a TCP port is written socket://127.0.0.1:4001"),
-        ("tcp://server:4001", "a line that a busmaster serves, .* a serial server is written socket://"),
-        ("unix:/run/line.sock", "unix:/run/line.sock is a line that a busmaster serves, .* here a port is needed"),
+        ("127.0.0.1:4001", "'127.0.0.1:4001' is not a device path; write a TCP port as socket://127.0.0.1:4001"),
+        ("tcp://server:4001", "is the address of a running line, .* write a serial server as socket://"),
+        ("unix:/run/line.sock", r"unix:/run/line.sock is the address of a running line, .*\. A port is needed here"),
         ("udp://server:4001", "no such kind of port: udp://; use a device path, usb:SERIAL, socket://HOST:PORT or rfc"),
         ("rfc2217://server", "'rfc2217://server' is not of the form rfc2217://HOST:PORT"),
         ("rfc2217://server:4001", r"no baud rate given; write for example rfc2217://server:4001\?baudrate=57600"),
@@ -121,5 +121,5 @@ def test_what_is_not_understood_is_named_with_what_would_do(url: str, says: str)
 
 
 def test_a_port_is_named_by_text() -> None:
-    with pytest.raises(InvalidCommand, match="a port is named by text"):
+    with pytest.raises(InvalidCommand, match="a port must be text"):
         endpoint(None)  # type: ignore[arg-type]  # a caller without a type checker

@@ -125,7 +125,7 @@ def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: PtyMa
     usb.plug(one.path, "A500XYZ", place="1-1")
     usb.plug(two.path, place="1-2")
     for name in ("usb:A500ABC", "usb:A500XYZ:1", "usb:A500XYZ:x", "usb:A500"):
-        with pytest.raises(LineDown, match=f"{name} is not plugged in: there is ") as caught:
+        with pytest.raises(LineDown, match=f"{name} is not plugged in: connected: ") as caught:
             resolve(name)
         assert f"usb:A500XYZ ({one.path})" in caught.value.what
         assert f"one without a lasting name ({two.path})" in caught.value.what
@@ -146,7 +146,7 @@ async def test_an_attempt_to_open_asks_once_what_is_plugged_in_whether_it_fails_
         return really_list(path)
 
     monkeypatch.setattr(os, "listdir", listdir)
-    with pytest.raises(LineDown, match=r"usb:A500 is not plugged in: there is usb:A500.* usb:A500"):
+    with pytest.raises(LineDown, match=r"usb:A500 is not plugged in: connected: usb:A500.* usb:A500"):
         await opened("usb:A500")
     assert len(scans) == 1
     transport, recorder = await opened("usb:A500ABC")

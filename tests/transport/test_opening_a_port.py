@@ -268,8 +268,8 @@ async def test_a_port_that_this_program_is_still_closing_is_said_to_be_and_opens
     with pytest.raises(LineDown) as caught:
         await opened(pty_master.path)
     assert str(caught.value) == (
-        f"this program is still closing {pty_master.path}: its driver does not let go of what was not sent; "
-        "it can be opened when that is over; if it never is, check CTS, replug the adapter"
+        f"this program is still closing {pty_master.path}: its driver holds unsent bytes; "
+        "it can be opened after that; if that does not end, check CTS, replug the adapter"
     )
     monkeypatch.setattr(serial_port, "CLOSING_PATIENCE", 2 * PATIENCE)
     opening = asyncio.ensure_future(opened(pty_master.path))
@@ -446,7 +446,7 @@ async def test_a_dangling_link_says_where_it_points(tmp_path: Path) -> None:
 async def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path, Path(os.devnull)):
-        with pytest.raises(LineDown, match="is no serial port; see"):
+        with pytest.raises(LineDown, match="is not a serial port; see"):
             await opened(str(path))
 
 

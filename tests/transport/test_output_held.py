@@ -340,7 +340,7 @@ def test_output_that_never_leaves_takes_the_line_down_and_is_discarded() -> None
             events = bus.events()
             transport_of(bus).hold()
             began = bus.now()
-            with pytest.raises(WriteUnconfirmed, match=r"nothing has left the emulated line for 5 s: the port"):
+            with pytest.raises(WriteUnconfirmed, match=r"no byte has left the emulated line for 5 s: the port"):
                 await axis.write(1, 6)
             assert STUCK_AFTER < bus.now() - began < STUCK_AFTER + 0.2
             changes = [await anext(events) for _ in range(2)]
@@ -493,7 +493,7 @@ async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
         termios.tcflow(transport._fd, termios.TCOOFF)
         with pytest.raises(
             LineDown,
-            match=f"nothing has left {pty_master.path} for 0.1 s: flow control holds it or the adapter is stuck; "
+            match=f"no byte has left {pty_master.path} for 0.1 s: flow control holds it or the adapter is stuck; "
             "check CTS, replug",
         ):
             await axis.read(1, retries=0)
@@ -574,7 +574,7 @@ async def test_a_network_that_stands_still_for_good_takes_the_line_down_in_words
         assert await axis.read(1) == 1
         with (
             standing_still(server.connection),
-            pytest.raises(LineDown, match=f"nothing has left 127.0.0.1:{server.port} for 0.1 s: the network or the s"),
+            pytest.raises(LineDown, match=f"no byte has left 127.0.0.1:{server.port} for 0.1 s: the network or the s"),
         ):
             await axis.read(1, retries=0)
     serving.cancel()

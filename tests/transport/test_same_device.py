@@ -120,7 +120,7 @@ async def test_two_adapters_that_came_back_in_the_other_order_are_refused(
         await causes.until("is now")
         assert causes[0] == (
             f"{name} is now FTDI A500XYZ, the line was opened on FTDI A500ABC; "
-            "name it usb:A500ABC, which finds it wherever it is, or restart to go on with the other"
+            "name it usb:A500ABC, which finds it at any USB port, or restart to use the other device"
         )
         await port.is_tried(3)
         assert len(causes) == 1
@@ -182,7 +182,7 @@ async def test_a_serial_number_follows_its_adapter_to_any_name_and_never_takes_a
         usb.unplug(ours.path)
         usb.plug(other.path, "A500XYZ", place="1-1")
         ours.unplug()
-        await causes.until(f"usb:A500ABC is not plugged in: there is usb:A500XYZ ({other.path}); plug it in")
+        await causes.until(f"usb:A500ABC is not plugged in: connected: usb:A500XYZ ({other.path}); plug it in")
         connection.accept_device()
         await port.is_tried(3)
         assert recorder.connections == 1
@@ -227,7 +227,7 @@ async def test_what_was_opened_is_looked_at_too_not_only_the_name(
 ) -> None:
     """The name may go to another device between the look and the opening."""
     monkeypatch.setattr(serial_port, "identify", lambda *_: identify(ends[1].path))
-    with pytest.raises(LineDown, match=f"{ends[0].path} became another device while it was opened; try again"):
+    with pytest.raises(LineDown, match=f"{ends[0].path} was replaced by another device while it was opened; try again"):
         await opened(ends[0].path)
     monkeypatch.undo()
     transport, recorder = await opened(ends[0].path)
@@ -317,8 +317,8 @@ async def test_while_another_device_has_the_name_every_request_says_so_and_what_
                 await request
             assert str(caught.value).endswith(
                 f"the line is down: {name} is now FTDI A500XYZ, the line was opened on FTDI A500ABC "
-                f"({caught.value.command}); name it usb:A500ABC, which finds it wherever it is, or restart to go on "
-                "with the other"
+                f"({caught.value.command}); name it usb:A500ABC, which finds it at any USB port, or restart to use "
+                "the other device"
             )
             assert caught.value.attempts == 0
 
@@ -344,7 +344,7 @@ async def test_the_events_of_a_bus_tell_why_its_port_does_not_come_back_and_anot
         LineChanged(LineChange.DOWN, f"{name} was lost: it hung up"),
         PortFailed(
             f"{name} is now FTDI A500XYZ, the line was opened on FTDI A500ABC",
-            "name it usb:A500ABC, which finds it wherever it is, or restart to go on with the other",
+            "name it usb:A500ABC, which finds it at any USB port, or restart to use the other device",
         ),
         LineChanged(LineChange.UP),
     ]

@@ -112,7 +112,7 @@ def _existence(path: str) -> Finding:
         return Finding("port", False, f"{path} is no device", "give the path of a serial port")
     subsystem = identity.entry(status.st_rdev) / "subsystem"
     if subsystem.exists() and subsystem.resolve().name != "tty":
-        return Finding("port", False, f"{path} is no serial port", "see `python -m serial.tools.list_ports`")
+        return Finding("port", False, f"{path} is not a serial port", "see `python -m serial.tools.list_ports`")
     return Finding("port", True, f"{path} is {os.path.realpath(path)}" if os.path.islink(path) else f"{path} exists")
 
 

@@ -135,7 +135,7 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_fix(
     line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
     findings = examined(line, (3,), "msc")
     assert findings.wrong == set()
-    assert findings.on("open").advice == "MSC nodes speak at 9600 baud alone, not at 19200"
+    assert findings.on("open").advice == "MSC nodes support only 9600 baud, not 19200"
 
 
 def test_a_node_is_left_with_nothing_unacknowledged() -> None:
@@ -352,7 +352,7 @@ def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_i
     assert "-> name it usb:A500ABC: " in by_path.out
     assert (value.status, value.out) == (0, "1 0\n")
     assert absent.status == 1
-    assert f"usb:A500XYZ is not plugged in: there is usb:A500ABC ({server.path})" in absent.out
+    assert f"usb:A500XYZ is not plugged in: connected: usb:A500ABC ({server.path})" in absent.out
 
 
 @pytest.mark.usefixtures("hasty")

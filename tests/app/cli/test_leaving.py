@@ -179,7 +179,7 @@ def test_what_cannot_be_a_safe_write_is_refused_when_the_file_is_read(
     ("port", "reason"),
     [
         ("FOLDER/away", "FOLDER/away does not exist"),
-        ("FOLDER/line.toml", "FOLDER/line.toml is no serial port"),
+        ("FOLDER/line.toml", "FOLDER/line.toml is not a serial port"),
         ("socket://127.0.0.1:FREE", "127.0.0.1:FREE refused the connection"),
     ],
 )

@@ -159,4 +159,4 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_said() -> None:
             check=False,
         )
     assert "flags" in done.stdout
-    assert done.stderr.splitlines()[0].endswith("MSC nodes speak at 9600 baud alone, not at 4800")
+    assert done.stderr.splitlines()[0].endswith("MSC nodes support only 9600 baud, not 4800")

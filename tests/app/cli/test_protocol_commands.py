@@ -156,7 +156,7 @@ def test_a_rate_that_no_device_has_is_said_once_and_the_command_goes_on(
     assert done.out
     told = done.err.splitlines()
     assert [line for line in told if "warning" in line] == [
-        f"busmaster: warning: {mscs.path.removeprefix('socket://')}: MSC nodes speak at 9600 baud alone, not at 19200"
+        f"busmaster: warning: {mscs.path.removeprefix('socket://')}: MSC nodes support only 9600 baud, not 19200"
     ]
 
 

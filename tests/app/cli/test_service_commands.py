@@ -325,7 +325,7 @@ def test_commands_that_need_a_port_of_their_own_say_so_of_a_line_that_is_served(
     ):
         ran = busmaster(*command)
         assert (ran.status, ran.out) == (2, "")
-        assert "is a line that a busmaster serves, which read, write, poll and scan take" in ran.err
+        assert "is the address of a running line, for read, write, poll and scan" in ran.err
         assert ran.err.count("\n") == 1
 
 

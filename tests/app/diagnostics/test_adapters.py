@@ -98,7 +98,7 @@ def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
         ("file", "is no device"),
         ("link", "which is gone"),
         ("none", "does not exist"),
-        ("null", "is no serial port"),
+        ("null", "is not a serial port"),
     ):
         (finding,) = inspect(str(tmp_path / name))
         assert not finding.ok
