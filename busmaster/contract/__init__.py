@@ -1,1 +1,1 @@
-"""What a protocol and the arbiter agree on: exchanges, their times, and the profile of a protocol."""
+"""The contract between protocols and the arbiter: exchanges, their times, and the profile of a protocol."""

@@ -1,6 +1,6 @@
-"""What callers hand in, numbers and names: taken for what it is, or refused in words before anything is sent.
+"""Checks of arguments, numbers and names: invalid ones raise InvalidCommand before anything is sent.
 
-True is no number here, although Python lets it pass for 1: it is what a mistyped call leaves behind.
+True is not accepted as a number, although Python treats it as 1: it is usually the result of a wrong call.
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ from busmaster.errors import InvalidCommand
 
 HIGHEST_PORT = 65535
 LONGEST_NUMBER = 20
-"""Of a number in a text: none here has more, and Python makes no number of some thousands."""
+"""Maximum number of digits of a number in a text. Python rejects numbers with some thousands."""
 
 
 class Between(NamedTuple):
-    """The least and the most that a number may be, bounds included: beside its type, in `Annotated`."""
+    """Minimum and maximum of a number, inclusive: used with its type in `Annotated`."""
 
     least: float
     most: float = inf
 
 
 def whole_number(value: SupportsIndex, lowest: int, highest: int, what: str) -> int:
-    """Return `value` as an int. Raises InvalidCommand, naming it `what`, unless it is a whole number in that range."""
-    number = value if type(value) is int else _index(value, what)  # an int, as nearly all are, is not asked what it is
+    """Return `value` as an int. Raises InvalidCommand with the name `what` unless it is a whole number in this
+    range."""
+    # nearly all values are ints, which need no conversion
+    number = value if type(value) is int else _index(value, what)
     if not lowest <= number <= highest:
         raise InvalidCommand(f"{what} must be {lowest} to {highest}, not {number}")
     return number
@@ -45,8 +47,9 @@ def _index(value: SupportsIndex, what: str) -> int:
 
 
 def seconds(value: object, what: str) -> float:
-    """Return `value` as a float. Raises InvalidCommand, naming it `what`, unless it is a finite time of 0 s or more."""
-    if type(value) is float:  # as nearly all are: to ask what else is a number takes longer than all the rest
+    """Return `value` as a float. Raises InvalidCommand with the name `what` unless it is a finite time of 0 s or
+    more."""
+    if type(value) is float:  # nearly all values are floats: other number types cost more to check than all the rest
         number = value
     else:
         number = nan if isinstance(value, bool) or not isinstance(value, Real) else _float(value)
@@ -63,7 +66,7 @@ def _float(value: Real) -> float:
 
 
 def is_decimal(text: str) -> bool:
-    """Return whether a text is a whole number without a sign, in digits as the command line takes them: 20 at most."""
+    """Return True if a text is a whole number without a sign, of at most 20 digits, as on the command line."""
     return text.isascii() and text.isdigit() and len(text) <= LONGEST_NUMBER
 
 
@@ -76,7 +79,7 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return that of the known names which may have been meant, or None if none is near."""
+    """Return the known name that was probably meant, or None."""
     return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 

@@ -1,7 +1,7 @@
-"""Driving an exchange: what is done with feed, expired and Expect, in one place.
+"""Runs an exchange: the calls of feed, expired and the handling of Expect, in one place.
 
-`follow` is the loop itself; the arbiter uses it with clocks of its own. `Driver` is a host without a clock, for whoever
-holds one exchange in his hands: who replays a recording, tests a protocol, or examines a line.
+`follow` is the loop itself; the arbiter uses it with its own clock. `Driver` is a host without a clock, for code that
+runs a single exchange: replaying a capture, testing a protocol, or examining a line.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 
 MOST_STEPS = 64
-"""Steps in a row, without a byte between them, after which an exchange that wants another one has no end."""
+"""Consecutive steps without a byte between them after which an exchange is considered endless."""
 
 
 class EndlessExchange(Exception):
-    """An exchange wants one step after the other though nothing comes: a bug of its protocol."""
+    """An exchange requests one step after the other although no byte arrives: a bug of its protocol."""
 
 
 def follow(
     exchange: Exchange[Any], progress: Expect, begin: Callable[[Expect, float], object], now: float
 ) -> Progress[Any]:
-    """Go from step to step for as long as the reader says so, and return what it says then.
+    """Run the steps as long as the reader returns Expect, and return its final result.
 
-    `begin` is called with each step, and with `now`; it says what the host says first. Raises what `begin` and the
-    reader raise, and EndlessExchange.
+    `begin` is called with each step and with `now`; it sends the host's bytes. Raises what `begin` and the reader
+    raise, and EndlessExchange.
     """
     for _ in range(MOST_STEPS):
         begin(progress, now)
@@ -40,15 +40,15 @@ def follow(
 
 
 def without_noise(exchange: Exchange[Any], data: bytes) -> bytes:
-    """Return what is left of the first bytes of a reply, for a profile that tolerates noise before it."""
+    """Return the first bytes of a reply without leading noise, for a profile that tolerates noise."""
     return data.lstrip(bytes(set(data) - set(exchange.starts)))
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How an exchange ended: with `value`, or with `error`. `send` is what the host says last; `rest` came after.
+    """The result of an exchange: `value` or `error`. `send`: the host's last bytes. `rest`: bytes after the reply.
 
-    `silent`: it failed because nothing came of the step that was awaited.
+    `silent`: it failed because no byte of the expected step arrived.
     """
 
     value: Any = None
@@ -63,16 +63,16 @@ class Ending:
 
     @property
     def is_bug(self) -> bool:
-        """It raised what no exchange may raise."""
+        """True if it raised an exception that an exchange must not raise."""
         return self.error is not None and not isinstance(self.error, (FrameError, Refused))
 
     @property
     def is_whole(self) -> bool:
-        """It claims that nothing more can come (R3)."""
+        """True if it reports that nothing more can arrive (R3)."""
         return isinstance(self.error, FrameError) and self.error.whole
 
     def same_as(self, other: Ending) -> bool:
-        """Compare values, what is said and left over, and the kinds of errors; not their words."""
+        """Compare values, sent and remaining bytes, and kinds of errors, but not their texts."""
         mine, theirs = (replace(ending, error=None) for ending in (self, other))
         return mine == theirs and type(self.error) is type(other.error)
 
@@ -83,11 +83,12 @@ class Ending:
 
 
 class Driver:
-    """One fresh exchange, as a host drives it that has no clock: somebody else knows when a window or gap is over.
+    """One exchange, run by a host without a clock: the caller reports when a window or an inter-byte timeout has
+    expired.
 
-    `said` is what the host says after the request, step by step. `timing` is that of the step which is awaited, and
-    `begun` tells whether a byte of it has come. `ending` is how it ended, None until it has. `noise_tolerant` is the
-    profile's: bytes that begin no reply are left out before one.
+    `said`: bytes that the host sends after the request, per step. `timing`: that of the current step; `begun`: True if
+    a byte of it was received. `ending`: the result, None before the end. `noise_tolerant`: that of the profile; bytes
+    before a reply that cannot begin one are skipped.
     """
 
     def __init__(self, exchange: Exchange[Any], *, noise_tolerant: bool = False) -> None:
@@ -100,7 +101,7 @@ class Driver:
         self.ending: Ending | None = None
 
     def feed(self, *chunks: bytes) -> Driver:
-        """Hand over bytes of the line, in the chunks in which they came. What comes after a reply is left over."""
+        """Pass received bytes in the chunks in which they arrived. Bytes after the reply are kept as its `rest`."""
         for chunk in chunks:
             ending = self.ending
             if ending is None:
@@ -114,13 +115,13 @@ class Driver:
         return self
 
     def expire(self) -> None:
-        """Tell that the window of the step is over, or the inter-byte timeout where it has begun."""
+        """Report that the window of the step has expired, or the inter-byte timeout if the reply has begun."""
         if self.ending is None:
             self._silent = not self.begun
             self._take(self.exchange.expired, self.begun)
 
     def run_out(self) -> Ending:
-        """Return how it ends if nothing more comes: one window or inter-byte timeout after the other is over."""
+        """Return the result if nothing more arrives: all windows and inter-byte timeouts expire."""
         for _ in range(MOST_STEPS):
             self.expire()
             if self.ending is not None:
@@ -128,12 +129,12 @@ class Driver:
         return Ending(error=EndlessExchange(f"another step after {MOST_STEPS} that expired"))
 
     def fail(self, error: Exception) -> None:
-        """End it with an error, the host's own too: whatever is still heard does not count."""
+        """End it with an error, which may be the host's own. Later bytes are ignored."""
         send = error.send if isinstance(error, FrameError) else b""
         self.ending = Ending(error=error, send=send, silent=self._silent)
 
     def abandon(self) -> None:
-        """End it where it would say something again, which is then not said (see `Abandonable`)."""
+        """End it instead of sending its next bytes (see `Abandonable`)."""
         self.said.clear()
         self.fail(cast("Abandonable", self.exchange).abandon())
 

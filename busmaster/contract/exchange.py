@@ -1,10 +1,10 @@
 """The contract between the protocols and the arbiter.
 
-A `Command` is an immutable value ("read element 100"). For each attempt it opens a fresh `Exchange`: the bytes to
-send and a reader for what comes back. The arbiter owns the clock and the line; an exchange owns only its frame.
+A `Command` is an immutable value ("read element 100"). For each attempt it opens a new `Exchange`: the bytes to send
+and a reader for the reply. The arbiter owns the clock and the line; an exchange handles only its frames.
 
-One exchange has one or more *steps*: something is said by the host, something is awaited. Most protocols need one.
-MSC needs two (ACK, then the packet) and more when a packet must be sent again.
+An exchange has one or more *steps*: the host sends bytes, then expects bytes. Most protocols need one step. MSC needs
+two (ACK, then the packet), and more if a packet must be sent again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ T_co = TypeVar("T_co", covariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """Bytes of one reply step: `typical` for planning, `longest` for the published bounds."""
+    """Length of a reply step in bytes: `typical` for planning, `longest` for the published bounds."""
 
     typical: int
     longest: int
@@ -31,7 +31,7 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True)
 class LaterStep:
-    """One later step of an undisturbed exchange, for planning: what the host says first, then what is awaited."""
+    """A later step of an undisturbed exchange, for planning: the bytes that the host sends, then the expected reply."""
 
     timing: ReplyTiming
     sizes: Sizes
@@ -39,7 +39,7 @@ class LaterStep:
 
 
 class Need(enum.Enum):
-    """`MORE`: not a whole frame yet; the inter-byte timeout is re-armed."""
+    """`MORE`: the frame is incomplete; the inter-byte timeout starts again."""
 
     MORE = "more"
 
@@ -49,9 +49,9 @@ MORE = Need.MORE
 
 @dataclass(slots=True)
 class Expect:
-    """This step is over and another follows: MSC's packet after its ACK, a NAKed packet sent again.
+    """This step has ended and another follows: MSC's packet after its ACK, or a packet repeated after a NAK.
 
-    The arbiter sends `send`, then calls `feed(b"")` at once, for bytes that came in the same chunk.
+    The arbiter sends `send`, then immediately calls `feed(b"")` for bytes that arrived in the same chunk.
     """
 
     timing: ReplyTiming
@@ -63,8 +63,8 @@ class Expect:
 class Done(Generic[T_co]):
     """The reply is complete.
 
-    `rest` is what came after the reply: nobody asked for those bytes and the line resynchronises. `send` is the host's
-    closing ACK (MSC): the line is free when it has left.
+    `rest`: bytes after the reply. They are unexpected, and the line resynchronises. `send`: the host's closing ACK
+    (MSC); the line is free when it has left.
     """
 
     value: T_co
@@ -76,12 +76,12 @@ Progress: TypeAlias = Need | Expect | Done[T_co]
 
 
 class FrameError(Exception):
-    """This is no reply: the attempt failed. Never reaches a caller.
+    """The received bytes are not a reply: the attempt failed. Callers never get this exception.
 
-    `whole` is True only for a whole frame with the right echo and a bad checksum: its reply has begun, so the line
-    need not wait for overdue replies, only for silence (R3). `send` is a closing ACK overdue to the device all the same
-    (MSC), else it retransmits into other exchanges. `heard` is all that came in place of the reply, where it may be
-    another request's: it pays what is overdue (R15). `hint` is what to try, where that is not what helps against most
+    `whole`: True only for a whole frame with the right echo and a bad checksum. Its reply has begun, so the line does
+    not wait for overdue replies, only for silence (R3). `send`: a closing ACK that the device needs nevertheless (MSC);
+    otherwise it retransmits into other exchanges. `heard`: all bytes received in place of the reply, if they may belong
+    to another request: they can clear overdue replies (R15). `hint`: what to do, if it differs from the hint for most
     garbled replies.
     """
 
@@ -97,11 +97,11 @@ class FrameError(Exception):
 
 
 class Exchange(Protocol[T_co]):
-    """One attempt at one command: the bytes to send and a reader for what comes back. Fresh per attempt."""
+    """One attempt at one command: the bytes to send and a reader for the reply. Created for each attempt."""
 
     @property
     def request(self) -> bytes:
-        """Return the bytes with which it begins."""
+        """Return the first bytes to send."""
         ...
 
     @property
@@ -111,61 +111,61 @@ class Exchange(Protocol[T_co]):
 
     @property
     def sizes(self) -> Sizes:
-        """Return the bytes of the first reply step."""
+        """Return the length of the first reply step."""
         ...
 
     @property
     def later(self) -> Sequence[LaterStep]:
-        """Return the steps after the first, when nothing goes wrong. Empty for most protocols."""
+        """Return the steps after the first in an undisturbed exchange. Empty for most protocols."""
         ...
 
     @property
     def closing(self) -> int:
-        """Return how many bytes the host's closing ACK has. 0 for most protocols."""
+        """Return the length of the host's closing ACK in bytes. 0 for most protocols."""
         ...
 
     @property
     def starts(self) -> bytes:
-        """Return the legal first bytes of the first reply step; anything else is a FrameError."""
+        """Return the valid first bytes of the first reply step. Other bytes are a FrameError."""
         ...
 
     @property
     def answers(self) -> tuple[bytes, ...]:
-        """Return what its good replies begin with, or are where they are one byte: one for each reply that decides.
+        """Return the keys of its good replies: the first bytes, or the byte of a one-byte reply. One for each deciding
+        reply.
 
-        Two exchanges that share one could be taken for each other (R15); they are compared whole, so one that only
-        begins like another is another. Empty for a broadcast.
+        Two exchanges with a common key could be confused (R15). Keys are compared as a whole: one that only begins like
+        another is different. Empty for a broadcast.
         """
         ...
 
     @property
     def overdue(self) -> tuple[bytes, ...]:
-        """Return what its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
+        """Return the keys of replies that may still arrive if the attempt ends now without one (R15); see `answers`."""
         ...
 
     @property
     def answered(self) -> bool:
-        """Return False for a broadcast: no reply will come, and `expired(False)` is called when the line is free."""
+        """Return False for a broadcast: it has no reply, and `expired(False)` is called when the line is free."""
         ...
 
     def feed(self, data: bytes, /) -> Progress[T_co]:
-        """Take the next bytes of the line. Raises FrameError or Refused; anything else is a bug."""
+        """Process the next received bytes. Raises FrameError or Refused; any other exception is a bug."""
         ...
 
     def expired(self, started: bool, /) -> Expect | Done[T_co]:
-        """Say what becomes of a window (`started` False) or an inter-byte timeout (True) that ran out.
+        """Handle an expired window (`started` False) or inter-byte timeout (True).
 
-        Raises FrameError to fail the attempt, or returns Expect (NAK a cut packet) or Done (a broadcast).
+        Raises FrameError to fail the attempt, or returns Expect (NAK to an incomplete packet) or Done (a broadcast).
         """
         ...
 
 
 class Abandonable(Protocol):
-    """An exchange that can be ended where it would say something again: needed where a profile has an
-    `exchange_limit` (R9)."""
+    """An exchange that can be ended instead of sending again. Required if a profile has an `exchange_limit` (R9)."""
 
     def abandon(self) -> FrameError | Refused:
-        """Return what to fail the attempt with in place of the last Expect's `send`, which is then not sent.
+        """Return the error that fails the attempt. The last Expect's `send` is not sent.
 
         A FrameError's own `send` leaves the node with nothing unacknowledged.
         """
@@ -173,36 +173,36 @@ class Abandonable(Protocol):
 
 
 class Command(Protocol[T_co]):
-    """What to ask of a node: an immutable, hashable value, checked when it is built (InvalidCommand).
+    """A request to a node: an immutable, hashable value, checked when it is created (InvalidCommand).
 
-    Encoding cannot fail. `str(command)` is how messages name it: "read element 100".
+    Encoding cannot fail. `str(command)` is its name in messages: "read element 100".
     """
 
     @property
     def writes(self) -> bool:
-        """Return True if it changes the node: then it is never retried unexpected, and never overtakes a write."""
+        """Return True if it changes the node. Then it is not retried by default, and never overtakes a write."""
         ...
 
     @property
     def idempotent(self) -> bool:
-        """Return True if it may be repeated without asking the caller: a read, or a level such as a reference."""
+        """Return True if it may be repeated without a decision of the caller: a read, or a level such as a
+        reference."""
         ...
 
     def open(self, address: int, timings: Timings, /) -> Exchange[T_co]:
-        """Return one attempt at it, with the node at this address. Raises InvalidCommand where that cannot be."""
+        """Return one attempt at it with the node at this address. Raises InvalidCommand if that is not possible."""
         ...
 
 
 class Listener(Protocol):
-    """A reader for what arrives while nothing is asked (MSC: a stale packet is ACKed and dropped)."""
+    """A reader for bytes received between exchanges (MSC: a stale packet is ACKed and dropped)."""
 
     def feed(self, data: bytes, /) -> Need | Done[None]:
-        """Take the next bytes. Raises FrameError for what cannot be a stale packet; its `send` is honoured too."""
+        """Process the next bytes. Raises FrameError if they cannot be a stale packet; its `send` is sent too."""
         ...
 
     def expired(self) -> Done[None]:
-        """Say what becomes of an inter-byte timeout that ran out in mid-frame, or behind noise in which a frame may
-        have been."""
+        """Handle an inter-byte timeout in mid-frame, or after noise that may contain a frame."""
         ...
 
 
@@ -210,7 +210,7 @@ NO_REPLY = "no reply"
 
 
 def no_reply() -> FrameError:
-    """Return the one failure that every exchange shares: the window ran out before a byte came."""
+    """Return the failure that all exchanges share: the window expired before a byte arrived."""
     return FrameError(NO_REPLY)
 
 
@@ -218,9 +218,9 @@ OTHER_FORMAT = "this is not the wiring: check the protocol, its options and the 
 
 
 def other_format(size: int, what: str, *, send: bytes = b"", heard: bytes = b"") -> FrameError:
-    """Return the failure of a reply of `size` bytes whose check is right and whose form is not the protocol's.
+    """Return the failure of a reply of `size` bytes with a correct checksum but an unknown format.
 
-    `what` says what differs. No noise makes such a reply, so its hint says that wiring is not what is wrong.
+    `what` describes the difference. Noise does not cause such replies, so the hint does not mention wiring.
     """
     what = f"{size} bytes came, right in their check but of another format: {what}"
     return FrameError(what, send=send, heard=heard, hint=OTHER_FORMAT)

@@ -1,4 +1,4 @@
-"""What a protocol's document says of each item, as data: lists, help and handles are made of it."""
+"""Items of a protocol as data, from its document. Used for lists, help and handles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Word = TypeVar("Word", bound=IntFlag)
 
 @dataclass(frozen=True, slots=True)
 class Bit:
-    """Describe one bit of a word, 0 the lowest. `severity` says whether something is wrong while it is set."""
+    """One bit of a word, 0 the lowest. `severity`: whether it reports a problem while it is set."""
 
     number: int
     name: str
@@ -24,11 +24,11 @@ class Bit:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Describe what a document says of one item.
+    """One item, as described in the document.
 
-    `item` is what is written where an ITEM is asked for; 1-99 stands for each of them, as in LINE.toml. `number` is
-    what the document calls it by, `keyword` its name in the device's own language. `access` is empty where the
-    document does not say it. `decimals`: how many of the last digits on the line are decimals of its unit.
+    `item`: its name as an ITEM; 1-99 stands for each of them, as in LINE.toml. `number`: its number in the document.
+    `keyword`: its name in the device's own language. `access`: empty if the document does not state it. `decimals`:
+    number of digits on the line that are decimals of its unit.
     """
 
     item: str
@@ -44,7 +44,7 @@ class Item:
 def bits_of(
     meanings: Mapping[Word, str], *, errors: IntFlag | None = None, warnings: IntFlag | None = None
 ) -> tuple[Bit, ...]:
-    """Describe the bits of a word, by what each means; `errors` and `warnings` are those that tell of trouble."""
+    """Return the bits of a word with their meaning. `errors` and `warnings`: the bits that report problems."""
 
     def severity(flag: Word) -> Severity:
         if errors is not None and flag & errors:

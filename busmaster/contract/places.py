@@ -1,7 +1,7 @@
-"""What a command reads or changes, place by place: what limits are held against, and what a listener learns of points.
+"""The places that a command reads or changes. Used to check limits, and to find point values in overheard traffic.
 
-A place is the smallest thing that a node keeps: one element, one parameter, one register. Protocols whose frames reach
-the same nodes name their places alike.
+A place is the smallest unit of a node: one element, one parameter, one register. Protocols that reach the same nodes
+use the same names for their places.
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from busmaster.contract.profile import Profile
 
 @runtime_checkable
 class Placed(Protocol):
-    """A read that says where it reads. What has no such read cannot be limited."""
+    """A read with known places. Quantities without such a read cannot be limited."""
 
     @property
     def places(self) -> tuple[Hashable, ...]:
-        """Return where it reads."""
+        """Return the places that it reads."""
         ...
 
     def shown(self, values: Mapping[Hashable, Any], /) -> Any:
-        """Return what it would return where its places hold these. Raises KeyError for a place that is missing."""
+        """Return its result for these values of its places. Raises KeyError for a missing place."""
         ...
 
 
 @runtime_checkable
 class Telling(Protocol):
-    """A read whose values are told apart by their places: a block tells each value in it."""
+    """A read whose result contains the value of each place, such as a block."""
 
     def told(self, value: Any, profile: Profile, /) -> Mapping[Hashable, Any]:
-        """Return what each place held when it returned `value`, as far as that is known."""
+        """Return the value of each place for the result `value`, as far as known."""
         ...
 
 
 @runtime_checkable
 class Changing(Protocol):
-    """A write that says what it changes. One that does not is refused by a node that has limits."""
+    """A write with known places. Nodes with limits reject writes without them."""
 
     def changes(self, profile: Profile, /) -> Mapping[Hashable, Any]:
-        """Return what each place that it changes holds after it; None where that is not known."""
+        """Return the value of each changed place after the write; None if it is not known."""
         ...
 
 

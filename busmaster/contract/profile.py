@@ -1,4 +1,4 @@
-"""What a protocol says of itself, as data."""
+"""The description of a protocol, as data."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class LineSettings:
 
     @property
     def framing(self) -> str:
-        """Return bits, parity and stop bits as people write them: 8N1, 7E1."""
+        """Return data bits, parity and stop bits in the usual form: 8N1, 7E1."""
         return f"{self.bytesize}{self.parity}{self.stopbits:g}"
 
     def at(self, *baudrates: int) -> tuple[LineSettings, ...]:
-        """Return the same framing at other rates."""
+        """Return the same framing at other baud rates."""
         return tuple(replace(self, baudrate=baudrate) for baudrate in baudrates)
 
 
@@ -60,31 +60,33 @@ class Batch:
 
 @dataclass(frozen=True)
 class Profile:
-    """What the arbiter, the planner and the handles need to know of a protocol.
+    """The properties of a protocol that the arbiter, the planner and the handles need.
 
-    `probe` is its cheapest read, asked of a node that may be dead. `merge` proposes cheaper exchanges for commands of
-    one node; a poll group and the planner weigh them by line time. `listen` reads what arrives while nothing is
-    asked. `checks` are further cheap reads that harm no node and whose answers differ: where an answer could be
-    another request's, one of those is asked that cannot be (R15); a node that refuses one is asked another.
-    `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
-    exchanges are `Abandonable`. `shares_line_with` are the other protocols whose nodes may be on the same line.
-    `fixed_rate`: its devices have the baud rate of `line` and no other. `other_lines`: further settings that its
-    devices are met with, the likeliest first, for whoever looks for one on an unknown line.
-    `checked_requests`: a node notices a flipped bit in any request. Without that a damaged read is answered with
-    another item, which is taken for that item if the line goes on meanwhile: reply windows cannot be learned.
-    `acks_are_commands`: a node that has just replied takes an ACK or a NAK for the host's wish for the next value or
-    the same one again, also where another node says it. So the line never goes on before the reply to a write is over.
+    `probe`: its cheapest read, sent to a node that may be dead. `merge`: proposes cheaper exchanges for commands of one
+    node; poll groups and the planner choose by line time. `listen`: returns a reader for bytes between exchanges.
+    `sync_reads`: further cheap reads that harm no node and whose replies differ. If a reply could belong to another
+    request, one that cannot be confused is sent (R15); if a node refuses one, another is sent. `exchange_limit`: limit
+    of one exchange in seconds (MSC: after that a bad packet is ACKed); its exchanges are `Abandonable`.
+    `shares_line_with`: other protocols whose nodes may be on the same line. `fixed_rate`: its devices support only the
+    baud rate of `line`. `other_lines`: further settings of its devices, the most likely first, for a search on an
+    unknown line.
+
+    `checked_requests`: a node detects a flipped bit in any request. Without that, a damaged read returns another item,
+    which would be taken for the requested one if the line has continued. Then reply windows cannot be learned.
+
+    `acks_are_commands`: a node that has just replied takes an ACK or a NAK, even one from another node, for the host's
+    request for the next value or a repetition. So the line never continues before the reply to a write is over.
     """
 
     name: str
     title: str
     addresses: Sequence[int]
-    """In rising order."""
+    """In ascending order."""
     line: LineSettings
     timings: Timings
     probe: Command[Any] = field(compare=False)
     sync_reads: Sequence[Command[Any]] = field(default=(), compare=False)
-    # Both compared apart: two kinds of device that speak one protocol may share a node (Node.check_shared).
+    # Compared separately: two kinds of device with one protocol may share a node (Node.check_shared).
     broadcast: int | None = None
     addressed: bool = True
     retries: int = 2
@@ -97,31 +99,31 @@ class Profile:
     acks_are_commands: bool = False
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
     kind: str = field(default="", compare=False)
-    """What this kind of device is called as a protocol, where that is not `name`: "microflex" speaks hcp2."""
-    # Compared apart: a second handle that leaves it open asks for the same node (Node.check_shared).
+    """Name of this kind of device as a protocol, if it is not `name`: "microflex" uses hcp2."""
+    # Compared separately: a second handle that leaves it out requests the same node (Node.check_shared).
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
 
     @property
     def kind_name(self) -> str:
-        """Return the name by which LINE.toml and the command line know this kind of device."""
+        """Return the name of this kind of device in LINE.toml and on the command line."""
         return self.kind or self.name
 
     def label(self, address: int) -> str:
-        """Return how messages name a node: "node 5", or "the drive" where the protocol has no address."""
+        """Return the name of a node in messages: "node 5", or "the drive" if the protocol has no address."""
         return f"node {address}" if self.addressed else "the drive"
 
     def may_share_with(self, other: Profile) -> bool:
-        """Return whether both may be on one line: it is enough that one of them knows the other."""
+        """Return True if both may be on one line. It is enough if one of them lists the other."""
         return other.name == self.name or other.name in self.shares_line_with or self.name in other.shares_line_with
 
     def wrong_rate(self, baudrate: int) -> str:
-        """Return what is wrong with a baud rate, in words; nothing unless its devices cannot have it."""
+        """Return an error text if its devices do not support this baud rate, else ""."""
         if not self.fixed_rate or baudrate == self.line.baudrate:
             return ""
-        return f"{self.title} nodes speak at {self.line.baudrate} baud alone, not at {baudrate}"
+        return f"{self.title} nodes support only {self.line.baudrate} baud, not {baudrate}"
 
     def check_learnable(self) -> None:
-        """Raise InvalidCommand where reply windows cannot be learned."""
+        """Raise InvalidCommand if reply windows cannot be learned."""
         if not self.checked_requests:
             raise InvalidCommand(
                 f"{self.name}: reply windows cannot be learned, because a read request carries no checksum: a damaged "

@@ -1,4 +1,4 @@
-"""When replies are awaited: the reply times of one kind of exchange, and of one node."""
+"""Reply times of one kind of exchange, and of one node."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from busmaster.renames import refuse_old_arguments
 
 @dataclass(frozen=True, slots=True)
 class ReplyTiming:
-    """When a reply is awaited, in seconds from the request's last byte on the wire.
+    """Reply times in seconds, from the request's last byte on the wire.
 
     Raises `InvalidCommand` unless 0 <= late_after <= window <= max_reply_delay and inter_byte_timeout > 0,
     driver_release_time >= 0.
 
-    `silence` is set where the window is learned: after so many seconds without a byte the line goes on, though the
-    maximum reply delay is not over; what may still come is overdue until it is (R15). None: the line waits for the
-    maximum reply delay (R3).
+    `silence` is set if the window is learned: after this many seconds without a byte the line continues before the
+    maximum reply delay has passed, and the reply is overdue until then (R15). None: the line waits for the maximum
+    reply delay (R3).
     """
 
     late_after: float
-    """A reply begun by then is on time."""
+    """A reply that begins by then is on time."""
     window: float
-    """A reply begun by then is accepted, and counted late after `late_after`."""
+    """Reply window. A reply that begins after `late_after` is accepted and counted late."""
     max_reply_delay: float
-    """What has not begun by then never comes: the promise R3 rests on it. A reply begun between `window` and then is
-    accepted and counted late, too, unless the window is learned."""
+    """Longest time after a request at which the reply can begin (R3). It must exceed the slowest reply. A reply that
+    begins after `window` is accepted and counted late too, unless the window is learned."""
     inter_byte_timeout: float
-    """The longest pause between two bytes of one frame."""
+    """Longest pause between two bytes of one frame."""
     driver_release_time: float = 0.0
-    """The node's driver holds the line this long after its reply."""
+    """Time for which the node's driver holds the line after its reply."""
     silence: float | None = None
-    """Where the window is learned, the silence that ends a resynchronisation by itself."""
+    """With a learned window, the silence that ends a resynchronisation."""
 
     def __new__(cls, *args: object, **named: object) -> ReplyTiming:
-        """Refuse the names that arguments had before version 0.3, with the new ones."""
+        """Reject the argument names from before version 0.3, and report the new ones."""
         refuse_old_arguments(named, "ReplyTiming")
         return object.__new__(cls)
 
@@ -53,12 +53,11 @@ class ReplyTiming:
 
     @property
     def awaited(self) -> float:
-        """Until when a reply that has not begun is awaited: the maximum reply delay, or the window where that is
-        learned."""
+        """Time for which the line waits for a reply to begin: the maximum reply delay, or a learned window."""
         return self.max_reply_delay if self.silence is None else self.window
 
     def with_window(self, window: float) -> ReplyTiming:
-        """Return the same with another reply window; late_after and max_reply_delay move only as far as they must."""
+        """Return the same times with another window; late_after and max_reply_delay change only as far as necessary."""
         return replace(
             self,
             late_after=min(self.late_after, window),
@@ -73,7 +72,7 @@ class ReplyTiming:
 
 @dataclass(frozen=True, slots=True)
 class Timings:
-    """The reply times of one node: `read` and `write` for the first step, `packet` for a packet after its ACK (MSC)."""
+    """Reply times of one node: `read` and `write` for the first step, `packet` for a packet after its ACK (MSC)."""
 
     read: ReplyTiming
     write: ReplyTiming
@@ -85,12 +84,12 @@ class Timings:
         return cls(timing, timing, timing)
 
     def with_window(self, window: float) -> Timings:
-        """Return the same with another window for every first step; a packet's is only ever lengthened."""
+        """Return the same times with another window for every first step. A packet's window is only ever lengthened."""
         packet = self.packet.with_window(max(window, self.packet.window))
         return Timings(self.read.with_window(window), self.write.with_window(window), packet)
 
     def with_max_reply_delay(self, max_reply_delay: float) -> Timings:
-        """Return the same with at least this maximum reply delay for each of the three."""
+        """Return the same times with at least this maximum reply delay for all three."""
         return Timings(
             self.read.with_max_reply_delay(max_reply_delay),
             self.write.with_max_reply_delay(max_reply_delay),

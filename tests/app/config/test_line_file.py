@@ -99,7 +99,7 @@ def test_protocols_that_may_share_a_line_share_it() -> None:
 
 def test_a_rate_that_no_device_of_the_protocol_has_is_warned_about_once() -> None:
     feeder = PRESS.replace("press", "feeder").replace("1", "2")
-    with pytest.warns(UserWarning, match="MSC nodes speak at 9600 baud alone, not at 57600") as told:
+    with pytest.warns(UserWarning, match="MSC nodes support only 9600 baud, not 57600") as told:
         line(f"{HEAD}{PRESS}{feeder}")
     assert len(told) == 1
 
