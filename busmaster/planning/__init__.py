@@ -1,4 +1,4 @@
-"""Does a schedule fit a line, and how long can anybody wait on it? Pure arithmetic; see `plan` and `bounds`."""
+"""Checks whether a schedule fits a line, and how long a request can wait. Pure calculation; see `plan` and `bounds`."""
 
 from busmaster.planning.fit import BAUDRATES, GroupPlan, MergedReads, Plan, PlannedGroup, plan, plan_steps
 from busmaster.planning.losses import Losses

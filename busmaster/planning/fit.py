@@ -1,8 +1,8 @@
-"""Does this schedule fit this line? Pure arithmetic over profiles, commands and periods.
+"""Checks whether a schedule fits a line. Pure calculation with profiles, commands and periods.
 
-`plan` says how busy the line will be, how long each group's cycle takes, which group will miss cycles and what would
-fit, and how long anybody can wait in the worst case. Reply times are measured or declared; where neither is known,
-half of `late_after` is assumed. All times are in seconds.
+`plan` calculates the line load, the cycle time of each group, which group will miss cycles and what would fit, and the
+longest wait in the worst case. Reply times are measured or given; if neither is known, half of `late_after` is assumed.
+All times are in seconds.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapes
 from busmaster.planning.worst_case import ALONE, Bounds, PlannedNode, Read, Sharing, bound_steps, unanswered
 
 COMFORT = 0.9
-"""The share of the line that a schedule may take: the rest is for commands, retries and probes."""
+"""Share of the line that a schedule may use. The rest is for commands, retries and probes."""
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 HORIZON = 10
-"""Periods of the slowest group over which the timetable is played through, at most TIMETABLE exchanges."""
+"""Periods of the slowest group for which the timetable is simulated, at most TIMETABLE exchanges."""
 TIMETABLE = 20_000
 PIECE = 32
-"""Exchanges of the timetable that are played at once."""
+"""Exchanges of the timetable simulated in one step."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedGroup:
-    """A poll group to be: what it reads of which node, once a period.
+    """A planned poll group: its reads, by node, once per period.
 
-    `merge`: the cheaper exchanges that it opts in to, beside those of the profiles.
+    `merge`: optional cheaper exchanges, in addition to those of the profiles.
     """
 
     name: str
@@ -51,7 +51,7 @@ class PlannedGroup:
 
 @dataclass(frozen=True, slots=True)
 class MergedReads:
-    """One merged exchange of a group: how many single commands it stands for, and what that saves in each cycle."""
+    """One merged exchange of a group: how many single commands it replaces, and what it saves per cycle."""
 
     node: str
     command: str
@@ -61,13 +61,13 @@ class MergedReads:
 
 @dataclass(frozen=True, slots=True)
 class GroupPlan:
-    """One group on the line. `values` are read in `exchanges` that take `line_time` seconds in each cycle.
+    """The result for one group. `values` are read in `exchanges` that take `line_time` seconds per cycle.
 
-    `cycle` and `longest_cycle` (mean and longest) run from a cycle's due time to its last value, if nothing goes
-    wrong. `missed` is the share of its cycles that cannot start in time, so that they come every `achieved` seconds.
-    `worst_wait` and `worst_cycle` are the bounds of R9, from due time to start and to end. `fitting_period` is the
-    shortest with which the schedule would fit comfortably, were all else as it is: None where it fits as it is, or
-    where this group alone cannot make it fit. `could_save`: what merges that nobody opted in to would save a cycle.
+    `cycle`, `longest_cycle`: mean and longest time from a cycle's due time to its last value, without disturbances.
+    `missed`: share of cycles that cannot start in time, so that the actual period is `achieved` seconds. `worst_wait`,
+    `worst_cycle`: the bounds of R9 from due time to start and to end. `fitting_period`: shortest period with which the
+    schedule would fit comfortably, all else unchanged. None if it already fits, or if this group alone cannot make it
+    fit. `could_save`: savings per cycle by merges that are not enabled.
     """
 
     name: str
@@ -87,18 +87,18 @@ class GroupPlan:
 
     @property
     def utilisation(self) -> float:
-        """Return the share of the line that it asks for."""
+        """Return the share of the line that it needs."""
         return self.line_time / self.period
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a line will be like. `utilisation` is the share of it that the schedule asks for: above 1 it does not fit.
+    """The result for a line. `utilisation`: share of the line that the schedule needs; above 1 it does not fit.
 
-    A command waits at most for `typical_wait` on a healthy line (one exchange), and for `dead_wait` behind a node that
-    does not answer. `worst_waits` are the bounds of R9 for one more request of each class. `fitting_baudrate` is the
-    lowest usual one at which the schedule would fit comfortably; None where it does as it is, where none is enough, and
-    where the devices of a protocol have one rate alone.
+    A command waits at most `typical_wait` on a healthy line (one exchange), and `dead_wait` behind a node that does not
+    reply. `worst_waits`: the bounds of R9 for one more request of each class. `fitting_baudrate`: lowest usual baud
+    rate at which the schedule would fit comfortably. None if it already fits, if no rate is sufficient, or if the
+    devices of a protocol support only one rate.
     """
 
     line: LineSettings
@@ -112,12 +112,12 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """Return whether no cycle is missed as long as nothing goes wrong."""
+        """Return True if no cycle is missed without disturbances."""
         return self.utilisation <= 1 and not any(group.missed for group in self.groups)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Say what does not fit and what would, a sentence each; empty where the schedule fits comfortably."""
+        """Return what does not fit and what would, one sentence each. Empty if the schedule fits comfortably."""
         return tuple(_advice(self))
 
 
@@ -130,11 +130,11 @@ def plan(
     could_merge: Sequence[Merge] = (),
     sharing: Sharing = ALONE,
 ) -> Plan:
-    """Calculate what becomes of these poll groups on this line.
+    """Calculate the load of these poll groups on this line.
 
-    `others` may be asked beside them: the worst case calculates with those, and with every node's probe. `could_merge`
-    are merges to be weighed that no group opts in to. `sharing` says who else has the line. Raises InvalidCommand for a
-    period or phase that cannot be.
+    `others`: further requests, which the worst case includes together with a probe of each node. `could_merge`: merges
+    to evaluate that no group has enabled. `sharing`: other programs on the line. Raises InvalidCommand for an invalid
+    period or phase.
     """
     return at_once(
         plan_steps(
@@ -157,7 +157,7 @@ def plan_steps(
     could_merge: Sequence[Merge] = (),
     sharing: Sharing = ALONE,
 ) -> Generator[int, None, Plan]:
-    """Do what `plan` does in steps: each yields how many units of work it took, of about a microsecond."""
+    """Calculate as `plan` does, in steps. Each yields the units of work it took, of about a microsecond."""
     drafts: list[_Draft] = []
     for group in groups:
         drafts.append(_Draft(group, line.byte_time))
@@ -186,7 +186,7 @@ def plan_steps(
 
 
 class _Draft:
-    """A group on its way to its GroupPlan."""
+    """A group during the calculation of its GroupPlan."""
 
     def __init__(self, group: PlannedGroup, byte_time: float) -> None:
         self.group = group
@@ -211,7 +211,7 @@ class _Draft:
         self.longest = max(self.longest, seconds)
 
     def weigh(self) -> Generator[int, None, None]:
-        """Choose its exchanges, and calculate what each takes."""
+        """Choose its exchanges and calculate their line time."""
         self.exchanges = yield from _exchanges(self.group, self.group.merge, self.byte_time)
         for node, served in self.exchanges:
             exchange = node.open(served.command)
@@ -222,7 +222,7 @@ class _Draft:
         self.poll.cost = sum(self.costs)
 
     def weigh_further(self, could_merge: Sequence[Merge]) -> Generator[int, None, None]:
-        """Calculate what merges would save that nobody opted in to."""
+        """Calculate the savings of merges that are not enabled."""
         if could_merge:
             merge = (*self.group.merge, *could_merge)
             further = _Draft(replace(self.group, merge=merge), self.byte_time)
@@ -259,7 +259,7 @@ class _Draft:
 def _exchanges(
     group: PlannedGroup, merges: Sequence[Merge], byte_time: float
 ) -> Generator[int, None, list[tuple[PlannedNode, Served]]]:
-    """Choose the exchanges node by node, each command once."""
+    """Choose the exchanges of each node, each command once."""
     commands: dict[PlannedNode, dict[Command[Any], None]] = {}
     for node, command in group.reads:
         commands.setdefault(node, {})[command] = None
@@ -274,7 +274,7 @@ def _exchanges(
 
 
 def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
-    """Play the timetable, if every exchange takes its line time: earliest deadline first, and BACKGROUND as in R9."""
+    """Simulate the timetable with the line time of each exchange: earliest deadline first, and BACKGROUND as in R9."""
     schedule, order = Schedule(), count()
     for draft in drafts:
         schedule.add(draft.poll, 0.0)
@@ -286,7 +286,7 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
     background: list[tuple[float, int, float, _Draft]] = []
 
     def release(now: float) -> Generator[int, None, float]:
-        """Have what is due wait; returns when more will be."""
+        """Queue what is due. Returns when more will be due."""
         while (due := schedule.next_due()) <= now:
             for poll in schedule.release(now):
                 draft: _Draft = poll.group
@@ -328,7 +328,7 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
 
 
 def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator[int, None, int | None]:
-    # They share one line: where one device has a single rate, another cannot be had by any.
+    # All share one line: if one device has a fixed rate, no other rate is possible.
     if any(node.profile.fixed_rate for draft in drafts for node, _ in draft.exchanges):
         return None
     for baudrate in BAUDRATES:
@@ -345,9 +345,9 @@ def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator
 
 
 def _rounded_up(seconds: float) -> float:
-    """Round up to two digits: to a period that somebody would write down."""
+    """Round up to two digits, to a period that a person would write."""
     unit = 10.0 ** (floor(log10(seconds)) - 1)
-    # 0.14 / 0.01 is a little more than 14 in floats, and would become 0.15.
+    # 0.14 / 0.01 is slightly more than 14 in floats, and would become 0.15.
     return round(ceil(seconds / unit - 1e-9) * unit, 9)
 
 
@@ -355,7 +355,7 @@ def _advice(plan: Plan) -> Iterator[str]:
     tight = any(group.longest_cycle > COMFORT * group.period for group in plan.groups)
     if plan.utilisation <= COMFORT and plan.fits and not tight:
         return
-    yield f"the schedule asks for {plan.utilisation:.0%} of the line; comfortable is up to {COMFORT:.0%}"
+    yield f"the schedule needs {plan.utilisation:.0%} of the line; up to {COMFORT:.0%} is comfortable"
     for group in plan.groups:
         if group.missed:
             yield (

@@ -1,4 +1,4 @@
-"""What lost frames cost a schedule: with the documents' reply times, and with learned ones."""
+"""Cost of lost frames for a schedule, with documented and with learned reply times."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from busmaster.contract.exchange import Exchange
 from busmaster.planning.worst_case import PlannedNode, unanswered
 
 LOST = 0.01
-"""The share of all frames, either way, that is calculated to be lost."""
+"""Assumed share of lost frames in each direction."""
 FAILED = (1 - LOST) ** -2 - 1
-"""Attempts that fail then, for each that succeeds."""
+"""Resulting failed attempts per successful one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """What a schedule asks of its line where `share` of all frames are lost, either way, and each is repeated.
+    """Line load of a schedule if a `share` of all frames is lost in each direction, and each is repeated.
 
-    `documented` and `learned` are shares of the line: with the reply times that nodes have, and with learned ones.
-    `windows` are the shortest and the longest first window that would be learned, in seconds, if no reply takes
-    longer than is known; both are 0 where nothing is read.
+    `documented`, `learned`: shares of the line with the reply times of the nodes, and with learned ones. `windows`:
+    shortest and longest first window that would be learned, in seconds, if no reply takes longer than known; both are 0
+    if nothing is read.
     """
 
     share: float
@@ -33,18 +33,20 @@ class Losses:
 
 
 class LostAttempts:
-    """What lost attempts cost one group, in seconds of the line: `documented` or `learned` for one of each exchange."""
+    """Cost of lost attempts for one group, in seconds of line time: `documented` or `learned`, for one of each
+    exchange."""
 
     def __init__(self) -> None:
         self.documented = self.learned = 0.0
         self.windows = (inf, 0.0)
 
     def add(self, node: PlannedNode, exchange: Exchange[Any], byte_time: float) -> None:
-        """Calculate with one more exchange."""
+        """Include one more exchange."""
         timing = exchange.timing
         usual = timing.late_after / 2 if node.reply_time is None else node.reply_time
         window = min(window_of(usual, usual), timing.window)
-        # The line goes on after the window and a short silence; a check shows that nothing is to come any more (R15).
+        # The line continues after the window and a short silence. A sync read proves that nothing more will arrive
+        # (R15).
         silence = min(timing.inter_byte_timeout, LEAST_SILENCE * byte_time)
         check = line_time(node.open(node.profile.probe), byte_time, node.reply_time)
         documented = unanswered(exchange, byte_time)
@@ -54,9 +56,9 @@ class LostAttempts:
 
 
 def losses(utilisation: float, groups: list[tuple[float, LostAttempts]]) -> Losses:
-    """Calculate what a schedule asks of its line, that asks for `utilisation` of it while nothing is lost.
+    """Calculate the line load of a schedule that needs `utilisation` without losses.
 
-    `groups` has the period of each in seconds, and what lost attempts cost it.
+    `groups`: the period of each in seconds, and its cost of lost attempts.
     """
     shortest = min((lost.windows[0] for _, lost in groups), default=inf)
     longest = max((lost.windows[1] for _, lost in groups), default=0.0)

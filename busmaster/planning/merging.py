@@ -1,7 +1,7 @@
-"""Cheaper exchanges: which of those that a protocol proposes are worth their line time.
+"""Selects the cheaper exchanges of a protocol that save line time.
 
-Work that grows with the points of a line is a generator: each step yields how many units it took, of about a
-microsecond, and whoever runs it lets the line go on between.
+Work that grows with the number of points is a generator. Each step yields the units it took, of about a microsecond, so
+that the caller can let the line continue in between.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from busmaster.contract.profile import Batch
 T = TypeVar("T")
 
 WEIGHING = 10
-"""Units of work that it takes to weigh one exchange."""
+"""Units of work for evaluating one exchange."""
 Merge: TypeAlias = Callable[[Sequence[Command[Any]]], Sequence[Batch]]
-"""Proposes batches for commands of one node: `Profile.merge`, or what a poll group opts in to."""
+"""Proposes batches for commands of one node: `Profile.merge`, or an option of a poll group."""
 
 
 class Served(NamedTuple):
-    """One exchange, and the indexes of the commands that it stands for.
+    """One exchange, and the indexes of the commands that it replaces.
 
-    A `batch` brings a sequence of their values, and saves so many seconds of the line compared with single commands.
+    A `batch` returns a sequence of their values, and saves this many seconds of line time compared with single
+    commands.
     """
 
     command: Command[Any]
@@ -35,10 +36,10 @@ class Served(NamedTuple):
 def cheapest(
     commands: Sequence[Command[Any]], merges: Iterable[Merge], cost: Callable[[Command[Any]], float]
 ) -> Generator[int, None, list[Served]]:
-    """Choose the exchanges that serve all these commands of one node, merged where that saves line time.
+    """Choose the exchanges for these commands of one node, merged if that saves line time.
 
-    `cost` is the line time of one command, in seconds. The greatest saving is taken first, each command is served
-    once, and the exchanges are in the order of the first command that each serves.
+    `cost`: line time of one command, in seconds. The largest saving is used first and each command is served once. The
+    exchanges are in the order of the first command that each serves.
     """
     offers: list[Batch] = []
     for merge in merges:
@@ -65,7 +66,7 @@ def cheapest(
 
 
 def at_once(steps: Generator[int, None, T]) -> T:
-    """Do all steps of a piece of work, and return what comes of it."""
+    """Run all steps of a generator, and return its result."""
     while True:
         try:
             next(steps)

@@ -1,8 +1,8 @@
-"""How long can anybody wait for the line, in the worst case?
+"""The longest wait for the line in the worst case.
 
-The worst case is that of R9: every exchange lasts as long as an exchange can, and whatever may go first goes first. It
-holds while each request causes at most one reply (R3), be it one that trickles in byte by byte; on a line that is
-never silent nobody waits longer either, but fails with LineNoisy.
+The worst case is that of R9: each exchange takes as long as an exchange can, and everything that may go first goes
+first. It is valid while each request causes at most one reply (R3), even one that arrives byte by byte. On a line that
+is never silent requests do not wait longer, but fail with LineNoisy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from busmaster.planning.merging import WEIGHING, at_once
 
 @dataclass(frozen=True, slots=True)
 class PlannedNode:
-    """A node as the planner sees it. `reply_time`: seconds from a request to its reply, if known or measured."""
+    """A node in the planner. `reply_time`: seconds from a request to its reply, if known or measured."""
 
     profile: Profile
     address: int
@@ -33,11 +33,11 @@ class PlannedNode:
     reply_time: float | None = None
 
     def open(self, command: Command[Any]) -> Exchange[Any]:
-        """Open the exchange of a command to this node, by its own timings or else its profile's."""
+        """Open the exchange of a command to this node, with its own timings or else its profile's."""
         return command.open(self.address, self.timings or self.profile.timings)
 
     def line_time(self, command: Command[Any], byte_time: float) -> float:
-        """Return the seconds of the line that one undisturbed attempt takes."""
+        """Return the line time, in seconds, of one undisturbed attempt."""
         return line_time(self.open(command), byte_time, self.reply_time)
 
 
@@ -45,7 +45,7 @@ Read: TypeAlias = tuple[PlannedNode, Command[Any]]
 
 
 class Sharing(NamedTuple):
-    """Who shares a line: so many other programs, and the longest time, in seconds, for which a sequence holds it."""
+    """The number of other programs on the line, and the longest time, in seconds, for which a sequence can hold it."""
 
     clients: int = 0
     held: float = 0.0
@@ -55,16 +55,16 @@ ALONE = Sharing()
 
 
 def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
-    """Return what, beside its timings, tells how long an exchange can take: two of one shape take equally long."""
+    """Return the properties, besides its timings, that determine how long an exchange can take."""
     later = tuple((step.sent, step.sizes.longest) for step in exchange.later)
     return len(exchange.request), exchange.sizes.longest, later
 
 
 def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
-    """Return for how many seconds one attempt can keep the line from others, if nothing is repeated in it.
+    """Return the longest time, in seconds, for which one attempt can occupy the line, without repetitions in it.
 
-    Its resynchronise is included. It is the H of R9: each step's request, its maximum reply delay and its longest
-    reply; then the silence after the last byte, which a reply that trickles in puts off.
+    This is the H of R9, resynchronisation included: for each step the request, its maximum reply delay and its longest
+    reply; then the silence after the last byte, which a slow reply delays.
     """
     before = worst = 0.0
     steps = [(len(exchange.request), exchange.timing, exchange.sizes)]
@@ -74,10 +74,10 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
         begins = timing.max_reply_delay + byte_time
         whole = (
             begins + sizes.longest * byte_time + timing.inter_byte_timeout
-        )  # then the step is over, whatever still trickles in
+        )  # then the step ends, even if bytes still arrive
         quiet = max(QUIET, timing.inter_byte_timeout) + receive_latency + byte_time
-        # Each byte puts the silence off; but a line that is not silent for longer is NOISY: nobody waits longer, but
-        # fails with LineNoisy.
+        # Each byte delays the silence. But a line without silence becomes NOISY: requests do not wait longer, but fail
+        # with LineNoisy.
         trickles = min(begins + sizes.longest * quiet, whole + NOISY_AFTER + quiet)
         worst = max(worst, said + trickles + quiet)
         before = said + whole
@@ -85,16 +85,16 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
 
 
 def unanswered(exchange: Exchange[Any], byte_time: float) -> float:
-    """Return for how many seconds one attempt keeps the line from others if no byte of a reply comes."""
+    """Return the time, in seconds, for which one attempt occupies the line if no byte of a reply arrives."""
     return len(exchange.request) * byte_time + max(exchange.timing.max_reply_delay, exchange.timing.driver_release_time)
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """How long a request of each class can wait until it is sent (R9), with so many exchanges polled on the line.
+    """The longest time until a request of each class is sent (R9), with this many polled exchanges on the line.
 
-    `hold` is the longest hold of one exchange, `urgent_hold` the longest while an urgent request waits: then nothing
-    is repeated within an exchange. Those of COMMAND and below hold as long as URGENT is rare.
+    `hold`: longest hold of one exchange. `urgent_hold`: the same while an urgent request waits, when nothing is
+    repeated within an exchange. The bounds of COMMAND and below are valid while URGENT requests are rare.
     """
 
     hold: float
@@ -102,19 +102,19 @@ class Bounds:
     polls: int = 0
     background: int = 0
     patience: float = 1.0
-    """The longest time, in seconds, for which a poll lets later ones with a shorter period pass."""
+    """Longest time, in seconds, for which later polls with a shorter period can go before a poll."""
     clients: int = 0
-    """How many other programs share the line, and take turns with this one."""
+    """Number of other programs that share the line and take turns with this one."""
     held: float = 0.0
-    """The longest time, in seconds, for which the line may be held for one sequence of requests."""
+    """Longest time, in seconds, for which the line can be held for one sequence of requests."""
 
     def wait(self, priority: Priority, *, ahead: int = 0, patience: float | None = None) -> float:
-        """Return how long, in seconds, a request of this class waits at most until it is sent.
+        """Return the longest time, in seconds, until a request of this class is sent.
 
-        `ahead` says how many of URGENT or COMMAND wait already, of this program. Of URGENT, it is the wait of a write.
-        Before each request, MOST_BEFORE others may go while an answer could be taken for its own (R15); an urgent write
-        is never held back so, an urgent read waits for so many more. Each other program may go before it twice, and
-        each exchange may be a sequence for which the line is held; a lower class has a slot behind each of those.
+        `ahead`: number of queued URGENT or COMMAND requests of this program. For URGENT, this is the wait of a write.
+        Before each request, MOST_BEFORE others may go if its reply could be ambiguous (R15). An urgent write is never
+        held back for this; an urgent read waits for that many more. Each other program may go before it twice, and each
+        exchange may be a sequence for which the line is held; a lower class has a slot behind each of those.
         """
         each = 1 + MOST_BEFORE
         turn = 1 + PASSED_BY_EACH * self.clients
@@ -141,14 +141,14 @@ def bounds(
     background: int = 0,
     sharing: Sharing = ALONE,
 ) -> Bounds:
-    """Return the bounds for a line on which nothing else is asked than these, and every node's probe."""
+    """Return the bounds for a line with only these requests and a probe of each node."""
     return at_once(bound_steps(reads, byte_time, receive_latency, polls, background, sharing))
 
 
 def bound_steps(
     reads: Iterable[Read], byte_time: float, receive_latency: float, polls: int, background: int, sharing: Sharing
 ) -> Generator[int, None, Bounds]:
-    """Do what `bounds` does in steps: each yields how many units of work it took, of about a microsecond."""
+    """Calculate as `bounds` does, in steps. Each yields the units of work it took, of about a microsecond."""
     hold = urgent_hold = 0.0
     probed: set[tuple[int, int]] = set()
     for node, command in reads:

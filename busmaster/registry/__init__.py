@@ -1,7 +1,7 @@
-"""Which protocols there are, and all that the rest of the package knows of one.
+"""The known protocols, and all that the rest of the package knows about each.
 
-A protocol is one `Protocol` object. Those of this package are found by walking `busmaster.protocols`, those of other
-packages by their entry points in the group `busmaster.protocols`, when one is first asked for.
+A protocol is one `Protocol` object. Protocols of this package are found in `busmaster.protocols`, those of other
+packages by their entry points in the group `busmaster.protocols`, when the first one is needed.
 """
 
 from __future__ import annotations

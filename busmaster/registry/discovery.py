@@ -1,4 +1,4 @@
-"""Finding the protocols: those in this package, and those that other packages bring."""
+"""Finds the protocols of this package and of other packages."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
 
 PACKAGE = "busmaster.protocols"
 GROUP = "busmaster.protocols"
-"""The group of entry points by which a package brings a protocol. Each names a `Protocol`."""
+"""Entry point group for protocols of other packages. Each entry point names a `Protocol`."""
 
 
 @cache
 def protocols() -> tuple[Protocol, ...]:
     """Return all protocols, by name.
 
-    A protocol of another package that cannot be loaded, or whose names are taken, is left out with a warning.
+    A protocol of another package that cannot be loaded, or whose names are already used, is skipped with a warning.
     """
-    from importlib.metadata import entry_points  # it takes longer to import than all protocols together
+    from importlib.metadata import entry_points  # its import takes longer than that of all protocols together
 
     found = list(_own())
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
             found.append(_loaded(entry, found))
-        except Exception as error:  # whatever another package does
+        except Exception as error:  # another package may raise anything
             brought = f" of {entry.dist.name}" if entry.dist is not None else ""
             warnings.warn(
                 f"the protocol {entry.name!r}{brought} cannot be used: {error}; fix or uninstall what brings it",
@@ -48,13 +48,13 @@ def protocols() -> tuple[Protocol, ...]:
 
 @cache
 def kinds() -> Mapping[str, NodeKind]:
-    """Return every kind of node that there is, by name."""
+    """Return all kinds of node, by name."""
     every = {kind.name: kind for protocol in protocols() for kind in protocol.kinds}
     return MappingProxyType(dict(sorted(every.items())))
 
 
 def find(name: str) -> NodeKind:
-    """Return the kind of node that goes by a name. Raises InvalidCommand if there is none."""
+    """Return the kind of node with this name. Raises InvalidCommand if there is none."""
     kind = kinds().get(name)
     if kind is None:
         raise InvalidCommand(f"no such protocol {name!r}; {meant(name, kinds())}")
@@ -74,16 +74,16 @@ def make_device(
 
     Raises InvalidCommand for a kind that does not exist, see `DeviceMaker`.
     """
-    from busmaster.emulator.device import Delay  # naming protocols loads no emulated device
+    from busmaster.emulator.device import Delay  # looking up protocols must not import the emulator
 
     delay = Delay() if delay is None else delay
     return find(name).make_device(address, delay=delay, traceable=traceable, lively=lively, **options)
 
 
 def _own() -> Iterator[Protocol]:
-    """Yield the protocols of this package: a folder each.
+    """Yield the protocols of this package, one folder each.
 
-    What several share is in folders that begin with an underscore.
+    Folders that begin with an underscore contain code shared by several protocols.
     """
     package = importlib.import_module(PACKAGE)
     for module in pkgutil.iter_modules(package.__path__):
@@ -94,7 +94,7 @@ def _own() -> Iterator[Protocol]:
 def _loaded(entry: EntryPoint, known: list[Protocol]) -> Protocol:
     protocol = entry.load()
     if not isinstance(protocol, Protocol):
-        raise TypeError(f"{entry.value} is no Protocol")
+        raise TypeError(f"{entry.value} is not a Protocol")
     _check_unique("name", lambda kind: kind.name, protocol, known)
     _check_unique("capture id", lambda kind: kind.capture_id, protocol, known)
     _check_options(protocol, known)
@@ -102,7 +102,7 @@ def _loaded(entry: EntryPoint, known: list[Protocol]) -> Protocol:
 
 
 def _check_options(protocol: Protocol, known: list[Protocol]) -> None:
-    """Check that an option of several protocols is written in one way. Raises InvalidCommand."""
+    """Check that an option of several protocols has the same type. Raises InvalidCommand."""
     taken = {option.name: option.kind for other in known for kind in other.kinds for option in _options(kind)}
     for kind in protocol.kinds:
         for option in _options(kind):

@@ -1,4 +1,5 @@
-"""What one protocol is to the rest of the package: a frozen object, made in the protocol's own folder."""
+"""The description of one protocol for the rest of the package: a frozen object, created in the protocol's own
+folder."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from busmaster.contract.items import Item
 from busmaster.errors import InvalidCommand
 
-if TYPE_CHECKING:  # so that a master alone does not load the emulator
+if TYPE_CHECKING:  # so that a master does not import the emulator
     from busmaster.bus.handle import Handle
     from busmaster.capture.decode import Dialect
     from busmaster.contract.exchange import Command
@@ -37,12 +38,12 @@ seconds or two bounds, and comes as a `Delay`. "numbers" is a list of whole numb
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """Describe one thing that can be said of nodes of one kind alone: an argument of that name.
+    """An option of one kind of node: an argument with that name.
 
-    It is an argument of their handle, of reading an item, or of making their emulated device. `help` is what the
-    command line says of it; without one it can be said in LINE.toml alone. `about` is what the reference of LINE.toml
-    says of it, a whole sentence with its unit and default, where `help` is not all. `common`: it may also be said once
-    for all nodes of the kind, in [protocols.NAME].
+    It is an argument of their handle, of reading an item, or of creating their emulated device. `help`: text for the
+    command line; without it the option exists only in LINE.toml. `about`: text for the reference of LINE.toml, a whole
+    sentence with unit and default, if `help` is not sufficient. `common`: it can also be set for all nodes of the kind,
+    in [protocols.NAME].
     """
 
     name: str
@@ -50,29 +51,29 @@ class Option:
     help: str = ""
     common: bool = True
     choices: tuple[str, ...] = ()
-    """All texts that it can be; () if it can be any."""
+    """The allowed texts; () for any text."""
     fields: tuple[Option, ...] = ()
-    """What each of its tables may say."""
+    """The fields of each of its tables."""
     about: str = ""
     reader: Callable[[str], Mapping[str, int]] | None = None
-    """Of "addresses": reads them from the text of a file, which LINE.toml may name in place of the table. Raises
-    InvalidCommand, naming the lines that it cannot read: none is guessed."""
+    """For "addresses": reads them from the text of a file, which LINE.toml may name instead of the table. Raises
+    InvalidCommand with the lines that it cannot read; it never guesses."""
 
 
 class DeviceMaker(typing.Protocol):
-    """Makes an emulated device.
+    """Creates an emulated device.
 
-    It is called with an address, `delay`, `traceable`, `lively`, and those of `NodeKind.emulated` that were said.
-    `delay` is a Delay. `traceable` is None or a TraceableMemory whose every value the device holds; its modulus must be
-    one that the protocol can carry. `lively` is True if something is to move on it from the start. Raises
-    InvalidCommand for an address or an option that the device cannot have.
+    It is called with an address, `delay`, `traceable`, `lively`, and the given options of `NodeKind.emulated`. `delay`:
+    a Delay. `traceable`: None, or a TraceableMemory with all values of the device; its modulus must be one that the
+    protocol can carry. `lively`: something moves from the start. Raises InvalidCommand for an address or an option that
+    the device cannot have.
     """
 
     def __call__(self, address: int, /, *args: Any, **options: Any) -> Device: ...
 
 
 def device_of(module: str) -> DeviceMaker:
-    """Return the `make_device` of a module that is not imported before the first device is made."""
+    """Return the `make_device` of a module, which is imported when the first device is created."""
 
     def make_device(address: int, /, **options: Any) -> Device:
         device: Device = import_module(module).make_device(address, **options)
@@ -82,57 +83,57 @@ def device_of(module: str) -> DeviceMaker:
 
 
 def everywhere(item: str) -> bool:
-    """Return True, whatever the item."""
+    """Return True for every item."""
     return True
 
 
 def usual_width(item: str) -> int:
-    """Return 32, whatever the item."""
+    """Return 32 for every item."""
     return 32
 
 
 def nowhere(item: str) -> bool:
-    """Return False, whatever the item."""
+    """Return False for every item."""
     return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeKind:
-    """Describe the nodes that go by one name: on the command line, in LINE.toml and in captures.
+    """The nodes with one name on the command line, in LINE.toml and in captures.
 
-    Most protocols have one kind, of the protocol's own name.
+    Most protocols have one kind, with the protocol's own name.
     """
 
     name: str
     handle: type[Handle]
     make_device: DeviceMaker
     items: str
-    """What an ITEM of such a node looks like, for the command line's help; its words are wrapped there."""
+    """The form of an ITEM of such a node, for the command line's help, which wraps it between words."""
     probe_item: str = ""
     """The ITEM that the profile's probe reads."""
     documented: tuple[Item, ...] = ()
-    """What the protocol's document says of items, one by one."""
+    """Descriptions of single items from the protocol's document."""
     options: tuple[Option, ...] = ()
     """Arguments of its handle."""
     read_options: tuple[Option, ...] = ()
     """Arguments of its handle's `_read_item`, for the command line."""
     emulated: tuple[Option, ...] = ()
-    """Arguments of `make_device`, said in [emulator.nodes.NAME]. One that is among `options` too is as the node says,
-    unless it is said there."""
+    """Arguments of `make_device`, set in [emulator.nodes.NAME]. An argument that is in `options` too has the node's
+    value by default."""
     whole_numbers: Callable[[str], bool] = nowhere
-    """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
+    """Returns True if the line carries whole numbers for an item. A value scaled by LINE.toml is then rounded."""
     width: Callable[[str], int] = usual_width
-    """How many bits the whole number of an item has, so that LINE.toml can give them names; 0 for a run of several."""
+    """Returns the number of bits of an item's whole number, so that LINE.toml can name them; 0 for a run of several."""
     takes_decimals: bool = False
-    """Its handle has an argument `decimals`, digits by item, and scales or rounds by it: LINE.toml does not."""
+    """Its handle has an argument `decimals` (digits by item), and scales or rounds with it: LINE.toml does not."""
     capture_id: int = 0
-    """What the header of a captured frame calls it beside its name, for the dissector. 0: by its name alone."""
+    """Its id in the header of captured frames, for the dissector, in addition to its name. 0: name only."""
     protocol: Protocol = field(init=False, repr=False)
     """Set by the protocol that lists it."""
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
-            raise InvalidCommand(f"{self.name!r} is no name of a protocol: use small letters, digits, - and _")
+            raise InvalidCommand(f"{self.name!r} is not a valid name of a protocol: use small letters, digits, - and _")
         if not 0 <= self.capture_id <= HIGHEST_CAPTURE_ID:
             raise InvalidCommand(f"{self.name}: a capture id is 0 to {HIGHEST_CAPTURE_ID}, not {self.capture_id}")
 
@@ -142,18 +143,17 @@ class NodeKind:
         return self.handle.profile
 
     def decimals(self, item: str) -> int:
-        """Return how many of an item's last digits on the line are decimals, as the document has it; else 0."""
+        """Return how many of an item's last digits on the line are decimals according to the document, else 0."""
         name = item.partition(":")[0]
         return next((one.decimals for one in self.documented if one.item == name), 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protocol:
-    """Hold all that the rest of the package knows of one protocol.
+    """All that the rest of the package knows about one protocol.
 
-    `kinds` are the kinds of nodes that speak it; the first is what its frames are taken to be from where nobody says.
-    `commands` are all its commands, by the names under which they are written down. `dialect` makes a reader of
-    captures.
+    `kinds`: the kinds of nodes that use it. Frames belong to the first one if no kind is given. `commands`: all its
+    commands, by their names in stored form. `dialect`: creates a reader for captures.
     """
 
     profile: Profile
@@ -165,7 +165,7 @@ class Protocol:
         if not self.kinds:
             raise InvalidCommand(f"{self.profile.name}: a protocol has at least one kind of node")
         for kind in self.kinds:
-            object.__setattr__(kind, "protocol", self)  # frozen, but made before the protocol that lists it
+            object.__setattr__(kind, "protocol", self)  # frozen, but created before the protocol that contains it
 
     @property
     def name(self) -> str:
@@ -173,7 +173,7 @@ class Protocol:
         return self.profile.name
 
     def write_down(self, command: Command[Any]) -> dict[str, Any]:
-        """Return a command as plain values, which JSON can carry: its name, and what it does not say by default.
+        """Return a command as plain values for JSON: its name, and the arguments that differ from the defaults.
 
         Raises InvalidCommand for a command that is not of this protocol.
         """
@@ -183,7 +183,7 @@ class Protocol:
         raise InvalidCommand(f"{self.name} has no command {type(command).__name__}")
 
     def read_back(self, written: Mapping[str, Any]) -> Command[Any]:
-        """Build the command that was written down, and so check it again. Raises InvalidCommand."""
+        """Create the command from its stored form, which checks it again. Raises InvalidCommand."""
         name = written.get("command")
         kind = self.commands.get(str(name))
         if kind is None:
@@ -194,7 +194,7 @@ class Protocol:
             wrong = ", ".join(sorted(form.needed - arguments.keys() | arguments.keys() - form.defaults.keys()))
             raise InvalidCommand(f"{self.name}: {name} has the arguments {', '.join(form.defaults)}: look at {wrong}")
         for part in form.options:
-            # An option has one form: neither a number nor a text stands for true.
+            # A Boolean must be true or false: numbers and texts are rejected.
             if not isinstance(arguments.get(part, False), bool):
                 raise InvalidCommand(f"{self.name}: {name}: {part} is true or false, not {arguments[part]!r}")
         try:
@@ -211,14 +211,14 @@ def _arguments_of(command: Command[Any]) -> dict[str, Any]:
 
 
 class _Form(typing.NamedTuple):
-    """What a command is made of: names and defaults, those that have none, and those that are true or false."""
+    """The arguments of a command: names and defaults, those without a default, and those that are true or false."""
 
     defaults: Mapping[str, Any]
     needed: frozenset[str]
     options: tuple[str, ...]
 
 
-@cache  # each remote request asks at either end
+@cache  # used at both ends of each remote request
 def _form_of(kind: type[Command[Any]]) -> _Form:
     fields = dataclasses.fields(kind)  # type: ignore[arg-type]  # every command is a dataclass
     defaults = {part.name: part.default for part in fields if part.init}
@@ -227,5 +227,5 @@ def _form_of(kind: type[Command[Any]]) -> _Form:
 
 
 def _frozen(value: Any) -> Any:
-    """Return a list, which is what JSON makes of a tuple, as a tuple again."""
+    """Return a list, which is JSON's form of a tuple, as a tuple."""
     return tuple(map(_frozen, value)) if isinstance(value, (list, tuple)) else value

@@ -1,1 +1,1 @@
-"""Codec parts that several protocols share: checksums, telegram readers, numbers as text. No policy lives here."""
+"""Codec parts shared by several protocols: checksums, telegram readers, numbers as text. No policy."""

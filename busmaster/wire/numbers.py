@@ -1,4 +1,4 @@
-"""Numbers as the HCP and HCP2 documents write them: decimal text with at most 4 decimals."""
+"""Numbers in the form of the HCP and HCP2 documents: decimal text with at most 4 decimals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.wire.characters import made_of
 
 LONGEST_NUMBER = 20
-"""Characters of one value. A controller returns no more, so a longer one could never be read back."""
+"""Characters of one value. A controller returns at most this many, so a longer value could never be read back."""
 LONGEST_LIST = 60
 """Characters of a telegram's data field, commas included."""
 
@@ -25,12 +25,12 @@ _NUMBER_CHARACTERS = made_of(b"0123456789+-.eE ")
 def format_number(value: SupportsFloat) -> str:
     """Return the shortest text with at most 4 decimals: "123.456", ".5", "-.0001", "0"; no exponent, no "-0".
 
-    The fifth decimal rounds half away from zero, on the decimal text that Python shows for the value. Raises
-    InvalidCommand for NaN, infinity, what is no number, and what takes more than 20 characters.
+    The fifth decimal is rounded half away from zero, based on Python's decimal text of the value. Raises InvalidCommand
+    for NaN, infinity, values that are not numbers, and values that need more than 20 characters.
     """
-    if isinstance(value, bool):  # a mistyped call or message; it would go out as 1 or 0
+    if isinstance(value, bool):  # usually a wrong call or message; it would be sent as 1 or 0
         raise InvalidCommand(f"{value!r} is not a number: write {int(value)} if that is meant")
-    if not hasattr(value, "__float__"):  # text has none: float() would take it
+    if not hasattr(value, "__float__"):  # text has none, but float() would accept it
         raise InvalidCommand(f"{value!r} is not a number")
     number = int(value) if isinstance(value, int) else float(value)
     if -_TOO_BIG < number < _TOO_BIG:
@@ -61,11 +61,11 @@ def format_list(values: Iterable[SupportsFloat]) -> str:
 
 
 def parse_number(field: bytes) -> float:
-    """Return the value of a reply's data field: sign, digits, fraction, and an exponent if there is one.
+    """Return the value of a reply's data field: sign, digits, fraction, and optional exponent.
 
-    Spaces around it are dropped. Raises FrameError for anything else, such as "nan", "1_0" or an empty field.
+    Surrounding spaces are ignored. Raises FrameError for anything else, such as "nan", "1_0" or an empty field.
     """
-    if field.translate(_NUMBER_CHARACTERS) == field:  # float() alone would take "1_0"
+    if field.translate(_NUMBER_CHARACTERS) == field:  # float() alone would accept "1_0"
         try:
             value = float(field)
         except ValueError:

@@ -1,8 +1,8 @@
-"""Readers for the replies of the character protocols: HCP, HCP2 and Mentor II.
+"""Readers for replies of the character protocols: HCP, HCP2 and Mentor II.
 
 A telegram is STX, the echoed element or parameter, data, ETX and a checksum. Reading is positional: data is printable,
 so the first ETX ends it, and the byte after that ETX is the checksum, whatever its value. Acknowledgements are one
-byte. The first byte tells the two apart, and every request has one legal set of first bytes.
+byte. The first byte distinguishes the two, and each request has one valid set of first bytes.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ _STX = STX[0]
 _PRINTABLE = made_of(bytes(range(0x20, 0x7F)))
 _ENVELOPE = len(STX + ETX) + 1
 _LONGER = 60
-"""Characters by which data may be too long and their end still be awaited."""
+"""Characters by which data may be too long while its end is still awaited."""
 _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 
 
 def find_field(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> bytes | None:
-    """Return the data of a whole and valid telegram, which may be followed by more; None if more bytes are needed.
+    """Return the data of a complete and valid telegram, which more bytes may follow; None if more bytes are needed.
 
-    `header` is STX and the echo, without an ETX; `longest` the most data characters. Raises FrameError as soon as the
-    bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows. Of
-    data that are too long the end is awaited, for its check tells another format from a damaged ETX.
+    `header`: STX and the echo, without an ETX. `longest`: maximum number of data characters. Raises FrameError as soon
+    as the bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong and nothing follows.
+    If the data is too long, its end is awaited: its checksum distinguishes another format from a damaged ETX.
     """
     start = len(header)
     if buffer[:start] != header:
         if header.startswith(buffer):
             return None
         raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}", heard=buffer)
-    head, _, tail = buffer.partition(ETX)  # which takes two thirds of the time of looking for its place
+    head, _, tail = buffer.partition(ETX)  # takes two thirds of the time of searching for its position
     field = head[start : start + longest + 1]
     if field.translate(_PRINTABLE) != field:
         raise FrameError("a control character within the data")
@@ -61,7 +61,7 @@ def find_field(buffer: bytes, header: bytes, longest: int, check: Callable[[byte
 
 
 def _await_end(head: bytes, tail: bytes, start: int, longest: int, check: Callable[[bytes], int]) -> None:
-    """Return while the end of data that are too long may still come; else raise what became of them."""
+    """Return while the end of data that is too long may still arrive, else raise the error."""
     field = head[start:]
     printable = field.translate(_PRINTABLE) == field
     if printable and not tail and len(field) <= longest + _LONGER:
@@ -72,12 +72,12 @@ def _await_end(head: bytes, tail: bytes, start: int, longest: int, check: Callab
 
 
 def telegram_sizes(echo: int, typical: int, longest: int) -> Sizes:
-    """Calculate the bytes of a telegram from the characters of its echo and of its data."""
+    """Calculate the length of a telegram in bytes from the characters of its echo and of its data."""
     return Sizes(_ENVELOPE + echo + typical, _ENVELOPE + echo + longest)
 
 
 class SingleStep:
-    """What the exchanges of the character protocols share."""
+    """Common part of the exchanges of the character protocols."""
 
     __slots__ = ("request", "timing")
 
@@ -91,7 +91,7 @@ class SingleStep:
         self.timing = timing
 
     def reject(self, heard: bytes) -> NoReturn:
-        """Raise what the first of these bytes means, which begins no answer: Refused, or FrameError."""
+        """Raise Refused or FrameError for bytes that cannot begin a reply."""
         refusal = self.refusals.get(heard[0])
         if refusal is not None:
             raise refusal
@@ -99,9 +99,9 @@ class SingleStep:
 
 
 class TelegramReader(SingleStep, Generic[T]):
-    """One read: a telegram, or a refusal. `header` is what the telegram begins with: STX and the echo.
+    """A read: a telegram or a refusal. `header`: the beginning of the telegram, STX and the echo.
 
-    A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
+    A protocol sets the class attributes. `parse` returns the value of the data field, or raises FrameError.
     """
 
     __slots__ = ("_buffer", "answers")
@@ -122,7 +122,7 @@ class TelegramReader(SingleStep, Generic[T]):
         return self.answers
 
     def parse(self, field: bytes) -> T:
-        """Return the value of the data field. Raises FrameError for one that means nothing."""
+        """Return the value of the data field. Raises FrameError if it is invalid."""
         raise NotImplementedError
 
     def feed(self, data: bytes) -> Need | Expect | Done[T]:
@@ -147,7 +147,7 @@ class TelegramReader(SingleStep, Generic[T]):
 
 
 class AcknowledgeReader(SingleStep):
-    """One write: a lone ACK, or a refusal."""
+    """A write: a single ACK or a refusal."""
 
     __slots__ = ()
 

@@ -219,7 +219,7 @@ def test_a_package_whose_protocol_cannot_be_used_is_told_and_the_others_are_ther
     assert len(causes) == 4
     for cause, text in zip(
         causes,
-        ("busmaster_missing", "is no Protocol", "name hcp is taken", "option address_step is a whole"),
+        ("busmaster_missing", "is not a Protocol", "name hcp is taken", "option address_step is a whole"),
         strict=True,
     ):
         assert text in cause
