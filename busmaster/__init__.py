@@ -126,12 +126,12 @@ ON_DEMAND = {
 
 
 def __dir__() -> list[str]:
-    """List the public names, those too that are imported when they are first used."""
+    """List the public names, including those imported on first use."""
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
 def __getattr__(name: str) -> object:
-    """Import a name on demand that a bus alone does not need: a program imports only the protocols that it uses."""
+    """Import a name on first use, so that a program imports only the protocols that it uses."""
     if name in ON_DEMAND:
         return getattr(import_module(ON_DEMAND[name]), name)
     if name in ROOT:  # an AttributeError's text would not be shown for `from busmaster import ...`

@@ -1,9 +1,10 @@
-"""What can go wrong, and nothing else.
+"""The exceptions of busmaster.
 
-Every request that fails raises one fresh instance of a `BusError` subclass. It carries the line, the node, the
-command and the number of attempts, and its text says in one sentence what happened, where, and what to try. It may be
-sent to another process: it pickles.
-A wrong argument is not a bus error: it raises `InvalidCommand` when the command is built, or when it is asked for.
+Each failed request raises a new instance of a `BusError` subclass. It contains the line, the node, the command and the
+number of attempts. Its text states in one sentence what happened, where, and what to do. It can be pickled, and so be
+sent to another process.
+
+A wrong argument is not a bus error: it raises `InvalidCommand` when the command is created or the request is made.
 """
 
 from __future__ import annotations
@@ -12,35 +13,35 @@ from typing import Any, Protocol
 
 
 class Addressed(Protocol):
-    """What an error is told of the node that it is about."""
+    """The node that an error refers to."""
 
     @property
     def line(self) -> str:
-        """Return the name of the line on which it happened, "" where that is not known."""
+        """Return the name of its line, "" if unknown."""
         ...
 
     @property
     def label(self) -> str:
-        """Return what messages call the node, "" where it is about none."""
+        """Return its name in messages, "" for no node."""
         ...
 
     @property
     def address(self) -> int:
-        """Return the node's address, None where it is about none."""
+        """Return its address, None for no node."""
         ...
 
 
 class InvalidCommand(ValueError):
-    """An argument is out of range or cannot be written as the protocol demands, or a bus is used as none can be: opened
-    twice, or from another thread or event loop than its own. Nothing was sent."""
+    """An argument is out of range or not allowed by the protocol, or a bus is used in the wrong way (opened twice, or
+    used from another thread or event loop). Nothing was sent."""
 
 
 class BusError(Exception):
-    """A request did not end with a value.
+    """A request ended without a value.
 
-    `what` is the happening ("no reply within 100 ms"), `hint` what to try, `command` the command as text, `attempts`
-    how often it was on the wire. `line` is the name of the line's port, `label` and `address` are the node's ("node
-    5", 5); each is None where it is not known, or where the error is not about one node.
+    `what`: the event ("no reply within 100 ms"). `hint`: what to do. `command`: the command as text. `attempts`: number
+    of attempts on the wire. `line`: name of the line's port. `label`, `address`: those of the node ("node 5", 5). Each
+    is None if it is unknown, or if the error does not refer to one node.
     """
 
     hint = ""
@@ -67,13 +68,13 @@ class BusError(Exception):
             self.hint = hint
 
     def name(self, node: Addressed) -> None:
-        """Say which node, of which line, it is about."""
+        """Set the node and the line of the error."""
         self.line = node.line or None
         self.label = node.label
         self.address = node.address
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Keep all attributes; of a cause that is no error of the line's, which may not pickle, its text."""
+        """Keep all attributes. A cause that is not a BusError may not be picklable, so only its text is kept."""
         state, cause = dict(self.__dict__), self.__cause__
         if cause is not None:
             told = isinstance(cause, BusError)
@@ -90,23 +91,23 @@ class BusError(Exception):
 
 
 class NoReply(BusError, TimeoutError):
-    """Nothing came within the reply window, at any attempt; or not before the caller's `finish_within` ran out."""
+    """No reply arrived within the reply window at any attempt, or before the caller's `finish_within`."""
 
     hint = "check the node's address, power, baud rate and wiring"
 
 
 class GarbledReply(BusError):
-    """Bytes came, but no valid reply to this command: a bad checksum, a cut frame, a wrong echo."""
+    """Bytes were received, but no valid reply to this command: bad checksum, incomplete frame, or wrong echo."""
 
     hint = "check wiring, termination and baud rate, and that no two nodes share an address"
 
 
 class Refused(BusError):
-    """The node understood and said no (NAK; EOT in Mentor II).
+    """The node understood the request and refused it (NAK; EOT in Mentor II).
 
-    A protocol's exchange raises it with `what` alone, and with `confirm=False` where asking again would say
-    nothing new (MSC has already sent it four times; a multi-value write may have stored a prefix). The arbiter
-    fills in the rest, and asks once more where `confirm` is True.
+    A protocol's exchange raises it with `what` only, and with `confirm=False` if a repetition would give no new
+    information (MSC has already sent it four times; a multi-value write may have stored a part). The arbiter adds the
+    rest, and repeats the request once if `confirm` is True.
     """
 
     hint = "check that it exists, is writable and within the node's limits"
@@ -132,46 +133,46 @@ class NoSuchParameter(Refused):
 
 
 class WriteUnconfirmed(BusError):
-    """A write was sent, and its answer never came, or was garbled, or had not come when `finish_within` ran out: all or
-    a part of it may have been carried out."""
+    """A write was sent, and its reply was missing, garbled, or not received before `finish_within`. All or a part of it
+    may have been carried out."""
 
     hint = "read the value back before you write again"
 
 
 class VerifyFailed(BusError):
-    """A write was acknowledged, but what was read back is something else."""
+    """A write was acknowledged, but the value read back differs."""
 
-    hint = "look for limits, rounding, an interlock, or a program in the node that writes it too"
+    hint = "check limits, rounding, interlocks, and whether a program in the node writes it too"
 
 
 class Superseded(BusError):
-    """A queued write was dropped because an urgent write to the same node overtook it."""
+    """A queued write was discarded because an urgent write to the same node overtook it."""
 
-    hint = "decide again after what overtook it"
+    hint = "decide again after the urgent write"
 
 
 class NodeDown(BusError):
-    """The node is known to be dead and this request was not worth line time."""
+    """The node is DOWN, and the request was not sent."""
 
-    hint = "it is probed by itself; node.probe() asks at once"
+    hint = "it is probed automatically; node.probe() sends a probe now"
 
 
 class NotStarted(BusError, TimeoutError):
-    """The request had not been sent when its `start_within` or `finish_within` ran out. Nothing was sent."""
+    """The request was not sent before its `start_within` or `finish_within`. Nothing was sent."""
 
     hint = "the line is busy: see bus.statistics() or busmaster plan"
 
 
 class HoldEnded(NotStarted):
-    """The line was no longer held for the exclusive sequence that this request is of. Nothing was sent."""
+    """The exclusive sequence that this request belongs to has ended. Nothing was sent."""
 
-    hint = "do less between two requests of a sequence, or hold the line for longer (max_hold)"
+    hint = "do less between two requests of a sequence, or increase max_hold"
 
 
 class BacklogFull(BusError):
-    """Too many requests are waiting. Nothing was queued."""
+    """Too many requests are queued. This one was not queued."""
 
-    hint = "the line cannot keep up: ask less often, or see busmaster plan"
+    hint = "the line cannot keep up: send fewer requests, or see busmaster plan"
 
 
 class LineNoisy(BusError):
@@ -181,9 +182,9 @@ class LineNoisy(BusError):
 
 
 class LineDown(BusError, ConnectionError):
-    """The port is gone or not yet open. It is opened again by itself."""
+    """The port is lost or not open yet. It is reopened automatically."""
 
-    hint = "check the port or adapter; while a bus is open it opens a lost port again by itself"
+    hint = "check the port or adapter; an open bus reopens a lost port automatically"
 
 
 class BusClosed(BusError):
@@ -193,7 +194,7 @@ class BusClosed(BusError):
 
 
 def cause_text(cause: Exception | None, otherwise: str) -> str:
-    """Return in words why a connection was lost: `otherwise` where there was no error, never an empty text."""
+    """Return why a connection was lost, as text; `otherwise` if there was no error. Never empty."""
     if cause is None:
         return otherwise
     if isinstance(cause, BusError):

@@ -1,6 +1,6 @@
-"""The extension interface: for programs that own a line for others, as the `busmaster` program does.
+"""The extension interface: for programs that own a line for other programs, as the `busmaster` program does.
 
-An application that embeds a bus needs nothing of it. It is versioned like the public names: docs/public-api.md.
+An application that embeds a bus does not need it. It is versioned like the public names: docs/public-api.md.
 """
 
 from __future__ import annotations
@@ -186,59 +186,59 @@ __all__ = [
 
 T = TypeVar("T")
 
-# a line and who shares it
+# a line and its clients
 
 
 def line_of(bus: Bus) -> SharedLine:
-    """Return what all nodes of a bus share: its clients, staleness, and who is told of stops and writes."""
+    """Return the shared state of a bus: its clients, staleness, and callbacks for stops and writes."""
     return bus._line
 
 
 def add_tap(bus: Bus, tap: Tap) -> None:
-    """Have a tap see every byte from now on."""
+    """Pass all traffic to a tap from now on."""
     bus._taps.add(tap)
 
 
 def remove_tap(bus: Bus, tap: Tap) -> None:
-    """Have a tap see no more."""
+    """Pass no more traffic to a tap."""
     bus._taps.remove(tap)
 
 
 def accept_device(bus: Bus) -> None:
-    """Let the next opening take whatever device has the port's name then, as if the program were started again.
+    """Accept any device that has the port's name at the next opening, as after a restart of the program.
 
-    Without it, only the device that the line was opened on is opened again. A port that is named by a serial number
-    (usb:SERIAL) never takes another one. A connection that is up stays as it is.
+    By default only the device that the line was opened on is reopened. A port given by a serial number (usb:SERIAL)
+    never accepts another one. An open connection is not affected.
     """
     bus._accept_device()
 
 
 def take_only_safe_writes(bus: Bus) -> Callable[[], None]:
-    """End every write that waits as Superseded, and accept only writes with `safe=True` from now on.
+    """Fail every queued write with Superseded, and accept only writes with `safe=True` from now on.
 
-    A write that is on the wire runs out, and is not repeated. Reads and polls go on. The function that is returned,
-    called once, accepts writes again: not on a line that is about to be left.
+    A write on the wire is finished, and is not repeated. Reads and polls continue. Call the returned function once to
+    accept all writes again; it is not needed on a line that will be closed.
     """
     return bus._take_only_safe_writes()
 
 
 def lost_seconds(bus: Bus) -> float:
-    """Return for how long the line was lost since the bus was opened, in all."""
+    """Return the total time, in seconds, for which the line was lost since the bus was opened."""
     return bus._lost_seconds
 
 
 def reads_after_writes(bus: Bus) -> ReadsAfterWrites:
-    """Return the counts of the reads of points with `read_after_write`."""
+    """Return the counters of the reads of points with `read_after_write`."""
     return bus._reads_after_writes
 
 
 async def plan_in_steps(bus: Bus, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-    """Do what `Bus.plan` does, in steps of less than a millisecond between which exchanges go on."""
+    """Calculate as `Bus.plan` does, in steps of less than a millisecond between which exchanges continue."""
     return await bus._plan_in_steps(*more, could_merge=could_merge)
 
 
 def take_overheard(bus: Bus, samples: Mapping[Point[Any], Sample[Any]]) -> None:
-    """Take values from another master's exchanges for the alarms that they begin and end."""
+    """Evaluate alarms for values received by listening to another master."""
     bus._overheard(samples)
 
 
@@ -254,61 +254,61 @@ def lend_node(
     retries: int | None = None,
     budgeted: bool = False,
 ) -> Node:
-    """Return a node as `Bus.node` does, for a client who gives it back.
+    """Return a node as `Bus.node` does, for a borrower that will give it back.
 
-    A node that was only ever lent leaves the bus when all who borrowed it have given it back. `budgeted`: if the node
-    is new, requests to it are within the budget of probes only (R11) until its first reply, as for a node that is down.
+    A node that was only lent is removed when all borrowers have given it back. `budgeted`: requests to a new node use
+    only the probe budget (R11) until its first reply, as for a node that is DOWN.
     """
     return bus._lend_node(profile, address, timings=timings, retries=retries, budgeted=budgeted)
 
 
 def give_back(bus: Bus, node: Node) -> None:
-    """Take back a node that was lent: whoever gives it back polls and requests nothing more of it."""
+    """Return a lent node. The borrower no longer polls it or sends requests to it."""
     bus._give_back(node)
 
 
 def has_node(bus: Bus, profile: Profile, address: int) -> bool:
-    """Return whether the node at this address is on the line."""
+    """Return True if the node at this address is on the line."""
     return bus._has_node(profile, address)
 
 
 def is_kept(node: Node) -> bool:
-    """Return whether the program that owns the line has named a node itself, or has only lent it."""
+    """Return True if the program that owns the line has named the node itself, False if it was only lent."""
     return node._kept
 
 
 def record_of(node: Node) -> NodeRecord:
-    """Return what the arbiter knows of a node."""
+    """Return the arbiter's record of a node."""
     return node._record
 
 
 def rename(node: Node, label: str) -> None:
-    """Have messages call a node by another name from now on."""
+    """Set a node's name in messages."""
     node._rename(label)
 
 
 def set_reply_time(node: Node, reply_time: float) -> None:
-    """Set the seconds from a request to its reply by which plans are calculated until poll groups have measured it."""
+    """Set a node's reply time, in seconds, for plans until poll groups have measured it."""
     node._reply_time = reply_time
 
 
 def times_to_keep(node: Node) -> tuple[LearnedTimes, ...]:
-    """Return the reply times that were learned and are trusted, for `begin_with` in the next run."""
+    """Return the trusted learned reply times, for `begin_with` in the next run."""
     return node._times_to_keep()
 
 
 def begin_with(node: Node, known: Iterable[LearnedTimes]) -> None:
-    """Begin with the reply times that an earlier run has learned, before anything is requested of the node.
+    """Start with the reply times learned in an earlier run, before the first request to the node.
 
-    They are trusted after twenty replies; where nothing is to be learned they are ignored.
+    They are trusted after twenty replies. Ignored if learning is disabled.
     """
     node._begin_with(known)
 
 
 def last_value(point: Point[Any]) -> Any:
-    """Return what a point would have read last, by whatever name it was polled, alone or with others.
+    """Return the value that a point would have read last, whichever point or batch read it.
 
-    None if that is not known, or may have been written since.
+    None if it is not known, or may have been written since.
     """
     return Node.of(point)._held(point)
 
@@ -317,33 +317,34 @@ def last_value(point: Point[Any]) -> Any:
 
 
 def checked_options(node: Node, given: CommandOptions) -> RequestOptions:
-    """Return the options of a request. Raises InvalidCommand, naming the node, for what is no such option."""
+    """Return the options of a request. Raises InvalidCommand with the node's name for invalid options."""
     return node._options(given)
 
 
 def start(node: Node, request: Request[Any], waiter: Waiter | None = None) -> Transaction:
-    """Start a request that writes nothing; `waiter` gets its value or its error, perhaps before this returns.
+    """Start a request that writes nothing. `waiter` gets its value or its error, possibly before this returns.
 
-    `run` starts writes: they pass the limits of the node first. Raises what `Node.request` raises before anything is
-    sent, and HoldEnded if the sequence that the request is part of is over.
+    Use `run` for writes, which checks the node's limits first. Raises what `Node.request` raises before anything is
+    sent, and HoldEnded if the request's sequence has ended.
     """
     return node._start(request, waiter)
 
 
 def give_up(node: Node, transaction: Transaction) -> None:
-    """Cancel a request for which nobody waits any more. A write that is on the wire ends before the next read."""
+    """Cancel a request whose caller no longer waits. A write on the wire ends before the next read."""
     node._give_up(transaction)
 
 
 async def run(node: Node, request: Request[T]) -> T:
-    """Do what `Node.request` does. `Request.sent` says, also once this was cancelled, whether anything was sent."""
+    """Run a request as `Node.request` does. `Request.sent` shows, also after a cancellation, whether anything was
+    sent."""
     return await node._run(request)
 
 
 def hold(node: Node, max_hold: float, client: LineClient | None = None) -> Hold:
-    """Return what the requests of one sequence, of a client of the line, name as their client.
+    """Return a hold that the requests of one sequence of a client use as their client.
 
-    `SharedLine.release` ends it. Raises InvalidCommand unless `max_hold` is above 0 s, and 5 s at most.
+    End it with `SharedLine.release`. Raises InvalidCommand unless `max_hold` is above 0 s and at most 5 s.
     """
     return node._hold(max_hold, client)
 
@@ -352,12 +353,12 @@ def hold(node: Node, max_hold: float, client: LineClient | None = None) -> Hold:
 
 
 async def read_item(handle: Handle, item: str, **options: Any) -> Any:
-    """Do as `handle.point(item).read()` does, by the exchanges that suit the node best."""
+    """Read as `handle.point(item).read()` does, with the exchanges that suit the node best."""
     return await handle._read_item(item, **options)
 
 
 def prepare_write(handle: Handle, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-    """Return what writes values to an item and those after it, once it is sure that all of them can be sent.
+    """Return the writes of values to an item and those after it, after all of them were checked.
 
     Raises InvalidCommand.
     """
@@ -370,5 +371,5 @@ def run_items(handle: Handle, item: str, count: int) -> tuple[str, ...]:
 
 
 def names_of_items(handle: type[Handle]) -> Mapping[str, str]:
-    """Return the names of those items that have one, by what a listener reads from the line."""
+    """Return the names of items by the keys that a listener reads from the line."""
     return handle._names_of_items()

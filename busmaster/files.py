@@ -1,4 +1,4 @@
-"""How files are read and made: what may be read, how much of it, and who may read what is made."""
+"""Reading and creating files: which files are read, up to which size, and with which permissions they are created."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import stat
 from busmaster.bounds import LONGEST_FILE
 
 MODE = 0o640
-"""Of a new file: its owner may write, its group may read. The process's umask narrows it, as it does every mode."""
+"""Mode of a new file: its owner may write, its group may read. The process's umask restricts it as usual."""
 FOLDER_MODE = 0o750
 
 
 def open_file(path: str, flags: int, mode: int = MODE) -> int:
-    """Open a file for writing and return its descriptor; one that is not there is made, with this mode.
+    """Open a file for writing and return its descriptor. A missing file is created with this mode.
 
-    `flags` are those of os.open. Programs that are started do not inherit the descriptor. Raises OSError.
+    `flags` are those of os.open. Child processes do not inherit the descriptor. Raises OSError.
     """
     return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, mode)
 
@@ -24,8 +24,8 @@ def open_file(path: str, flags: int, mode: int = MODE) -> int:
 def read_file(path: str | os.PathLike[str], most: int = LONGEST_FILE) -> bytes:
     """Return the content of a regular file of at most `most` bytes. Never waits for another program.
 
-    Raises OSError for a file that cannot be read, that is larger, or that is a FIFO or a device: opening a FIFO waits
-    for a program that writes to it, and a device may have no end.
+    Raises OSError for a file that cannot be read or is larger, and for a FIFO or a device: opening a FIFO waits for a
+    writer, and a device may have no end.
     """
     name = os.fspath(path)
     descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -38,7 +38,7 @@ def read_file(path: str | os.PathLike[str], most: int = LONGEST_FILE) -> bytes:
 
 
 def check_regular(found: os.stat_result, name: str) -> None:
-    """Raise OSError for what is not a regular file."""
+    """Raise OSError unless it is a regular file."""
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), name)
     if not stat.S_ISREG(found.st_mode):

@@ -1,6 +1,6 @@
-"""What has another name since version 0.3. Nothing answers to an old name: the error for one says the new one.
+"""Names that have changed since version 0.3. Old names are not accepted; the error contains the new name.
 
-This is the one place where old names stand: errors, `busmaster migrate` and docs/upgrading.md are made of it.
+This is the only list of old names: errors, `busmaster migrate` and docs/upgrading.md use it.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ STATISTICS = {
 
 
 def now_called(name: str, known: Iterable[str]) -> str | None:
-    """Return what a key or an argument of this name is called now, or None if it is no old name of one of `known`."""
+    """Return the new name of a key or argument, or None if it is not an old name of one of `known`."""
     new = TIMES.get(name)
     return new if new in set(known) else None
 
 
 def refuse_old_arguments(names: Iterable[str], what: str) -> None:
-    """Raise TypeError, with the new name, if one of these arguments of `what` has another name now."""
+    """Raise TypeError with the new name if one of these arguments of `what` was renamed."""
     for name in names:
         if name in TIMES:
             raise TypeError(f"{what} takes no argument {name!r}: it is now {TIMES[name]!r}; see docs/upgrading.md")

@@ -1,4 +1,4 @@
-"""What `statistics` returns for a bus, a node and a poll group; and the times of one request."""
+"""The statistics of a bus, a node and a poll group, and the timeline of a request."""
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.learned import LearnedTimes
