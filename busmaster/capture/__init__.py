@@ -1,4 +1,4 @@
-"""Seeing the wire: recording what passes on a line, reading it back, and decoding it without a master."""
+"""Captures: recording the traffic of a line, reading it back, and decoding it without a master."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 DISSECTOR = Path(__file__).parent.parent / "dissectors" / "busmaster.lua"
-"""The Wireshark dissector for captures of ours: `tshark -X lua_script:DISSECTOR -r FILE`."""
+"""The Wireshark dissector for busmaster captures: `tshark -X lua_script:DISSECTOR -r FILE`."""
 
 _ON_DEMAND = {
     "COUNT": "busmaster.capture.files",

@@ -1,7 +1,7 @@
-"""From what was sent and heard to the packets of a capture: one a frame, each exchange with its outcome.
+"""Converts sent and received bytes to the packets of a capture: one per frame, each exchange with its outcome.
 
-The owner of a line tells whose every byte is, and how each attempt ended. On a line that is only listened to, the
-frames say it, as well as they can.
+The owner of a line knows the exchange of every byte, and how each attempt ended. On a line that is only listened to,
+this is inferred from the frames as far as possible.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from busmaster.registry import NodeKind, find, protocols
 
 
 class _Exchange:
-    """One exchange whose packets wait for its outcome. `attempt` is None on a line that is only listened to.
+    """An exchange whose packets wait for its outcome. `attempt` is None on a line that is only listened to.
 
-    `kind` is that of its node, None where the protocol is not known here.
+    `kind` is that of its node, None if the protocol is not known.
     """
 
     def __init__(self, kind: NodeKind | None, attempt: Attempt | None = None, request: Frame | None = None) -> None:
@@ -38,7 +38,7 @@ class _Exchange:
 
     @property
     def over(self) -> bool:
-        """Nothing more can be said of it."""
+        """True if no further frame can belong to it."""
         return self.attempt is None or self.attempt.verdict is not None
 
     @property
@@ -46,9 +46,9 @@ class _Exchange:
         return self.kind is not None and self.node is not None and self.node == self.kind.profile.broadcast
 
     def is_behind(self, frame: Frame) -> bool:
-        """Return whether a frame is from a node after the answer, or before anything was asked.
+        """Return True if a frame is from a node after the reply, or before any request.
 
-        This is judged by the frames alone.
+        Only the frames are used.
         """
         if self.attempt is not None and self.request is None:
             return False  # its protocol is not known here: the frames say nothing
@@ -63,36 +63,36 @@ class _Exchange:
         return frame.kind is Kind.NOISE
 
     def outcome(self) -> tuple[Outcome, str]:
-        """Return how the exchange ended, and that in words."""
+        """Return the outcome of the exchange and its description."""
         attempt = self.attempt
         if attempt is None or attempt.verdict is None:
             return self.judge()
         return Outcome[attempt.verdict.name], str(attempt)
 
     def judge(self) -> tuple[Outcome, str]:
-        """Return, by the frames alone, how the exchange ended, and that in words."""
+        """Return the outcome and its description, inferred from the frames only."""
         asked, last = self.request, self.last
         if asked is None:
             return Outcome.NONE, ""
         if last is None:
             return (Outcome.OK, "") if self.is_broadcast else (Outcome.NO_REPLY, "no reply")
         if last.fault == UNACKED:
-            return Outcome.NO_REPLY, "no ACK came, only a packet that may answer something older"
+            return Outcome.NO_REPLY, "no ACK received, only a packet that may be the reply to an older request"
         if last.fault:
             return Outcome.GARBLED, last.fault
         if last.kind in (Kind.NAK, Kind.EOT):
             return Outcome.REFUSED, ""
         if last.kind is Kind.ACK and asked.kind is Kind.READ:
-            return Outcome.NO_REPLY, "nothing came after the ACK"
+            return Outcome.NO_REPLY, "no packet received after the ACK"
         return Outcome.OK, ""
 
 
 class Assembler:
-    """Makes packets and hands them to `write`, in order. `now` is in seconds, and `offset` what makes it 1970's.
+    """Creates packets and passes them to `write`, in order. `now` is in seconds; `offset` converts it to seconds since
+    1970.
 
-    `protocol` is what is spoken where nobody says it: on a line that is listened to, and before anything was asked. It
-    also names the kind of node, where several speak that protocol. With `echo` what the host sends is received too, and
-    left out.
+    `protocol`: the protocol if nothing else determines it: on a line that is listened to, and before the first request.
+    It also names the kind of node if several use that protocol. `echo`: sent bytes are received too, and are left out.
     """
 
     def __init__(
@@ -115,12 +115,12 @@ class Assembler:
         self._now = 0.0
 
     def overheard(self, now: float, data: bytes, sender: Direction = Direction.UNKNOWN) -> None:
-        """Take bytes of a line that is only listened to."""
+        """Process bytes of a line that is only listened to."""
         self._now, self._told = now, False
         self._decode(now, data, sender)
 
     def passed(self, now: float, data: bytes, sender: Direction, attempt: Attempt | None) -> None:
-        """Take bytes of a line of ours, and what was on the wire then: those of the HOST are whole frames."""
+        """Process bytes of an owned line with the attempt on the wire. Bytes of the HOST are whole frames."""
         if sender is not self._sender or sender is Direction.HOST:
             self._rest()
         self._now, self._told, self._sender, self._asked = now, True, sender, attempt
@@ -138,21 +138,21 @@ class Assembler:
         self._decode(now, data, sender)
 
     def attempted(self, attempt: Attempt) -> None:
-        """Take it that an attempt is over, and how it ended."""
+        """Process the end of an attempt."""
         if attempt is self._exchange.attempt:  # that of an exchange before was read from the attempt itself
             self._now = max(self._now, attempt.ended_at)
             self._rest()
             self._release()
 
     def idle(self, now: float) -> None:
-        """Hold back nothing that is over: for long nothing has happened."""
+        """Write everything that is complete: the line has been idle for a long time."""
         self._now = now
         self._rest()
         if self._exchange.over:  # a master's exchange that goes on is not judged by its silence
             self._release()
 
     def finish(self, now: float) -> None:
-        """Hold back nothing."""
+        """Write everything."""
         self._now = now
         self._rest()
         self._release()
@@ -164,7 +164,7 @@ class Assembler:
         self._exchange = _Exchange(self._kind, attempt)
 
     def _take(self, frame: Frame) -> None:
-        """Make the packet of one frame."""
+        """Create the packet of one frame."""
         if self._told:
             frame.sender = self._sender  # which its bytes may not tell
         from_host = frame.sender is Direction.HOST
@@ -194,7 +194,7 @@ class Assembler:
             exchange.packets.append(packet)
 
     def _mark(self, packet: Packet) -> None:
-        """Say whose packet it is."""
+        """Set the exchange of a packet."""
         exchange = self._exchange
         attempt = exchange.attempt
         if packet.node is None:
@@ -203,7 +203,7 @@ class Assembler:
             packet.transaction, packet.attempt = attempt.transaction, attempt.number
 
     def _overdue_reply(self) -> str:
-        """Return what a stray may be, "" if that is not known."""
+        """Return a description of what an unexpected frame may be, or ""."""
         attempt = self._exchange.attempt
         late = self._told and attempt is not None and attempt.verdict is Verdict.NO_REPLY
         return f"perhaps a late answer to {attempt.command}" if late and attempt is not None else ""
@@ -213,11 +213,11 @@ class Assembler:
         return "" if self._kind is None else self._kind.name
 
     def _strip_echo(self, data: bytes) -> bytes:
-        """Return what is not the echo of what was sent last, or before that.
+        """Return the bytes that are not the echo of the last or the previous transmission.
 
-        MSC's closing ACK comes with the next request. An echo that differs is left as it came: the line collided.
+        MSC's closing ACK is sent with the next request. An echo that differs is left in: there was a collision.
         """
-        # The last alone is tried first: an echo that never came must not use up the next one.
+        # The last transmission is tried first: a missing echo must not use up the next one.
         for overdue in (self._sent, self._echo_pending):
             length = min(len(overdue), len(data))
             if length and data[:length] == overdue[:length]:
@@ -227,7 +227,7 @@ class Assembler:
         return data
 
     def _decoder(self) -> Decoder | None:
-        """Return the decoder of what is spoken; None where that is not known."""
+        """Return the decoder of the current protocol; None if it is not known."""
         if self._name and self._name not in self._decoders:
             self._decoders[self._name] = Decoder(find(self._name).protocol.dialect())
         return self._decoders.get(self._name)
@@ -243,7 +243,7 @@ class Assembler:
             self._take(frame)
 
     def _rest(self) -> None:
-        """Take what the node left unfinished as it is."""
+        """Write the bytes that a node left incomplete as they are."""
         decoder = self._decoder()
         for frame in decoder.quiet() if decoder else ():
             self._take(frame)
@@ -260,7 +260,7 @@ class Assembler:
         exchange.packets.clear()
 
     def _conclude(self, exchange: _Exchange) -> None:
-        """Write down the outcome: on the last packet from the node, of a broadcast on its own."""
+        """Write the outcome: in the last packet from the node; for a broadcast in its own packet."""
         outcome, comment = exchange.outcome()
         attempt, target = exchange.attempt, exchange.answer
         if exchange.packets and attempt is not None:
@@ -269,7 +269,7 @@ class Assembler:
             target = exchange.packets[0]
         elif target is None:
             ended = self._now if attempt is None or attempt.verdict is None else attempt.ended_at
-            # Nothing came that could carry the outcome: a packet without bytes does.
+            # No packet can carry the outcome, so one without bytes is written.
             name = "" if exchange.kind is None else exchange.kind.name
             target = Packet(self._micros(ended), name, Direction.NODE, b"", exchange.node)
             self._mark(target)
@@ -282,13 +282,13 @@ class Assembler:
 
 
 def why_asked(attempt: Attempt) -> str:
-    """Say of a request what nobody sees in its bytes: "poll axes, attempt 2"; empty for a caller's first attempt."""
+    """Return what a request's bytes do not show: "poll axes, attempt 2"; empty for a caller's first attempt."""
     again = f"attempt {attempt.number}" if attempt.number > 1 else ""
     return ", ".join(part for part in (attempt.purpose, again) if part)
 
 
 def asides(attempt: Attempt | None) -> list[str]:
-    """Return what is to be said of how an attempt ended, beside its result."""
+    """Return notes on how an attempt ended, in addition to its result."""
     if attempt is None or attempt.verdict is None:
         return []
     return ["late"] * attempt.late + ["cancelled"] * (not attempt.heard)

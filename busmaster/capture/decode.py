@@ -1,7 +1,7 @@
-"""A passive decoder: what passes on a line, cut into frames and put into words.
+"""A passive decoder: separates the traffic of a line into frames and describes them.
 
-It hears both directions, mixed, and mostly does not know who speaks; so it is not the master's reader. Frames are cut
-by position: any byte may be a check. Silence ends a frame only to give it up.
+It receives both directions mixed and mostly without the sender, so it cannot use the master's readers. Frames are
+separated by position, because any byte may be a checksum. After a silence an incomplete frame is given up.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from busmaster.contract.exchange import Command
 
 LONGEST_FRAME = 250
 DEFAULT_GAP = 0.1
-"""Seconds of silence that end an unfinished frame: longer than any adapter's batching, shorter than a retry."""
+"""Seconds of silence that end an incomplete frame: longer than any adapter's buffering, shorter than a retry."""
 
 
 class Dialect(Protocol):
-    """How one protocol's frames are cut and read, and who may have sent them. It remembers what was asked last."""
+    """Separates and reads the frames of one protocol, and infers their senders. It remembers the last request."""
 
     starts: bytes
-    """The bytes that can begin a frame."""
+    """Bytes that can begin a frame."""
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
-        """Return the length of the frame that `data`, never empty, begins with.
+        """Return the length of the frame at the beginning of `data`, which is never empty.
 
-        A length of 0 says that the frame is not whole yet; one below 0 that so many bytes are no frame. With `quiet`
-        nothing more follows, and the length is never 0.
+        0: the frame is incomplete. Negative: this many bytes are not a frame. With `quiet` no more bytes follow, and
+        the length is never 0.
         """
         ...
 
     def explain(self, raw: bytes, sender: Direction, /) -> Frame:
-        """Return what a whole frame says.
+        """Return the contents of a whole frame.
 
-        A `sender` that is UNKNOWN is inferred from the frame and what was asked before.
+        An UNKNOWN `sender` is inferred from the frame and the requests before it.
         """
         ...
 
     def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
-        """Return the command that a request speaks, with what the host said in the midst of the same exchange.
+        """Return the command of a request, with what the host sent later in the same exchange.
 
         Raises InvalidCommand, ValueError or KeyError for a request that no command would send.
         """
@@ -47,7 +47,7 @@ class Dialect(Protocol):
 
 
 class Decoder:
-    """Bytes and their times in, frames out. `gap`: seconds of silence that end an unfinished frame."""
+    """Converts bytes with times to frames. `gap`: seconds of silence that end an incomplete frame."""
 
     def __init__(self, dialect: Dialect, *, gap: float = DEFAULT_GAP) -> None:
         self._dialect = dialect
@@ -64,7 +64,8 @@ class Decoder:
         self._sender = Direction.UNKNOWN
 
     def feed(self, data: bytes, now: float, sender: Direction = Direction.UNKNOWN) -> list[Frame]:
-        """Take the next bytes, heard at `now` in seconds. A change of a known `sender` ends an unfinished frame."""
+        """Process the next bytes, received at `now` in seconds. A change of a known `sender` ends an incomplete
+        frame."""
         frames = self.quiet() if now - self._heard > self._gap or sender is not self._sender else []
         if not self._buffer:
             self._started = now
@@ -76,7 +77,7 @@ class Decoder:
         return frames
 
     def quiet(self) -> list[Frame]:
-        """End what is unfinished here: the line was silent for the gap, or somebody else began to speak."""
+        """End an incomplete frame: the line was silent for the gap, or another sender began."""
         frames: list[Frame] = []
         self._cut(frames, quiet=True)
         self._flush(frames)
@@ -84,7 +85,7 @@ class Decoder:
 
     @property
     def unfinished(self) -> bool:
-        """Return whether something waits for more bytes, or for silence."""
+        """Return True if bytes wait for more bytes or for silence."""
         return bool(self._buffer or self._rejected)
 
     def _cut(self, frames: list[Frame], *, quiet: bool = False) -> None:
@@ -121,7 +122,7 @@ class Decoder:
         self._rejected += raw
 
     def _flush(self, frames: list[Frame]) -> None:
-        """Make one frame of its own of what could not be read."""
+        """Return unreadable bytes as a frame of their own."""
         if not self._rejected:
             return
         raw = bytes(self._rejected)

@@ -1,4 +1,4 @@
-"""The files of one capture: none that is there is overwritten, each is bounded, and so is their number."""
+"""The files of one capture: existing files are never overwritten, and their size and number are limited."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from collections import deque
 from busmaster.files import open_file
 
 SIZE = 100_000_000
-"""Bytes after which the next file is begun: a busy line at 57600 baud writes some two gigabytes a day."""
+"""Bytes after which the next file is started. A busy line at 57600 baud writes about two gigabytes a day."""
 COUNT = 10
-"""Files of one capture that are kept."""
+"""Number of files kept per capture."""
 
 
 class CaptureFiles:
-    """Writes to `path`; where that is taken, and when `size` bytes are in it, to `path` with -2, -3 and so on.
+    """Writes to `path`. If that exists, or after `size` bytes, to `path` with -2, -3 and so on.
 
-    A new file is for its owner and group. With more than `count` files of its own it removes its oldest. A device or a
-    pipe is written to as it is. What could not be written is kept, so that writing goes on where it stopped once the
-    disk has room. Raises OSError if no file can be made.
+    A new file is accessible to its owner and group. If there are more than `count` files of its own, the oldest is
+    removed. A device or a pipe is written to as it is. Unwritten bytes are kept, so that writing continues where it
+    stopped once the disk has space. Raises OSError if no file can be created.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, size: int = SIZE, count: int = COUNT) -> None:
@@ -40,24 +40,24 @@ class CaptureFiles:
 
     @property
     def pending(self) -> int:
-        """Bytes that are not yet written."""
+        """Number of bytes not written yet."""
         return len(self._pending)
 
     def write(self, data: bytes) -> int:
-        """Take what `flush` is to write."""
+        """Add bytes for `flush`."""
         self._pending += data
         return len(data)
 
     def flush(self) -> None:
-        """Write what was taken. Raises OSError where not all can be written; the rest is kept."""
+        """Write the added bytes. Raises OSError if not all can be written; the rest is kept."""
         while self._pending:
-            # unbuffered: a disk that fills up takes a part, and says how much
+            # unbuffered: a disk that becomes full writes a part, and reports how much
             written = self._file.write(self._pending) or 0
             del self._pending[:written]
             self._size += written
 
     def begin_next(self) -> None:
-        """Go on in a new file. Raises OSError, the old one going on, where that is not possible."""
+        """Continue in a new file. If that is not possible, raises OSError and continues in the old one."""
         self.flush()
         while len(self._own) >= self._count:
             self._remove(self._own.popleft())
@@ -68,7 +68,7 @@ class CaptureFiles:
     def close(self) -> None:
         """Write the rest and close the file.
 
-        Raises OSError where not all can be written, or where the disk says so late.
+        Raises OSError if not all can be written, or if the disk reports an error late.
         """
         try:
             self.flush()
@@ -76,11 +76,11 @@ class CaptureFiles:
             self._file.close()
 
     def _new(self) -> io.FileIO:
-        """Open the next file that is not there yet."""
+        """Create the next file that does not exist yet."""
         while True:
             self.path = self._name()
             try:
-                # exclusive: what is there is never overwritten
+                # exclusive: existing files are never overwritten
                 file = io.FileIO(open_file(self.path, os.O_WRONLY | os.O_EXCL), "wb")
             except FileExistsError:
                 self._number += 1
@@ -94,7 +94,7 @@ class CaptureFiles:
         return self._wanted if self._number == 1 else f"{root}-{self._number}{extension}"
 
     def _remove(self, path: str) -> None:
-        """Remove a file of ours; one that somebody has moved away is his."""
+        """Remove a file of this capture. A file that was moved is left alone."""
         try:
             os.unlink(path)
         except FileNotFoundError:

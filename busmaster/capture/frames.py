@@ -1,4 +1,4 @@
-"""What a frame on the line says: the one form in which recording, monitoring and replaying speak of it."""
+"""The contents of a frame, in the form that recording, monitoring and replaying share."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import enum
 from dataclasses import dataclass
 
 UNEXPECTED = "unexpected"
-"""The fault of a frame from a node that nobody had asked."""
+"""Fault of a frame from a node without a request."""
 UNACKED = "before the ACK"
-"""The fault of an MSC packet whose request was not yet acknowledged: it may answer an older one."""
+"""Fault of an MSC packet before the ACK of its request: it may be the reply to an older one."""
 
 
 class Direction(enum.IntEnum):
-    """Who spoke."""
+    """Sender of a frame."""
 
     UNKNOWN = 0
     NODE = 1
@@ -20,7 +20,7 @@ class Direction(enum.IntEnum):
 
 
 class Kind(enum.StrEnum):
-    """What sort of frame it is."""
+    """Kind of a frame."""
 
     READ = "read"
     WRITE = "write"
@@ -34,11 +34,11 @@ class Kind(enum.StrEnum):
 
 @dataclass(slots=True)
 class Frame:
-    """One frame as it was heard.
+    """One received frame.
 
-    `item` names the quantity as the command line does ("100", "01.17", "2008:32", "flag:5"); `value` is the data as
-    text, several joined by commas; `fault` says what is wrong with the frame and is empty if nothing is. `node` of a
-    reply is that of the request it answers, since no reply but MSC's carries one.
+    `item`: the quantity as on the command line ("100", "01.17", "2008:32", "flag:5"). `value`: the data as text,
+    several values joined by commas. `fault`: what is wrong with the frame, or empty. `node`: for a reply that of its
+    request, because only MSC's replies contain it.
     """
 
     kind: Kind
@@ -50,23 +50,23 @@ class Frame:
     value: str = ""
     fault: str = ""
     answers: bool = False
-    """It ends what the last request asked for, or one step of it."""
+    """It ends the last request, or one step of it."""
     continues: bool = False
-    """It is what the host says in the midst of an exchange, and begins none."""
+    """The host sent it within an exchange; it does not begin one."""
     joined: bool = False
-    """It came in one piece with the end of the frame before."""
+    """It arrived in one piece with the end of the previous frame."""
     time: float = 0.0
-    """Seconds, when its first byte was heard, on the clock of whoever heard it."""
+    """When its first byte was received, in seconds on the receiver's clock."""
     ended: float = 0.0
-    """Seconds, when its last byte was heard, likewise."""
+    """When its last byte was received, in seconds on the receiver's clock."""
     earlier: float = 0.0
-    """Seconds by which its first byte may have come before `time`, as the listener stood still."""
+    """Seconds by which its first byte may have arrived before `time`, because the receiver was stopped."""
     delay: float | None = None
-    """Of an answer: seconds since the last byte of what it answers was heard."""
+    """For a reply: seconds since the last byte of its request."""
 
     @property
     def text(self) -> str:
-        """Return what it says, without the node: "read 100", "100 = 12.5", "NAK"."""
+        """Return its contents without the node: "read 100", "100 = 12.5", "NAK"."""
         match self.kind:
             case Kind.READ:
                 return f"{self.command} {self.item}".rstrip()

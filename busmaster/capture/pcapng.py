@@ -1,26 +1,27 @@
-"""Capture files: the few pcapng blocks that a serial line needs, written and read.
+"""Capture files: writes and reads the few pcapng blocks that a serial line needs.
 
-Every packet is one frame on the line. Its bytes follow a header of our own, twelve bytes, so that a dissector knows
-what no byte of an anonymous reply tells; numbers are big-endian:
+Each packet is one frame on the line. A header of twelve bytes precedes its bytes and contains what an anonymous reply
+does not; numbers are big-endian:
 
     0      version of this header, 2
-    1      the protocol's capture id, 0 where it has none
+    1      the protocol's capture id, 0 if it has none
     2      direction: 0 unknown, 1 from a node, 2 from the host (the codes of the packet's own flags option)
-    3      outcome of the exchange, see `Outcome`; on the last packet from the node, 0 on the others
-    4-5    node; FFFF where unknown or the protocol has none
-    6-9    the request to which the frame belongs, numbered from 1 in the order in which they began (a cycle of a poll
-           anew); 0 where it belongs to none (a stray) or nobody knows (a line that was only listened to)
-    10     which attempt at that request it is, from 1; 0 likewise
-    11     1 where the frame came in one piece with the end of the one before, else 0
+    3      outcome of the exchange, see `Outcome`; in the last packet from the node, 0 in the others
+    4-5    node; FFFF if unknown or the protocol has none
+    6-9    number of the frame's request, from 1 in the order in which they began (each cycle of a poll is a new
+           one); 0 if it belongs to none or is not known (a line that was only listened to)
+    10     number of the attempt at that request, from 1; 0 as above
+    11     1 if the frame arrived in one piece with the end of the previous one, else 0
 
 Version 1 ends before byte 6. The protocol's name is the description of the packet's interface: a file has an interface
-for each protocol on the line, all named for the port. In the oldest files, which have one interface without a
-description, the id tells it.
+for each protocol on the line, all with the name of the port. The oldest files have one interface without a description;
+there the id determines the protocol.
 
-A packet's first comment says what came of the exchange, or why it was asked; further comments are notes on that, "late"
-or "cancelled". An exchange that nobody answered ends in a packet of the header alone. Times are whole microseconds
+A packet's first comment is the result of the exchange, or the reason for the request. Further comments are notes,
+"late" or "cancelled". An exchange without a reply ends in a packet with only the header. Times are whole microseconds
 since 1970.
-The link type is `LINK_TYPE`, one of those set aside for private use.
+
+The link type is `LINK_TYPE`, one of those reserved for private use.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from busmaster.capture.frames import Direction
 from busmaster.registry import find, kinds
 
 LINK_TYPE = 157
-"""LINKTYPE_USER10: private, and not the first of them, which other people's dissectors take."""
+"""LINKTYPE_USER10: private, and not the first one, which other dissectors often use."""
 HEADER_VERSION = 2
 NO_NODE = 0xFFFF
 
@@ -49,15 +50,16 @@ _LONGEST_BLOCK = 1 << 20
 
 
 class CaptureError(ValueError):
-    """The file is no capture, or not one of ours."""
+    """The file is not a capture, or not one of busmaster."""
 
 
 class CutOff(CaptureError):
-    """The file ends in the midst of a block, as one does whose recorder was killed or whose disk was full."""
+    """The file ends within a block, for example because the recorder was killed or the disk was full."""
 
 
 class Outcome(enum.IntEnum):
-    """How an exchange ended, or that a frame is of none (UNASKED). Those from DOUBTED on are a master's alone."""
+    """How an exchange ended, or that a frame belongs to none (UNASKED). Values from AMBIGUOUS on are used by a master
+    only."""
 
     NONE = 0
     OK = 1
@@ -66,16 +68,16 @@ class Outcome(enum.IntEnum):
     REFUSED = 4
     UNEXPECTED = 5
     AMBIGUOUS = 6
-    """A good answer came and was not believed, since it may have been another request's."""
+    """A correct reply was not delivered, because it could belong to another request."""
     SPOILT = 7
-    """What came was not read: the port said that it was damaged, or it came too early, or the echo was another."""
+    """The bytes were not parsed: damaged according to the port, too early, or with a wrong echo."""
     CUT_OFF = 8
     """The line was lost."""
 
 
 @dataclass(slots=True)
 class Packet:
-    """One frame on the line, as a capture holds it. `micros`: microseconds since 1970."""
+    """One frame in a capture. `micros`: microseconds since 1970."""
 
     micros: int
     protocol: str
@@ -85,31 +87,31 @@ class Packet:
     outcome: Outcome = Outcome.NONE
     comment: str = ""
     dropped: int = 0
-    """Events that the recorder had to drop between the packet before and this one."""
+    """Events lost by the recorder before this packet."""
     notes: tuple[str, ...] = ()
-    """What is to be said beside the comment."""
+    """Notes in addition to the comment."""
     transaction: int = 0
     attempt: int = 0
-    """To which request of the master, and which attempt at it, the frame belongs; 0 where that is not known."""
+    """Request of the master, and attempt at it; 0 if not known."""
     joined: bool = False
-    """It came in one piece with the end of the frame before."""
+    """It arrived in one piece with the end of the previous frame."""
 
 
 class Writable(Protocol):
-    """What bytes can be written to."""
+    """An object that bytes can be written to."""
 
     def write(self, data: bytes, /) -> int: ...
 
 
 class PcapngWriter:
-    """Writes packets to a binary file, which it does not own. The head of the file is written at once."""
+    """Writes packets to a binary file, which it does not own. The file header is written immediately."""
 
     def __init__(self, file: Writable, *, port: str = "") -> None:
         self._file = file
         self._port = port
         self._interfaces: dict[str, int] = {}
         self._write(_SECTION, struct.pack("<IHHq", _BYTE_ORDER, 1, 0, -1) + _options((_APPLICATION, b"busmaster")))
-        self._interface_of("")  # the statistics at the end are of interface 0, in a capture without packets too
+        self._interface_of("")  # the statistics at the end refer to interface 0, also in a capture without packets
 
     def write(self, packet: Packet) -> None:
         """Write one packet."""
@@ -129,12 +131,12 @@ class PcapngWriter:
         self._write(_PACKET, fixed + _padded(data) + options)
 
     def finish(self, micros: int, dropped: int) -> None:
-        """Write the closing statistics: how many events were dropped in all, at `micros` since 1970."""
+        """Write the closing statistics: number of lost events, at `micros` since 1970."""
         fixed = struct.pack("<III", 0, micros >> 32, micros & 0xFFFFFFFF)
         self._write(_STATISTICS, fixed + _options((_IF_DROPPED, struct.pack("<Q", dropped))))
 
     def _interface_of(self, protocol: str) -> int:
-        """Return the number of a protocol's interface, which is described in the file before its first packet."""
+        """Return the number of a protocol's interface, which is written before its first packet."""
         if protocol not in self._interfaces:
             self._interfaces[protocol] = len(self._interfaces)
             options = _options(
@@ -151,9 +153,9 @@ class PcapngWriter:
 
 
 def read_packets(file: BinaryIO) -> Iterator[Packet]:
-    """Yield the packets of a capture of ours, in order.
+    """Yield the packets of a busmaster capture, in order.
 
-    Raises CaptureError for any other file, and CutOff, behind all that is whole, for one that ends in mid-block.
+    Raises CaptureError for any other file, and CutOff, after all complete packets, for one that ends within a block.
     """
     interfaces: list[_Interface] = []
     for kind, body, order in _blocks(file):
@@ -166,7 +168,7 @@ def read_packets(file: BinaryIO) -> Iterator[Packet]:
 
 
 def _take_block(kind: int, body: bytes, order: str, interfaces: list[_Interface]) -> Packet | None:
-    """Note an interface, or return the packet of a block."""
+    """Store an interface, or return the packet of a block."""
     if kind == _SECTION:
         interfaces.clear()
     elif kind == _INTERFACE:
@@ -183,7 +185,7 @@ def _take_block(kind: int, body: bytes, order: str, interfaces: list[_Interface]
 
 
 class _Interface(NamedTuple):
-    """`ticks`: its time stamps' in a second. `protocol`: what it is described as, "" in older files."""
+    """An interface. `ticks`: timestamp units per second. `protocol`: the interface description, "" in older files."""
 
     link_type: int
     ticks: int
@@ -204,7 +206,7 @@ def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, by
     header = _HEADERS.get(data[0]) if data else None
     if header is None or len(data) < header.size:
         raise CaptureError("a packet without our header, or of a later version")
-    # Headers of older versions end sooner: they number no requests.
+    # headers of older versions are shorter: they have no request numbers
     _, capture_id, direction, outcome, node, transaction, attempt, joined = (*header.unpack_from(data), 0, 0, 0)[:8]
     comment, *notes = [value.decode(errors="replace") for code, value in options if code == _COMMENT] or [""]
     dropped = dict(options).get(_DROPPED)
@@ -228,7 +230,7 @@ def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, by
 
 
 def _by_id() -> dict[int, str]:
-    """Return the protocols of older files."""
+    """Return the protocols of older files, by id."""
     return {0: "", **{kind.capture_id: kind.name for kind in kinds().values() if kind.capture_id}}
 
 
@@ -249,7 +251,7 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
         if length < 12 + len(mark) or length % 4 or length > _LONGEST_BLOCK:
             raise CaptureError(f"a block of {length} bytes: the file is damaged")
         rest = mark + file.read(length - 8 - len(mark))
-        if len(rest) != length - 8 or rest[-4:] != head[4:]:  # zeros behind the cut may make up the length
+        if len(rest) != length - 8 or rest[-4:] != head[4:]:  # zeros after the end of the data may complete the length
             raise CutOff("the file is cut in mid-block")
         first = False
         yield kind, rest[:-4], order
@@ -262,7 +264,7 @@ def _padded(data: bytes) -> bytes:
 
 
 def _options(*options: tuple[int, bytes | None]) -> bytes:
-    """Return the options that are not None, and their end; nothing at all if every one is."""
+    """Return the options that are not None and the end marker; nothing if all are None."""
     given = ((code, value) for code, value in options if value is not None)
     coded = b"".join(struct.pack("<HH", code, len(value)) + _padded(value) for code, value in given)
     return coded + bytes(4) if coded else b""

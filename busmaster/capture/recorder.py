@@ -1,6 +1,7 @@
-"""Recording a line while it runs, at no cost to it: the owner of the line only notes what passed, a thread writes.
+"""Records a line while it runs, without delaying it: the line's owner only stores events, and a thread writes them.
 
-It is a `Tap`: the owner of the line calls it on its loop, as soon as bytes have left or come and an attempt has ended.
+It is a `Tap`: the owner of the line calls it on its loop, as soon as bytes were sent or received and an attempt has
+ended.
 """
 
 from __future__ import annotations
@@ -19,22 +20,22 @@ from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Packet, PcapngWriter
 
 CAPACITY = 50_000
-"""Events that may wait for the disk: minutes of a line at 57600 baud."""
+"""Events that can wait for the disk: minutes of a line at 57600 baud."""
 TICK = 0.05
-"""Seconds between two looks of the writing thread, which is never woken by the line."""
+"""Seconds between two checks of the writing thread. The line never wakes it."""
 SLICE = 10
-"""Events handled before the thread lets go of the interpreter."""
+"""Events processed before the thread releases the interpreter."""
 PAUSE = 0.0002
 RETRY = 1.0
-"""Seconds from a failure to write to the next try."""
+"""Seconds between two attempts to write after an error."""
 AT_ONCE = 1 << 16
-"""Bytes that are written at once."""
+"""Bytes written at once."""
 IDLE = 3.0
-"""Seconds without an event after which nothing is held back that is over: longer than any node needs to go on."""
+"""Seconds without an event after which all complete packets are written: longer than any node takes to continue."""
 
 
 class _Passed:
-    """Bytes that were on the line. `attempt` is None, too, on one that is only listened to."""
+    """Bytes on the line. `attempt` is None also on a line that is only listened to."""
 
     __slots__ = ("attempt", "data", "now", "sender")
 
@@ -48,12 +49,12 @@ class _Passed:
 class Recorder:
     """A tap that writes a capture. Raises OSError if `path` cannot be written.
 
-    A file that is there is never overwritten: `path` gets a number then, and so do those that follow when `size` bytes
-    are in one; of its own the last `count` are kept (see `CaptureFiles`). While the disk is full, up to `capacity`
-    events wait for it. `say` is told, from a thread, when that begins and when it is over.
+    Existing files are never overwritten: `path` gets a number then, and so do further files after `size` bytes. The
+    last `count` files are kept (see `CaptureFiles`). While the disk is full, up to `capacity` events wait. `say` is
+    called from a thread when that begins and ends.
 
-    `port` names the line in the file; `protocol` is needed where nobody tells it (see `Assembler`); `echo` says that
-    what is sent is received too. Close it off the loop: closing waits for the disk.
+    `port`: name of the line in the file. `protocol`: needed if nothing else determines it (see `Assembler`). `echo`:
+    sent bytes are received too. Do not close it on the loop: closing waits for the disk.
     """
 
     def __init__(
@@ -69,9 +70,9 @@ class Recorder:
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.dropped = 0
-        """Events that came while `capacity` of them waited, and those that the disk would not take to the end."""
+        """Events lost because `capacity` events waited, and those that could not be written before the end."""
         self.error: OSError | None = None
-        """Why nothing can be written, while that is so."""
+        """The error while nothing can be written."""
         self._capacity = capacity
         self._say = say
         self._events: deque[_Passed | Attempt] = deque()
@@ -80,7 +81,7 @@ class Recorder:
         self._files = CaptureFiles(path, size=size, count=count)
         self._writer = PcapngWriter(self._files, port=port)
         self._unwritten = 0
-        """Events that are made into packets, but not yet written."""
+        """Events in packets that are not written yet."""
         self._reported = 0
         offset = time.time() - time.monotonic()
         self._assembler = Assembler(self._write, protocol=protocol, echo=echo, offset=offset)
@@ -89,25 +90,25 @@ class Recorder:
 
     @property
     def path(self) -> str:
-        """That of the file which is written now."""
+        """Path of the current file."""
         return self._files.path
 
     # on the loop that owns the line
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        """Note what was handed to the port at `now`, in seconds of `time.monotonic()`."""
+        """Store bytes passed to the port at `now`, in seconds of `time.monotonic()`."""
         self._note(_Passed(now, data, Direction.HOST, attempt))
 
     def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        """Note what came."""
+        """Store received bytes."""
         self._note(_Passed(now, data, Direction.NODE, attempt))
 
     def attempted(self, attempt: Attempt, /) -> None:
-        """Note that an attempt is over."""
+        """Store the end of an attempt."""
         self._note(attempt)
 
     def overheard(self, now: float, data: bytes) -> None:
-        """Note bytes of a line that is only listened to: who sent them is worked out from what they say."""
+        """Store bytes of a line that is only listened to. Their sender is inferred from the contents."""
         self._note(_Passed(now, data, Direction.UNKNOWN))
 
     def _note(self, event: _Passed | Attempt) -> None:
@@ -119,7 +120,7 @@ class Recorder:
     # elsewhere
 
     def close(self) -> None:
-        """Write what waits and close the file. It never raises, and may be called twice."""
+        """Write the remaining events and close the file. Never raises, and can be called twice."""
         self._stop.set()
         self._thread.join()
 
@@ -148,8 +149,8 @@ class Recorder:
         self._end()
 
     def _end(self) -> None:
-        """Write the rest, if the disk takes it."""
-        # First, as nothing is drained before a disk that was full takes something again.
+        """Write the remaining events if the disk accepts them."""
+        # First: nothing is drained before a disk that was full accepts data again.
         self._flush()
         self._drain()
         self._assembler.finish(time.monotonic())
@@ -163,9 +164,9 @@ class Recorder:
         self._events.clear()
 
     def _drain(self) -> None:
-        """Write what waits in small helpings, so that the loop never waits long for the interpreter."""
+        """Write waiting events in small batches, so that the loop never waits long for the interpreter."""
         handled = 0
-        # While the disk is full the events stay where their number is bounded.
+        # While the disk is full the events stay in the queue, whose size is bounded.
         while self._events and self.error is None:
             self._handle(self._events.popleft())
             self._unwritten += 1
@@ -182,17 +183,17 @@ class Recorder:
         self._try(self._files.flush)
 
     def _begin_next(self) -> None:
-        """Go on in a new file, between two events.
+        """Continue in a new file, between two events.
 
-        Those of one exchange that is not over yet are all in the next file.
+        The events of an unfinished exchange are all in the next file.
         """
         self._writer.finish(round(time.time() * 1e6), self.dropped)
         if self._try(self._files.begin_next):
-            # each file has a head, and can be read alone
+            # each file has a header and can be read separately
             self._writer = PcapngWriter(self._files, port=self._port)
 
     def _try(self, work: Callable[[], None]) -> bool:
-        """Return whether it could be written; say it when that changes."""
+        """Return True if writing succeeded. Reports changes."""
         try:
             work()
         except OSError as error:
@@ -216,7 +217,7 @@ class Recorder:
             self._assembler.passed(event.now, event.data, event.sender, event.attempt)
 
     def _write(self, packet: Packet) -> None:
-        dropped = self.dropped  # read once: the loop counts on meanwhile
+        dropped = self.dropped  # read once: the loop continues to count
         packet.dropped = dropped - self._reported
         self._reported = dropped
         self._writer.write(packet)

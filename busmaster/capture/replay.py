@@ -1,7 +1,7 @@
-"""A recorded line, run through the master's readers of today: what would they make of the same bytes?
+"""Runs a capture through the current readers, and compares the results with the recorded ones.
 
-The clock is not replayed, so what a reply's maximum reply delay decided is not decided again: unexpected bytes stay
-unexpected, and where nothing came nothing comes.
+The clock is not replayed, so decisions that depended on a reply's maximum reply delay are not repeated: unexpected
+bytes stay unexpected, and missing replies stay missing.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from busmaster.errors import InvalidCommand, Refused
 from busmaster.registry import Protocol, find
 
 UNREAD = (Outcome.NONE, Outcome.SPOILT, Outcome.CUT_OFF)
-"""Outcomes that are no reader's doing."""
+"""Outcomes that no reader has decided."""
 FAILED = (Outcome.NO_REPLY, Outcome.GARBLED)
 
 
 @dataclass(slots=True)
 class Result:
-    """How an exchange ended. `text` is the value as the master showed it, or what was wrong; "" if that is not known.
+    """How an exchange ended. `text`: the value as displayed, or the error; "" if not known.
 
-    `values` are the numbers of the replies, as the frames have them; None if there were none to be had.
+    `values`: the numbers of the replies, from the frames; None if there are none.
     """
 
     outcome: Outcome
@@ -44,9 +44,9 @@ class Result:
         return f"{name}: {text}" if text else name
 
     def same_as(self, now: Result) -> bool:
-        """Return whether both are the same: by the value as it was shown if that is known, else by the numbers.
+        """Return True if both are equal: by the displayed value if it is known, else by the numbers.
 
-        Wordings of failures do not count.
+        Texts of errors are not compared.
         """
         if self.outcome is not Outcome.OK or now.outcome is not Outcome.OK:
             return self.outcome is now.outcome
@@ -55,7 +55,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """One exchange: what was recorded of it, and what comes of its bytes now. `packet` counts from 1, as Wireshark."""
+    """One exchange: the recorded result and the current one. `packet` counts from 1, as in Wireshark."""
 
     packet: int
     micros: int
@@ -66,7 +66,7 @@ class Replayed:
 
     @property
     def judged(self) -> bool:
-        """There is something to compare with."""
+        """True if there is a recorded result to compare with."""
         return self.recorded.outcome not in UNREAD
 
     @property
@@ -76,7 +76,7 @@ class Replayed:
 
 @dataclass(slots=True)
 class _Heard:
-    """A packet, its place in the capture, and what a listener makes of it."""
+    """A packet, its position in the capture, and its frame."""
 
     number: int
     packet: Packet
@@ -90,15 +90,15 @@ class _Heard:
 
     @property
     def exchange(self) -> tuple[int, int]:
-        """Which exchange it is of, as far as its recorder knew that."""
+        """The exchange it belongs to, as far as the recorder knew it."""
         return self.packet.transaction, self.packet.attempt
 
 
 class _Run:
-    """One exchange of today's, driven with what was recorded.
+    """A new exchange, run with the recorded bytes.
 
-    With `pauses`, a reply that pauses for longer than its inter-byte timeout is over for the reader, as it was for the
-    arbiter, unless that allowed for an adapter that holds bytes back: which it did is not recorded.
+    With `pauses`, a reply with a pause longer than its inter-byte timeout ends for the reader, as it did for the
+    arbiter, unless that allowed for an adapter that holds bytes back. Which of the two happened is not recorded.
     """
 
     def __init__(self, asked: _Heard, command: Command[Any], profile: Profile, pauses: bool = False) -> None:
@@ -108,20 +108,21 @@ class _Run:
         self._pauses = pauses
         self._told: list[_Heard] = []
         self._last: int | None = None
-        """When the node said something, in microseconds."""
+        """When the node last sent bytes, in microseconds."""
         exchange = command.open(asked.frame.node or 0, profile.timings)
         self._driver = Driver(exchange, noise_tolerant=profile.noise_tolerant)
         self._abandonable = profile.exchange_limit is not None
         self._answered = False
         self._heard = b""
-        """What came in one piece, and may go on."""
+        """Bytes received in one piece, which may continue."""
         self._unsaid = b""
-        """What the host is to say next."""
+        """Bytes that the host must send next."""
         self._closed = False
         self._over = False
         self._differs = ""
         self._given_up: Result | None = None
-        """What came of it if the host said the last word not to go on, but to end it (R9): the words are the same."""
+        """Result if the host's last bytes aborted the exchange instead of continuing it (R9). The bytes are the
+        same."""
         self._recorded = Result(Outcome.NONE)
         self._values: list[float] = []
         self.note(asked)
@@ -129,7 +130,7 @@ class _Run:
             self._differs = f"the request would be {exchange.request.hex(' ')}"
 
     def note(self, heard: _Heard) -> None:
-        """Take the recorded outcome and values."""
+        """Add the recorded outcome and values."""
         packet = heard.packet
         if packet.outcome not in (Outcome.NONE, Outcome.UNEXPECTED):
             self._recorded = Result(packet.outcome, packet.comment.removesuffix(" (late)"))
@@ -137,7 +138,7 @@ class _Run:
             self._values += numbers_in(heard.frame.value)
 
     def node_says(self, heard: _Heard) -> None:
-        """Let the reader hear it, if it still listens."""
+        """Pass bytes of the node to the reader, if the exchange has not ended."""
         if self._over and not any(heard.exchange):
             return
         if not self._driver.exchange.answered:
@@ -147,13 +148,13 @@ class _Run:
         self._pause(heard.packet.micros)
         self.note(heard)
         self._given_up = None
-        if not heard.packet.joined:  # readers of several steps weigh what came in one piece
+        if not heard.packet.joined:  # readers with several steps examine the bytes of one piece together
             self._hand_over()
         self._heard += heard.packet.frame
         self._answered = self._answered or bool(heard.packet.frame)
 
     def host_says(self, heard: _Heard) -> bool:
-        """Return whether it is what this exchange says at this point; else the exchange is over."""
+        """Return True if these are the bytes that this exchange sends next; else the exchange has ended."""
         if self._over or self._differs:
             return False
         self._told.append(heard)
@@ -173,7 +174,7 @@ class _Run:
         return not self._over
 
     def end(self) -> Replayed:
-        """Return what was recorded, and what comes of it now."""
+        """Return the recorded and the current result."""
         found = self._end()
         if not found.changed:
             return found
@@ -187,7 +188,7 @@ class _Run:
         return found if by_pauses.changed else by_pauses
 
     def _pause(self, now: int) -> None:
-        """Have the reader told of a pause, where it was long enough, before what is said now."""
+        """Report a pause to the reader if it was long enough."""
         last, self._last = self._last, now
         if not self._pauses or last is None or self._over or self._differs:
             return
@@ -202,9 +203,9 @@ class _Run:
         now = Result(Outcome.NONE, self._differs) if self._differs else result_of(self._driver.run_out())
         recorded, lead = self._recorded, f"{self._command}: "
         if self._given_up is not None and recorded.outcome is self._given_up.outcome:
-            now = self._given_up  # time decided it, which is not replayed
+            now = self._given_up  # a decision by time, which is not replayed
         if self._answered and recorded.outcome in FAILED and now.outcome in FAILED:
-            now.outcome = recorded.outcome  # in pieces of what size a later step began is not recorded
+            now.outcome = recorded.outcome  # the piece sizes of a later step are not recorded
         if recorded.outcome is Outcome.OK:
             recorded.values = self._values
             recorded.text = recorded.text.removeprefix(lead) if recorded.text.startswith(lead) else ""
@@ -213,14 +214,14 @@ class _Run:
         return _replayed(self.asked, str(self._command), recorded, now)
 
     def _hand_over(self) -> None:
-        """Let the reader hear what came, in the pieces in which it came."""
+        """Pass the received bytes to the reader, in the recorded pieces."""
         heard, self._heard = self._heard, b""
         if heard and not self._differs and not self._over:
             self._driver.feed(heard)
             self._gather()
 
     def _gather(self) -> None:
-        """Take what the exchange wants to say."""
+        """Store the bytes that the exchange sends next."""
         driver = self._driver
         self._unsaid += b"".join(driver.said)
         driver.said.clear()
@@ -229,14 +230,14 @@ class _Run:
             self._unsaid += driver.ending.send
 
     def _if_abandoned(self, said: bytes) -> Result | None:
-        """Return what would have come of it, had it been abandoned with these words."""
+        """Return the result if the exchange had been aborted with these bytes."""
         if not self._abandonable or self._driver.ending is not None:
             return None
         failure = cast("Abandonable", self._driver.exchange).abandon()
         return result_of(Ending(error=failure)) if isinstance(failure, FrameError) and failure.send == said else None
 
     def _abandon(self) -> None:
-        """Note that it would have said something again, and the host did not: there was no more time for that (R9)."""
+        """Abort the exchange: it would have sent again, but the host had no more time for that (R9)."""
         if self._abandonable and self._unsaid and self._driver.ending is None:
             self._driver.abandon()
             self._unsaid = b""
@@ -244,7 +245,7 @@ class _Run:
 
 
 def result_of(ending: Ending) -> Result:
-    """Return what a reader's ending is called."""
+    """Return the result for a reader's ending."""
     error = ending.error
     if error is None:
         text = "ok" if ending.value is None else repr(ending.value)
@@ -281,7 +282,7 @@ def replay_packets(packets: Iterable[Packet]) -> Iterator[Replayed]:
 
 
 def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
-    """Yield every packet with the frame that it is."""
+    """Yield each packet with its frame."""
     decoders: dict[str, Decoder] = {}
     for number, packet in enumerate(packets, 1):
         if packet.protocol and packet.protocol not in decoders:
@@ -294,7 +295,7 @@ def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
 
 
 def open_run(heard: Sequence[_Heard], place: int) -> _Run:
-    """Return today's exchange for a recorded request. Raises InvalidCommand for one that we would not send."""
+    """Return a new exchange for a recorded request. Raises InvalidCommand if no command would send it."""
     asked = heard[place]
     continued = []
     for follower in heard[place + 1 :]:
@@ -308,9 +309,9 @@ def open_run(heard: Sequence[_Heard], place: int) -> _Run:
 
 
 def command_of(protocol: Protocol, request: Frame, continued: Sequence[Frame] = ()) -> Command[Any]:
-    """Return the command that a request speaks, with what the host said in the midst of the same exchange.
+    """Return the command of a request, with what the host sent later in the same exchange.
 
-    Raises InvalidCommand for a request that no command of ours would send.
+    Raises InvalidCommand for a request that no command would send.
     """
     if request.fault:
         raise InvalidCommand(f"{request.text}: {request.fault}")
@@ -323,7 +324,7 @@ def command_of(protocol: Protocol, request: Frame, continued: Sequence[Frame] = 
 
 
 def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:
-    """Return the recorded outcome of the exchange that begins there."""
+    """Return the recorded outcome of the exchange that begins at `place`."""
     outcome = heard[place].packet.outcome
     for follower in heard[place + 1 :]:
         if follower.is_request:
@@ -338,7 +339,7 @@ def _replayed(asked: _Heard, command: str, recorded: Result, now: Result) -> Rep
 
 
 def numbers_in(text: str) -> list[float]:
-    """Return those of a listener's values that are numbers."""
+    """Return the numbers among a listener's values."""
     numbers = []
     for part in text.split(","):
         try:
@@ -349,7 +350,7 @@ def numbers_in(text: str) -> list[float]:
 
 
 def numbers_of(value: Any) -> list[float] | None:
-    """Return a command's value as a list of numbers; None for none."""
+    """Return a command's value as a list of numbers, or None."""
     if value is None:
         return None
     if isinstance(value, AbstractSet):

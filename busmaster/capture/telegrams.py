@@ -1,4 +1,4 @@
-"""What listeners to character protocols share: telegrams of printable characters, closed by ETX and a checksum."""
+"""Common parts of listeners to character protocols: telegrams of printable characters, ended by ETX and a checksum."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ from busmaster.wire.characters import made_of
 STX, ETX, EOT, ENQ, ACK, BEL, BS, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x15
 SPACE = 0x20
 _LONGEST_FIELD = 90
-"""Far more than any telegram may hold (60), so that one too long is still seen whole."""
+"""Far more than any telegram contains (60), so that one that is too long is still recognised as a whole."""
 ANSWERS = {ACK: Kind.ACK, NAK: Kind.NAK, EOT: Kind.EOT}
 DECIMAL = made_of(b"0123456789")
 HEXADECIMAL = made_of(b"0123456789ABCDEF")
 
 
 def field_end(data: bytes, start: int) -> int:
-    """Return where the printable characters from `start` end.
-
-    That is at a control character, or at the end of what is there.
-    """
+    """Return where the printable characters from `start` end: at a control character, or at the end of the data."""
     for position in range(start, len(data)):
         if data[position] < SPACE:
             return position
@@ -28,7 +25,7 @@ def field_end(data: bytes, start: int) -> int:
 
 
 def closed_size(data: bytes, start: int) -> int:
-    """Return `Dialect.size` of a telegram whose data begin at `start` and are closed by ETX and a checksum."""
+    """Return `Dialect.size` of a telegram with data from `start` that is ended by ETX and a checksum."""
     end = field_end(data, start)
     if end - start > _LONGEST_FIELD:
         return -start - _LONGEST_FIELD
@@ -38,7 +35,7 @@ def closed_size(data: bytes, start: int) -> int:
 
 
 def checked(raw: bytes, start: int, check: Callable[[bytes], int]) -> str:
-    """Say what is wrong with the checksum, the last byte, of what is before it from `start` on; "" if it is right."""
+    """Return what is wrong with the checksum (the last byte) of the bytes from `start` on; "" if it is correct."""
     right = check(raw[start:-1])
     return "" if raw[-1] == right else f"bad checksum {raw[-1]:02X}, not {right:02X}"
 
@@ -49,12 +46,12 @@ def characters(field: bytes) -> str:
 
 
 def came_back(raw: bytes) -> Frame:
-    """Return as noise a whole request that was received by the host: an echo that nobody declared, or that differs."""
+    """Return a whole request that the host received as noise: an undeclared or a different echo."""
     return Frame(Kind.NOISE, Direction.NODE, raw, fault="a request, received")
 
 
 def number(field: bytes, base: int, digits: bytes) -> int | None:
-    """Return the number that these characters spell, or None if one is none of `digits` (a table of `made_of`)."""
+    """Return the number of these characters, or None if one is not among `digits` (a table of `made_of`)."""
     return int(field, base) if field.translate(digits) == field else None
 
 
