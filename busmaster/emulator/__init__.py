@@ -1,4 +1,4 @@
-"""A line with physics and the devices on it, in virtual time: what cannot be tried on real drives is tried here."""
+"""An emulated line and its devices, with bus physics. It tests what cannot be tested on real drives."""
 
 from __future__ import annotations
 

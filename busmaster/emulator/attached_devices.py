@@ -1,9 +1,9 @@
-"""Who hears what passes on the line, and what they say to it.
+"""Distributes the bytes on the line to the devices, and collects their replies.
 
-Every byte is every device's to hear. A frame of the host's that nobody disturbed goes to the device whose route it
-begins with, in one piece; the others hear it only if they are attentive. What is cut, garbled or glued, everybody
-hears byte by byte, unless it holds no byte that any route begins with: then it can move no device out of its ground
-state.
+Every device receives every byte. An undisturbed frame of the host is passed in one piece to the device with a matching
+route; the other devices receive it only if they are attentive. Incomplete, corrupted or joined frames are passed to all
+devices byte by byte, unless they contain no byte with which a route begins: then they cannot change the state of an
+idle device.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from busmaster.emulator.device import NEVER, Device
 from busmaster.emulator.disturbance import misses
 
 Say = Callable[[Device, float, bytes], None]
-"""A device is going to say something: from when on, and what."""
+"""A device will transmit: the start time and the bytes."""
 TakeBack = Callable[[Device, float], None]
-"""A device has restarted at this time: what it was going to say is not said."""
+"""A device has restarted at this time: its pending transmissions are discarded."""
 
 
 class AttachedDevices:
-    """The devices of a line. `say` is called with what they say in answer, `take_back` when one has restarted."""
+    """The devices of a line. `say` is called with their replies, `take_back` after a restart."""
 
     def __init__(self, say: Say, take_back: TakeBack, chance: Chance, tau: float) -> None:
         self.devices: list[Device] = []
         self.wakeup = NEVER
-        """When a device wants to be woken, at the earliest."""
+        """Earliest time at which a device must be woken."""
         self.cut_off: frozenset[Device] = frozenset()
         self._say = say
         self._take_back = take_back
@@ -39,7 +39,7 @@ class AttachedDevices:
         self._attentive: dict[Device, None] = {}
 
     def add(self, device: Device) -> None:
-        """Attach a device, which then keeps the line's time and its chance."""
+        """Attach a device, which then uses the line's time and random source."""
         device.tau = self._tau
         device.chance = self._chance
         self.devices.append(device)
@@ -53,7 +53,7 @@ class AttachedDevices:
         self._learn_routes()
 
     def request(self, frame: bytes, start: float, end: float) -> None:
-        """Take a frame of the host's that passed undisturbed from `start` to `end`."""
+        """Process an undisturbed frame of the host, on the line from `start` to `end`."""
         for size in self._route_sizes:
             routed = self._routes.get(frame[:size])
             if routed is not None:
@@ -77,7 +77,7 @@ class AttachedDevices:
             self.hear([device for device in self._attentive if device not in routed], frame, start, end)
 
     def overhear(self, data: bytes, start: float, end: float, talker: Device | None, whole: bool) -> None:
-        """Take bytes that passed and are no request in one piece.
+        """Process bytes that are not a request in one piece.
 
         With `whole` they are a reply in one piece, which begins with no route.
         """
@@ -90,13 +90,13 @@ class AttachedDevices:
         self.hear([device for device in listeners if device is not talker], data, start, end)
 
     def scatter(self, collision: Collision, end: float) -> None:
-        """Let each device hear what several talkers made of each other's bytes, but for what fell in its own talk."""
+        """Pass the result of a collision to each device, except for its own transmission time."""
         for device in self.devices:
             for start, byte in collision.heard(device):
                 self.hear((device,), bytes((byte,)), start, end)
 
     def wake(self) -> None:
-        """Wake the devices whose time has come, now that `wakeup` has."""
+        """Wake the devices whose time has come."""
         now = self.wakeup
         self.wakeup = NEVER
         for device in self.devices:
@@ -107,12 +107,12 @@ class AttachedDevices:
                 self.wakeup = device.wakeup
 
     def restart(self, device: Device, now: float) -> None:
-        """Restart a device at `now`, and note what it says and when it wants to be woken."""
+        """Restart a device at `now`."""
         device.restart(now)
         self._note(device, now)
 
     def hear(self, listeners: Iterable[Device], data: bytes, start: float, now: float) -> None:
-        """Let `listeners` hear `data` byte by byte; its last byte ended at `now`."""
+        """Pass `data` to `listeners` byte by byte; its last byte ended at `now`."""
         for device in listeners:
             if device in self.cut_off:
                 continue

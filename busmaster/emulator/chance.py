@@ -1,4 +1,4 @@
-"""The chance that the emulator is handed: it draws from no generator of its own."""
+"""The random source of the emulator, which is passed in. The emulator has no generator of its own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Chance(Protocol):
-    """What the emulator uses of a seeded `random.Random`, which is handed in: the same seed, the same line."""
+    """The methods of a seeded `random.Random` that the emulator uses: the same seed gives the same line."""
 
     def random(self) -> float:
         """Return a number from 0 to below 1."""
@@ -26,10 +26,10 @@ class Chance(Protocol):
 
 
 class NoChance(Chance):
-    """Stands in where no random.Random was handed in: says so as soon as chance is needed."""
+    """Used if no random.Random was passed: raises an error as soon as randomness is needed."""
 
     def random(self) -> float:
-        raise ValueError("hand a random.Random(seed) to the Line: a delay or a fault on it is random")
+        raise ValueError("pass a random.Random(seed) to the Line: a delay or a fault on it is random")
 
     def uniform(self, a: float, b: float) -> float:
         return self.random()

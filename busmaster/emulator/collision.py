@@ -1,6 +1,6 @@
-"""What a receiver makes of several talkers at once: bits on the wire, contested where two drivers disagree.
+"""What a receiver gets from several simultaneous transmissions: bits on the wire, undefined where two drivers disagree.
 
-Only collisions come here. A frame that is alone on the line is never taken apart into bits.
+Only collisions are handled here. A frame that is alone on the line is never split into bits.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ ROUNDING = 1e-6
 
 
 class Collision:
-    """The line from `start` on, a level a bit time, and who drives it when.
+    """The line from `start` on: a level per bit time, and its drivers.
 
-    A talker that starts off the grid of the first is moved up to the next bit: never into the past, so that what was
-    already received stays as it was.
+    A transmission that starts off the first one's bit grid is moved to the next bit, never into the past, so that
+    received bytes stay as they were.
     """
 
     def __init__(self, settings: LineSettings, start: float, chance: Chance) -> None:
@@ -39,9 +39,9 @@ class Collision:
         """What each listener hears in the end. The host looks after each byte: half of a campaign was spent on this."""
 
     def add(self, start: float, data: bytes, talker: Device | None, hold: float = 0.0) -> None:
-        """Have `talker` say `data` from `start` on; its driver then holds the line idle for `hold` seconds.
+        """Transmit `data` from `start` on; the driver then holds the line idle for `hold` seconds.
 
-        Where another already drives a bit and they disagree, chance decides.
+        If another driver transmits a different bit at the same time, the result is random.
         """
         at = max(0, math.ceil((start - self.start) / self._bit_time - ROUNDING))
         bits = [bit for byte in data for bit in self._encode(byte)]
@@ -61,9 +61,9 @@ class Collision:
     def heard(
         self, listener: Device | None, until: float = math.inf, *, echo: bool = False
     ) -> Iterator[tuple[float, int]]:
-        """Yield when each byte began, and the byte, as far as it ended by `until`.
+        """Yield the start time and the value of each byte that ended by `until`.
 
-        `listener` (None: the host) does not hear what comes while it talks, unless it has an `echo`.
+        `listener` (None: the host) does not receive while it transmits, unless it has an `echo`.
         """
         found = self._decoded.get((listener, echo))
         if found is None:

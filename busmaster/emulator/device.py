@@ -1,22 +1,22 @@
-"""What an emulated device is: it hears bytes, says bytes, and is told the time.
+"""The base class of emulated devices: receives bytes, transmits bytes, and gets the time from outside.
 
-A device is written apart from the master's readers: it shares checksums with them (`busmaster.wire`) and nothing else,
-so that a misreading of a document on one side is not hidden by the same misreading on the other.
+A device is implemented separately from the master's readers. It shares checksums with them (`busmaster.wire`) and
+nothing else, so that a misreading of a document on one side is not hidden by the same misreading on the other.
 
 How the line uses a device
-    Every byte on the line is every device's to hear. Handing each byte to each of 32 devices is slow and mostly in
-    vain, so there are two ways of hearing, and they must agree:
 
-    `hear`  bytes as they come, whoever sent them: cut, garbled, glued, another device's reply. Always right.
-    `take`  one frame of the host's, undisturbed, that begins with one of the device's `routes`. In mid-frame it
-            refuses.
+    Every device receives every byte. Passing each byte to each of 32 devices is slow and mostly useless, so there are
+    two ways to receive, which must agree:
 
-    A device in its ground state (`attentive` False) lets pass unheard what does not begin with one of its routes. A
-    device that is in mid-frame, or waits for something (MSC: the host's ACK; Mentor: a short command), sets
-    `attentive` and then hears every byte of everybody, but for the frames that it takes. After a reset byte that may
-    as well have been a checksum, either will do. A device never hears what passes while it talks itself.
+    `hear`  bytes as they arrive, from any sender: incomplete, corrupted, joined, or of another device. Always valid.
+    `take`  one undisturbed frame of the host that begins with one of the device's `routes`. In mid-frame it refuses.
 
-    `hear`, `take`, `wake` and `restart` are the only places where `attentive` and `wakeup` may change.
+    An idle device (`attentive` False) ignores what does not begin with one of its routes. A device that is in mid-frame
+    or waits for something (MSC: the host's ACK; Mentor: a short command) sets `attentive`. It then receives every byte
+    of every sender, except for frames that it takes. After a reset byte that may also have been a checksum, either is
+    correct. A device never receives while it transmits.
+
+    `attentive` and `wakeup` change only in `hear`, `take`, `wake` and `restart`.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ NAK = b"\x15"
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """Seconds from the end of a request to the start of its reply: `low`, or evenly spread from `low` to `high`.
+    """Seconds from the end of a request to the start of its reply: `low`, or uniformly distributed from `low` to
+    `high`.
 
     A share `late_replies` (0 to 1) of the replies takes `late_reply_delay[0]` to `late_reply_delay[1]` seconds instead.
-    Raises InvalidCommand unless 0 <= low <= high, and for a share that is none.
+    Raises InvalidCommand unless 0 <= low <= high, and for an invalid share.
     """
 
     low: float = 0.002
@@ -60,7 +61,7 @@ class Delay:
 
     @classmethod
     def parse(cls, text: str) -> Delay:
-        """Parse milliseconds as the command line gives them: "2" or "50-100". Raises InvalidCommand."""
+        """Parse milliseconds as on the command line: "2" or "50-100". Raises InvalidCommand."""
         low, dash, high = text.partition("-")
         try:
             return cls(float(low) / 1000, float(high) / 1000 if dash else None)
@@ -70,29 +71,29 @@ class Delay:
             raise InvalidCommand(f"a reply delay is milliseconds, as 2 or 50-100, not {text!r}") from None
 
     def draw(self, chance: Chance) -> float:
-        """Return a delay in seconds, drawn by `chance` unless it is always the same."""
+        """Return a delay in seconds, from `chance` unless it is constant."""
         if self.late_replies and chance.random() < self.late_replies:
             return chance.uniform(*self.late_reply_delay)
         return self.low if self.high is None else chance.uniform(self.low, self.high)
 
 
 def held(value: float, low: int, high: int, what: str) -> int:
-    """Return a value as the whole number that a device can hold. Raises InvalidCommand, naming it `what`."""
+    """Return a value as a whole number that a device can store. Raises InvalidCommand with the name `what`."""
     if not low <= value <= high or value != int(value):
         raise InvalidCommand(f"{what} holds a whole number, {low} to {high}, not {value:g}")
     return int(value)
 
 
 class Device(ABC):
-    """One device on the line. A kind of device writes `hear_byte`, its `routes`, and `take` for speed.
+    """One device on the line. A kind of device implements `hear_byte`, its `routes`, and `take` for speed.
 
-    `delay` may be changed at any time. `tau` (seconds per byte) and `chance` are set when the device joins a line.
+    `delay` can be changed at any time. `tau` (seconds per byte) and `chance` are set when the device joins a line.
     """
 
     routes: tuple[bytes, ...] = ()
-    """What a request to this device begins with: b"\\x0702" for HCP2 node 2. Several if it hears a broadcast too."""
+    """First bytes of a request to this device: b"\\x0702" for HCP2 node 2. Several if it also receives broadcasts."""
     refusal: bytes = NAK
-    """What it says in a storm of refusals."""
+    """Its reply in a storm of refusals."""
 
     def __init__(self, address: int, *, delay: Delay | None = None) -> None:
         self.address = address
@@ -100,62 +101,61 @@ class Device(ABC):
         self.tau = 0.0
         self.chance: Chance = NoChance()
         self.attentive = False
-        """In mid-frame, or waiting: it must hear every byte of everybody."""
+        """True in mid-frame or while waiting: it must receive every byte of every sender."""
         self.wakeup = NEVER
-        """When `wake` wants to be called (MSC: no ACK came, or the packet was never completed)."""
+        """When to call `wake` (MSC: no ACK arrived, or the packet was never completed)."""
         self.free_at = 0.0
         """When its own last byte will have left."""
         self.outbox: list[tuple[float, bytes]] = []
-        """What it is going to say, and when the first byte begins. The line empties it."""
+        """Pending transmissions with their start times. The line removes them."""
         self.faults = Faults()
         self.driver_release_time = 0.0
-        """Seconds for which its driver still holds the line after its last byte."""
+        """Seconds for which its driver holds the line after its last byte."""
         self.lag = 0.0
-        """Added to every delay: how a fault makes one reply late."""
+        """Added to every delay: used by a fault that makes one reply late."""
         self.away_until = 0.0
-        """A fault took it off the line until then."""
+        """A fault has removed it from the line until this time."""
         self.restarted = False
-        """It has restarted, and the line has not yet taken back what it was about to say."""
+        """It has restarted, and the line has not discarded its pending transmissions yet."""
 
     # Before it joins a line
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold `values` from the start: in `item`, written as on the command line, and in those after it.
+        """Set initial `values`: of `item`, written as on the command line, and of those after it.
 
-        A value is the number that the line carries. A kind of device whose values can be set writes this. Raises
-        InvalidCommand for an item that it does not have, or that cannot hold the value.
+        A value is the number on the line. Implemented by kinds of device with settable values. Raises InvalidCommand
+        for an item that it does not have, or that cannot hold the value.
         """
         raise InvalidCommand(f"{type(self).__name__} takes no initial values")
 
     # What the line calls
 
     def hear(self, data: bytes, start: float) -> None:
-        """Take contiguous bytes off the line, the first of which began at `start`. Never raises, whatever they are."""
+        """Process contiguous bytes from the line, the first of which began at `start`. Never raises."""
         tau = self.tau
         for number, byte in enumerate(data, 1):
             self.hear_byte(byte, start + number * tau)
 
     @abstractmethod
     def hear_byte(self, byte: int, now: float) -> None:
-        """Take one byte off the line, which ended at `now`. `reply` answers it. Never raises."""
+        """Process one byte from the line, which ended at `now`. Use `reply` to answer. Never raises."""
 
     def take(self, frame: bytes, now: float) -> bool:
-        """Take a frame that begins with a route, whole and undisturbed, whose last byte ended at `now`.
+        """Process a whole undisturbed frame that begins with a route; its last byte ended at `now`.
 
-        Returns True if it was exactly one request and has been answered (or rightly not), just as `hear` would have
-        done it. Returns False, and nothing has happened, if it is something else, or the device is in mid-frame; it is
-        then heard byte by byte.
+        Returns True if it was exactly one request and was processed as `hear` would have done. Returns False without
+        any effect if it is something else or the device is in mid-frame; the frame is then passed byte by byte.
         """
         return False
 
     def wake(self, now: float) -> None:
-        """Do what is due now that `wakeup` has come. Must set another `wakeup`, or NEVER."""
+        """Run the timer set in `wakeup`. Must set another `wakeup`, or NEVER."""
         self.wakeup = NEVER
 
     def restart(self, now: float) -> None:
-        """Begin anew, as power was lost and is back: what was in RAM is gone, what it was about to say too.
+        """Restart after a power failure: RAM contents and pending transmissions are lost.
 
-        A kind of device with RAM or a parser extends this.
+        Extended by kinds of device with RAM or a parser.
         """
         self.outbox.clear()
         self.attentive = False
@@ -164,10 +164,10 @@ class Device(ABC):
         self.restarted = True
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
-        """Return the same reply as if for another element, parameter or unit, with a right checksum.
+        """Return the reply as if for another element, parameter or unit, with a correct checksum.
 
-        A fault asks for it. It is unchanged if it carries no such thing (a lone ACK). A traceable value becomes another
-        node's.
+        Used by a fault. Unchanged if the reply has no such field (a single ACK). A traceable value becomes that of
+        another node.
         """
         return reply
 
@@ -175,7 +175,7 @@ class Device(ABC):
 
     @final
     def reply(self, data: bytes, now: float, delay: float | None = None) -> float:
-        """Say `data`, `delay` seconds after `now` (drawn from `self.delay` by default), after what is still to be said.
+        """Transmit `data` after its pending transmissions, `delay` seconds after `now` (by default from `self.delay`).
 
         Returns when its last byte will have left.
         """

@@ -1,4 +1,4 @@
-"""How the faults in use strike: what a device does not hear, and what becomes of a frame that somebody says."""
+"""Applies faults: what a device does not receive, and what becomes of a transmitted frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from busmaster.emulator.faults import FORGED, NO_NOISE, Faults
 
 
 def misses(device: Device, start: float, end: float, request: bool, chance: Chance) -> bool:
-    """Return whether `device` misses what passed from `start` to `end`; `request`: a whole frame meant for it."""
+    """Return True if `device` misses what was on the line from `start` to `end`. `request`: a whole frame addressed to
+    it."""
     if start < device.away_until:
         return True
     faults = device.faults
@@ -42,7 +43,8 @@ Said = tuple[float, bytes, int]
 
 
 def distort(faults: Faults, said: Said, device: Device | None, tau: float, chance: Chance) -> list[Said]:
-    """Return what becomes of a frame said by `device` (None: the host): possibly nothing, possibly several."""
+    """Return what becomes of a frame transmitted by `device` (None: the host): possibly nothing, possibly several
+    frames."""
     start, data, chunk = said
     more: list[Said] = []
     for name, rate in faults.speaking:

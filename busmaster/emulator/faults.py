@@ -44,23 +44,23 @@ class Faults:
     """
 
     lost: float = 0.0
-    """Never said."""
+    """Not transmitted."""
     late: float = 0.0
-    """Said up to `late_by` seconds later than usual."""
+    """Transmitted up to `late_by` seconds later than usual."""
     flip: float = 0.0
     """One bit flipped."""
     unseen: float = 0.0
     """The same bit flipped in two bytes: an exclusive-or of all bytes cannot see it."""
     truncated: float = 0.0
-    """Cut somewhere."""
+    """Cut at a random place."""
     doubled: float = 0.0
-    """Said twice, the second time glued to the first."""
+    """Transmitted twice, the second time directly after the first."""
     repeated: float = 0.0
-    """Said twice, up to 300 ms apart."""
+    """Transmitted twice, up to 300 ms apart."""
     wrong: float = 0.0
-    """For another element, parameter or unit than was asked for, with a right checksum."""
+    """For another element, parameter or unit than requested, with a correct checksum."""
     duplicate: float = 0.0
-    """A second device with the same address answers too, after a delay of its own."""
+    """A second device with the same address replies too, after its own delay."""
     leading: float = 0.0
     """A few noise bytes before it (a driver switched on): never an ACK, NAK, EOT or BS."""
     trailing: float = 0.0
@@ -70,19 +70,19 @@ class Faults:
     babble: float = 0.0
     """A burst of up to 60 noise bytes at some moment of the next 100 ms."""
     split: float = 0.0
-    """Handed to the host in chunks of 1 to 4 bytes."""
+    """Delivered to the host in chunks of 1 to 4 bytes."""
     deaf: float = 0.0
-    """A request is not heard."""
+    """A request is not received."""
     nak: float = 0.0
-    """A request is refused unheeded; 1 is a storm of them."""
+    """A request is refused without being processed; 1 is a storm of refusals."""
     flapping: float = 0.0
     """It goes away for up to `away_for` seconds when a request comes."""
     restart: float = 0.0
     """It goes away as by `flapping`, and what was in its RAM is lost."""
     dead: float = 0.0
-    """Above 0: it hears and says nothing."""
+    """Above 0: it does not receive or transmit."""
     drop: float = 0.0
-    """What comes while it still has something to say is lost on it. At 0 a UART's queue holds it."""
+    """What it receives while it still has something to transmit is lost. At 0 a UART's queue keeps it."""
     late_by: float = 0.1
     """The most seconds by which `late` delays a reply."""
     away_for: float = 5.0
@@ -117,13 +117,13 @@ class Faults:
             try:
                 value = float(text)
             except ValueError:
-                raise InvalidCommand(f"fault {name}: {text!r} is no number; write for example {name}=0.1") from None
+                raise InvalidCommand(f"fault {name}: {text!r} is not a number; write for example {name}=0.1") from None
             setattr(faults, name, value)
         return faults
 
     @property
     def beyond(self) -> frozenset[str]:
-        """Return the faults in use that are outside R3's assumption: where there are none, no value may be wrong."""
+        """Return the active faults outside R3's assumption. If there are none, no value may be wrong."""
         return frozenset(name for name, _ in self.speaking) & BEYOND
 
     def __str__(self) -> str:

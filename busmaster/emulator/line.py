@@ -40,14 +40,16 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Echo:
-    """The host hears itself: `delay` seconds late, and each frame with probability `corrupt` with one bit flipped."""
+    """The host receives its own transmissions, `delay` seconds late; each frame with probability `corrupt` with a
+    flipped bit."""
 
     delay: float = 0.0
     corrupt: float = 0.0
 
 
 class Talk:
-    """Contiguous bytes by one talker (None: the host). `given` counts those that the host already has."""
+    """A contiguous transmission of one sender (None: the host). `given`: number of bytes already delivered to the
+    host."""
 
     __slots__ = ("chunk", "clean", "collision", "data", "end", "given", "start", "talker")
 
@@ -129,7 +131,7 @@ class Line:
         return self._attached.devices
 
     def add(self, device: Device) -> None:
-        """Attach a device. Two devices may have one address: then both answer, and collide."""
+        """Attach a device. Two devices may have the same address: then both reply, and collide."""
         self._attached.add(device)
 
     def remove(self, device: Device) -> None:
@@ -149,7 +151,7 @@ class Line:
         self._attached.restart(device, now)
 
     def cut(self, now: float, *devices: Device) -> None:
-        """Break the wire to `devices` (to all of them, by default): what they say or hear ends there and then."""
+        """Disconnect `devices` (by default all). Their current transmissions and receptions end immediately."""
         self._advance(now)
         lost = devices or tuple(self.devices)
         self._fixing = None
@@ -167,7 +169,7 @@ class Line:
             self._activate(heappop(self._pending)[2])
 
     def restore(self, now: float) -> None:
-        """Make the wire whole again. Who was cut off does not hear the frame that the host is in the middle of."""
+        """Reconnect all devices. They do not receive the frame that the host is transmitting."""
         self._advance(now)
         talk = self._active
         if talk is not None and talk.talker is None and talk.start < now:
@@ -178,7 +180,7 @@ class Line:
     # What the host does
 
     def send(self, data: bytes, now: float) -> None:
-        """Have the host say `data`, behind what it is still sending."""
+        """Have the host transmit `data`, behind what it is still transmitting."""
         self._advance(now)
         start = now if now > self._sent_by else self._sent_by
         if self.host is not None:
@@ -187,7 +189,7 @@ class Line:
         self._say(None, start, data)
 
     def receive(self, now: float) -> bytes:
-        """Return what has wholly arrived at the host's port by `now` and was not yet given to it."""
+        """Return the bytes that have completely arrived at the host's port by `now` and were not delivered before."""
         self._advance(now)
         talk = self._active
         if talk is not None and talk.start < now:
@@ -200,7 +202,7 @@ class Line:
         return data
 
     def next_event(self) -> float:
-        """Return when something happens next, be it within the line, or has happened unseen; NEVER if nothing will."""
+        """Return the time of the next event, within the line or not yet seen by the host; NEVER if there is none."""
         if self._inbox:
             return self._arrived
         when = self._attached.wakeup

@@ -26,7 +26,7 @@ class MemoryPort:
 
     @property
     def name(self) -> str:
-        """Return what messages call the port."""
+        """Return its name in messages."""
         return "the emulated line"
 
     @property
@@ -36,12 +36,12 @@ class MemoryPort:
 
     @property
     def echo(self) -> bool:
-        """Return whether what is sent is heard too."""
+        """Return True if sent bytes are received too."""
         return self.line.echo is not None
 
     @property
     def receive_latency(self) -> float:
-        """Return for how many seconds the emulated adapter may hold bytes back."""
+        """Return the seconds for which the emulated adapter can hold bytes."""
         return self.line.latency
 
     @property
@@ -50,18 +50,18 @@ class MemoryPort:
         return self.line.paced
 
     def presence(self) -> None:
-        """Return None: it never goes away."""
+        """Return None: it is always present."""
         return None
 
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> MemoryTransport:
-        """Open it, which never fails."""
+        """Open it. Never fails."""
         return MemoryTransport(asyncio.get_running_loop(), protocol_factory(), self.line)
 
 
 class MemoryTransport(asyncio.Transport):
-    """Sends to the line at once, and gives the protocol what the line has for it when it is due."""
+    """Sends to the line immediately, and passes the line's bytes to the protocol when they are due."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, line: Line) -> None:
         super().__init__()
@@ -102,12 +102,12 @@ class MemoryTransport(asyncio.Transport):
         self._line.host = None if settings == self._line.settings else settings
 
     def hold(self) -> None:
-        """Hold back what is written from now on, as if flow control stopped the port."""
+        """Hold back all writes from now on, as if flow control stopped the port."""
         if self._held is None:
             self._held = b""
 
     def release(self) -> None:
-        """Let what waited leave now."""
+        """Release the bytes held back."""
         held, self._held = self._held, None
         if held and not self._closing:
             self.write(held)
@@ -123,7 +123,7 @@ class MemoryTransport(asyncio.Transport):
         self.lose(None)
 
     def lose(self, cause: Exception | None) -> None:
-        """Lose the port, as if it were unplugged: the protocol is told at the next turn of the loop, once."""
+        """Lose the port, as if it were unplugged. The protocol is notified once, at the next turn of the loop."""
         if self._closing:
             return
         self._closing = True

@@ -1,7 +1,7 @@
 """A line in real time, on a pseudo-terminal or on a TCP port.
 
-A server runs its line in a thread with a clock of its own, since an event loop's timers are rounded up to milliseconds,
-which is half a frame. A thread that has nothing to do sleeps without end.
+A server runs its line in a thread with its own clock, because an event loop's timers are rounded up to milliseconds,
+which is half a frame. A thread without work sleeps until it is woken.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from busmaster.emulator.line import Line
 
 T = TypeVar("T")
 SPIN = 100e-6
-"""Seconds for which the thread waits awake: the kernel wakes a sleeper some 60 microseconds late."""
+"""Seconds for which the thread waits without sleeping: the kernel wakes a thread some 60 microseconds late."""
 CHUNK = 4096
 
 
@@ -42,7 +42,7 @@ class LineServer(ABC):
     def __init__(self, line: Line) -> None:
         self.line = line
         self.dropped = 0
-        """Bytes for the host that nobody took in time."""
+        """Bytes for the host that were not read in time."""
         self._actions: queue.SimpleQueue[tuple[Callable[[Line, float], Any], Future[Any]]] = queue.SimpleQueue()
         self._bell, self._button = os.pipe()
         os.set_blocking(self._button, False)
@@ -53,7 +53,7 @@ class LineServer(ABC):
         self._thread.start()
 
     def call(self, action: Callable[[Line, float], T]) -> T:
-        """Have the thread call `action(line, now)`, and return, or raise, what came of it.
+        """Have the thread call `action(line, now)`, and return its result or raise its exception.
 
         Raises RuntimeError if the line is no longer served.
         """
@@ -65,7 +65,7 @@ class LineServer(ABC):
         return result.result()
 
     def close(self) -> None:
-        """Stop serving: clients find their port gone. Raises what ended the thread before its time, if anything did."""
+        """Stop serving: clients lose their port. Raises the exception that ended the thread early, if any."""
         if self._closed:
             return
         self._closed = self._closing = True
@@ -198,7 +198,7 @@ class PtyServer(LineServer):
 
 
 class TcpServer(LineServer):
-    """A line on a TCP port, as a serial server has it. Clients share it: each hears all that comes back.
+    """A line on a TCP port, as on a serial server. Clients share it: each receives everything that is sent back.
 
     `path` is "socket://HOST:PORT"; port 0 picks a free one. Raises OSError if the port cannot be bound.
     """

@@ -1,7 +1,7 @@
-"""Arbiter, line and devices in virtual time, without an event loop: a day of a line in minutes, the same on every run.
+"""Arbiter, line and devices in virtual time, without an event loop: a day of a line in minutes, reproducible.
 
-A world is what the pump and the port are in earnest: it hands bytes, time and events between an arbiter and a line.
-Nothing in it waits, reads a clock or draws a random number of its own.
+A world replaces the pump and the port: it passes bytes, time and events between an arbiter and a line. It does not
+wait, read a clock or draw random numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FOREVER_STEPS = 100_000
 
 
 class StuckWorldError(RuntimeError):
-    """Time does not advance any more: the arbiter or the line asks to be called again and again at one moment."""
+    """Time does not advance: the arbiter or the line requests calls at the same moment again and again."""
 
 
 class World:

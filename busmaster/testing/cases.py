@@ -1,4 +1,4 @@
-"""What a tester says of a protocol, and what the conformance kit answers."""
+"""The input of the conformance kit for a protocol, and its results."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from busmaster.errors import Refused
 
 @dataclass(frozen=True)
 class Case:
-    """One exchange as the protocol's document has it.
+    """One exchange from the protocol's document.
 
-    `steps` is what the node says, one item a step: one for most protocols; in MSC the ACK and the packet; none for a
-    broadcast. A node that has to be asked again (a NAK that the reader answers by itself) says one step each time.
-    It ends with `value`, or `raises` Refused or its subclass. `request` is what must be sent, if that is to be checked.
+    `steps`: the node's transmissions, one item per step: one for most protocols; in MSC the ACK and the packet; none
+    for a broadcast. A node that must be asked again (a NAK that the reader answers itself) transmits one step each
+    time. The exchange ends with `value`, or `raises` Refused or its subclass. `request`: the bytes that must be sent,
+    if they are to be checked.
     """
 
     command: Command[Any]
@@ -34,7 +35,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Foreign:
-    """Bytes that `command` to `address` must not accept, and why they might come."""
+    """Bytes that `command` to `address` must not accept, and why they might arrive."""
 
     command: Command[Any]
     address: int
@@ -44,7 +45,7 @@ class Foreign:
 
 @dataclass(frozen=True)
 class Unseen:
-    """A flipped bit that the protocol itself cannot see: `heard` in place of `reply`, accepted for the reason `why`."""
+    """A flipped bit that the protocol cannot detect: `heard` instead of `reply`, accepted for the reason `why`."""
 
     reply: bytes
     heard: bytes
@@ -53,9 +54,9 @@ class Unseen:
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """Each of `values`, written by `write(value)` to `address` of the device, is what `read` then reads.
+    """Each of `values`, written by `write(value)` to `address` of the device, must be what `read` then returns.
 
-    `read_back` makes the value that must be read of the one that was written (a rounded one, for example).
+    `read_back` calculates the expected value from the written one, for example by rounding.
     """
 
     address: int
@@ -66,7 +67,7 @@ class RoundTrip:
 
 
 class NotConformant(AssertionError):
-    """The protocol breaks its contract. `findings` has one sentence for each place."""
+    """The protocol breaks its contract. `findings` has one sentence for each fault."""
 
     def __init__(self, name: str, findings: Sequence[str]) -> None:
         super().__init__(f"{name}: {len(findings)} findings\n" + "\n".join(f"- {finding}" for finding in findings))
@@ -74,11 +75,11 @@ class NotConformant(AssertionError):
 
 
 Tally = Counter[str]
-"""How much was tried, by kind: "splits", "truncations", "flips", "foreign", "garbage", "round trips"."""
+"""Number of tests by kind: "splits", "truncations", "flips", "foreign", "garbage", "round trips"."""
 
 
 def answers_of(device: Device) -> Callable[[bytes], bytes]:
-    """Return an emulated device, alone on a line on which nothing takes time, as what `round_trips` ask."""
+    """Return an emulated device, alone on a line without delays, as a function for `round_trips`."""
 
     def answer(heard: bytes) -> bytes:
         device.hear(heard, 0.0)

@@ -1,4 +1,4 @@
-"""pytest fixtures for those who test an application of theirs. In a conftest.py:
+"""pytest fixtures for testing an application. In a conftest.py:
 
 pytest_plugins = ["busmaster.testing.fixtures"]
 """
@@ -19,10 +19,10 @@ from busmaster.testing.virtual_time import run_in_virtual_time
 
 
 class LineFactory(Protocol):
-    """Makes an emulated line of devices of one protocol; a MemoryPort or `serve_pty` puts it into use.
+    """Creates an emulated line with devices of one protocol. Use it with a MemoryPort or `serve_pty`.
 
-    `delay` is the devices' reply delay and `faults` what is wrong with each of them ("lost=0.1"). What is random on
-    the line comes from `seed`.
+    `delay`: reply delay of the devices. `faults`: faults of each device ("lost=0.1"). `seed`: for all randomness on the
+    line.
     """
 
     def __call__(

@@ -20,15 +20,15 @@ from typing import Any, TypeVar, TypeVarTuple
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 PATIENCE = 0.05
-"""Seconds between looks at whether a thread is done."""
+"""Seconds between checks whether a thread has finished."""
 
 
 class DeadlockError(RuntimeError):
-    """Nothing is ready to run and no timer is set: every task waits for something that will never come."""
+    """No task is ready to run and no timer is set: every task waits for something that will never happen."""
 
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
-    """Starts at 0 s and advances by jumps alone. Raises DeadlockError, out of `run`, instead of waiting for ever."""
+    """Starts at 0 s and advances only by jumps. Raises DeadlockError, out of `run`, instead of waiting forever."""
 
     def __init__(self) -> None:
         self._now = 0.0

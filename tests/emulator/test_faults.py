@@ -57,8 +57,8 @@ def test_faults_are_read_from_text() -> None:
     ("setting", "message"),
     [
         ("lots=0.1", "no such fault 'lots'.*did you mean 'lost'"),
-        ("lost", "fault lost: '' is no number; write for example lost=0.1"),
-        ("lost=often", "'often' is no number"),
+        ("lost", "fault lost: '' is not a number; write for example lost=0.1"),
+        ("lost=often", "'often' is not a number"),
         ("lost=1.5", "fault lost is a probability from 0 to 1, not 1.5"),
         ("lost=nan", "probability"),
         ("late_by=-1", "fault late_by is a number of seconds"),
