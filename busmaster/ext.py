@@ -55,7 +55,7 @@ from busmaster.contract.places import Changing, Placed, Telling
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.files import FOLDER_MODE, MODE, check_regular, open_file, read_file
-from busmaster.planning import Plan, PlannedGroup
+from busmaster.planning import Bounds, GroupPlan, Losses, Plan, PlannedGroup
 from busmaster.planning.merging import Merge
 from busmaster.renames import TIMES, now_called
 from busmaster.transport import identity
@@ -87,6 +87,7 @@ __all__ = [
     "Attempt",
     "Between",
     "Bit",
+    "Bounds",
     "Changing",
     "Command",
     "CommandOptions",
@@ -95,6 +96,7 @@ __all__ = [
     "Echo",
     "Exchange",
     "FrameError",
+    "GroupPlan",
     "Handle",
     "HeldNode",
     "Hold",
@@ -103,6 +105,7 @@ __all__ = [
     "LearnedTimes",
     "Limit",
     "LineClient",
+    "Losses",
     "Mark",
     "MeansNothing",
     "Merge",
@@ -112,6 +115,8 @@ __all__ = [
     "OpenPort",
     "Outdated",
     "Placed",
+    "Plan",
+    "PlannedGroup",
     "Poll",
     "Profile",
     "ReadAfterWrite",

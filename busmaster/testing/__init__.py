@@ -1,7 +1,8 @@
 """Tools for testing programs that use busmaster, and protocols for it. busmaster's own tests use them too.
 
 `check_protocol` and `check_dialect` are the conformance kit of a protocol. `run_in_virtual_time` runs an application on
-a loop whose time jumps. `busmaster.testing.fixtures` has pytest fixtures.
+a loop whose time jumps. `busmaster.testing.bench` measures latency against a budget. `busmaster.testing.fixtures` has
+pytest fixtures.
 """
 
 from __future__ import annotations

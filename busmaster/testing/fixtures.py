@@ -15,6 +15,7 @@ from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.registry import find, make_device
+from busmaster.testing.bench import BenchReport, bench
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 
@@ -63,3 +64,12 @@ def emulated_line() -> LineFactory:
         return Line(find(protocol).profile.line, devices, chance=random.Random(seed), **options)
 
     return make
+
+
+@pytest.fixture
+def latency_bench() -> Callable[..., BenchReport]:
+    """Measure an emulated line, and hold it against a budget: `latency_bench("hcp2", range(1, 33)).check("p99=20")`.
+
+    The arguments are those of `busmaster.testing.bench.bench`.
+    """
+    return bench

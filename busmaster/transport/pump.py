@@ -205,7 +205,7 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        """Process a byte that the UART marked as damaged; no byte if a serial server reports the error apart from it."""
+        """Process a byte that the UART marked as damaged; none if a serial server reports the error separately."""
         now = self.clock()
         if mark is Mark.BREAK and self._port is not None and not self._port.is_break():
             mark = Mark.DAMAGED

@@ -54,6 +54,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "points": (("points line.toml --csv >points.csv", RUN), ("points line.toml --from points.csv", RUN)),
     "monitor": ((f"monitor {LINE} --protocol hcp2", DRIVES),),
     "doctor": ((f"doctor {LINE} --protocol hcp2 --nodes 1-8", LONG),),
+    "bench": (
+        ("bench --protocol hcp2 --nodes 1-32 --virtual --every 0.5 --period 0.5 --budget cycle.p99=400", RUN),
+        (f"bench {LINE} --protocol hcp2 --nodes 1-8 --seconds 60 --json >today.json", LONG),
+        ("bench --compare yesterday.json today.json --budget p99=1.2x", LONG),
+    ),
     "replay": (
         (f"read {LINE} --protocol hcp2 --node 5 1 --capture line.pcapng", RUN),
         ("replay line.pcapng", RUN),

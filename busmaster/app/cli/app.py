@@ -52,6 +52,7 @@ COMMANDS = (
     "points",
     "monitor",
     "doctor",
+    "bench",
     "replay",
     "items",
 )

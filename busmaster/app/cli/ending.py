@@ -72,8 +72,13 @@ class Ending:
     def _unwind(self) -> NoReturn:
         raise KeyboardInterrupt if self.number == signal.SIGINT else SystemExit(128 + self.number)
 
-    def run(self, function: Callable[..., Awaitable[T]], *arguments: Any) -> T:
-        """Run an async function as anyio.run does.
+    def run(
+        self,
+        function: Callable[..., Awaitable[T]],
+        *arguments: Any,
+        loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
+    ) -> T:
+        """Run an async function as anyio.run does, in a loop of `loop_factory`.
 
         Raises KeyboardInterrupt or SystemExit if it was cancelled by a signal.
         """
@@ -92,14 +97,20 @@ class Ending:
 
         self._running = True
         try:
-            return anyio.run(cancellable)
+            return anyio.run(cancellable, backend_options={"loop_factory": loop_factory})
         finally:
             self._running = False
             if self.number:
                 self._unwind()
 
 
-def until_ended(function: Callable[..., Awaitable[T]], *arguments: Any) -> T:
+def until_ended(
+    function: Callable[..., Awaitable[T]],
+    *arguments: Any,
+    loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
+) -> T:
     """Run an async function in an event loop, to be ended by the signals of the command that runs."""
     ending = click.get_current_context().find_object(Ending)
-    return anyio.run(function, *arguments) if ending is None else ending.run(function, *arguments)
+    if ending is None:
+        return anyio.run(function, *arguments, backend_options={"loop_factory": loop_factory})
+    return ending.run(function, *arguments, loop_factory=loop_factory)

@@ -17,7 +17,7 @@ from busmaster.app.config import emulated_line
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.rights import line_parts
 from busmaster.bounds import MOST_CLIENTS
-from busmaster.planning import Bounds, GroupPlan, Losses, Plan
+from busmaster.ext import Bounds, GroupPlan, Losses, Plan
 
 SHOWN = (Priority.URGENT, Priority.COMMAND, Priority.POLL)
 SOME = 8

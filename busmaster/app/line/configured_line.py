@@ -24,8 +24,19 @@ from busmaster.app.outputs.kinds import find
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.bounds import MOST_MEMBERS
 from busmaster.errors import InvalidCommand
-from busmaster.ext import Handle, Limit, NodeSource, Send, Tap, WriteOptions, guess, is_decimal, meant
-from busmaster.planning import Plan, PlannedGroup
+from busmaster.ext import (
+    Handle,
+    Limit,
+    NodeSource,
+    Plan,
+    PlannedGroup,
+    Send,
+    Tap,
+    WriteOptions,
+    guess,
+    is_decimal,
+    meant,
+)
 
 
 class ConfiguredLine:

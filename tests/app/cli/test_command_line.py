@@ -28,6 +28,9 @@ PROMISED = {
     "plan": "LINE.toml [--json]",
     "monitor": "PORT|LINE.toml [--protocol P] [--json]",
     "doctor": "PORT [--protocol P] [--nodes N-M,K] [--json]",
+    "bench": "[PORT] [--protocol P] [--nodes N-M,K] [--seconds S] [--callers N] [--every S] [--priorities NAME=N,...]"
+    " [--period S] [--items ITEM,ITEM...] [--reply-delay MS[-MS]] [--fault NAME=VALUE] [--seed N] [--virtual] [--json]"
+    " [--plot FILE] [--budget FIGURE=LIMIT] [--compare A.json B.json]",
     "replay": "CAPTURE [--json]",
     "serve": "LINE.toml [--read-only]",
     "status": "[--json]",
@@ -55,6 +58,7 @@ BESIDE = {
     "web": "[--token-file FILE] [--host NAME]",
     "opcua": "[--allow POINT] [--token-file FILE] [--certificate FILE] [--key FILE] [--trusted FOLDER]",
     "safe": f"{CAPTURE} [--port PORT]",
+    "bench": NODE,
     "discover": f"{CAPTURE} [--protocol P] [--nodes N-M,K]",
 }
 """What a line, a node, a recording or an interface takes besides."""
@@ -64,7 +68,7 @@ SPOKEN = {"hcp", "hcp2", "microflex", "msc", "mentor", "dc104", "modbus", "ct-an
 def promised(name: str) -> set[str]:
     """The words behind a command, an option with its value as one."""
     text = f"{PROMISED[name]} {BESIDE.get(name, '')}"
-    return set(re.findall(r"\[--[a-z-]+(?: \[?[^\s\]]+(?:\[-MS\])?\]?)?\]|--[a-z-]+ \S+|\S+", text))
+    return set(re.findall(r"\[--[a-z-]+(?: \[?[^\s\]]+(?:\[-MS\])?\]?(?: [^\s\[\]]+)?)?\]|--[a-z-]+ \S+|\S+", text))
 
 
 def found(name: str) -> Iterator[str]:
