@@ -43,8 +43,7 @@ class Times:
         count = len(ordered)
         if not count:
             return cls()
-        # -1e-9: 0.999 * 1000 is a little more than 999 in floats, and would take the maximum.
-        figures = {name: ordered[ceil(share * count - 1e-9) - 1] for name, share in QUANTILES.items()}
+        figures = {name: ordered[ceil(share * count) - 1] for name, share in QUANTILES.items()}
         return cls(count, sum(ordered) / count, {**figures, "max": ordered[-1]})
 
     def fields(self) -> dict[str, Any]:

@@ -68,6 +68,7 @@ def test_the_polls_of_a_group_count_towards_the_share_of_the_wire() -> None:
 def test_failed_attempts_and_retries_are_no_part_of_the_share() -> None:
     report = bench("hcp2", [1], virtual=True, seconds=5, faults=["lost=0.2"])
     assert 0 < report.share < 0.5
+    assert report.values == report.total.count, "a sync read after a lost frame has no caller"
 
 
 def test_the_same_arguments_give_the_same_report_and_another_seed_another() -> None:
