@@ -22,6 +22,20 @@ from busmaster.bus.handle import Handle, Send
 from busmaster.bus.limits import Limit
 from busmaster.bus.meaning import MOST_DIGITS, OF_QUANTITIES, PLAIN, MeansNothing, Named
 from busmaster.bus.node import Node, Request
+from busmaster.bus.parameters import (
+    Change,
+    Entry,
+    Found,
+    Left,
+    Outcome,
+    Parameter,
+    ParameterLoad,
+    ParameterSet,
+    Result,
+    Value,
+    empty_set,
+    walk,
+)
 from busmaster.bus.points import Point
 from busmaster.bus.reads_after_writes import ReadsAfterWrites
 from busmaster.bus.requester import (
@@ -88,13 +102,16 @@ __all__ = [
     "Between",
     "Bit",
     "Bounds",
+    "Change",
     "Changing",
     "Command",
     "CommandOptions",
     "Cycles",
     "Driver",
     "Echo",
+    "Entry",
     "Exchange",
+    "Found",
     "FrameError",
     "GroupPlan",
     "Handle",
@@ -103,6 +120,7 @@ __all__ = [
     "Item",
     "Learned",
     "LearnedTimes",
+    "Left",
     "Limit",
     "LineClient",
     "Losses",
@@ -113,7 +131,11 @@ __all__ = [
     "NodeRecord",
     "NodeSource",
     "OpenPort",
+    "Outcome",
     "Outdated",
+    "Parameter",
+    "ParameterLoad",
+    "ParameterSet",
     "Placed",
     "Plan",
     "PlannedGroup",
@@ -125,11 +147,13 @@ __all__ = [
     "Request",
     "RequestOptions",
     "Requester",
+    "Result",
     "Send",
     "SharedLine",
     "Tap",
     "Telling",
     "Transaction",
+    "Value",
     "Verdict",
     "Waiter",
     "WriteOptions",
@@ -144,6 +168,7 @@ __all__ = [
     "checked_priority",
     "clock_of",
     "documented",
+    "empty_set",
     "give_back",
     "give_up",
     "guess",
@@ -160,6 +185,7 @@ __all__ = [
     "last_value",
     "lend_node",
     "line_of",
+    "listed_parameters",
     "lost_seconds",
     "meant",
     "names_of_items",
@@ -167,6 +193,7 @@ __all__ = [
     "open_file",
     "open_port",
     "owning_group",
+    "plain_handle",
     "plan_in_steps",
     "prepare_write",
     "read_file",
@@ -185,6 +212,7 @@ __all__ = [
     "take_only_safe_writes",
     "take_overheard",
     "times_to_keep",
+    "walk",
     "whole_number",
     "window_of",
 ]
@@ -368,6 +396,17 @@ def prepare_write(handle: Handle, item: str, values: Sequence[Any], **options: U
     Raises InvalidCommand.
     """
     return handle._prepare_write(item, values, **options)
+
+
+def listed_parameters(handle: Handle) -> tuple[Parameter, ...]:
+    """Return the parameters that the document of a handle's protocol lists, in its order; none if it lists none."""
+    return tuple(handle._listed())
+
+
+def plain_handle(handle: Handle) -> Handle:
+    """Return a handle of the same node that reads and writes numbers without decimals of its own: parameter sets have
+    these."""
+    return handle._plain()
 
 
 def run_items(handle: Handle, item: str, count: int) -> tuple[str, ...]:

@@ -72,7 +72,7 @@ OPEN: dict[str, set[str]] = {
         *("shared_backlog", "tap", "transaction", "unexpected"),
     },
     "bus": {
-        *("alarms", "bus", "exclusive", "handle", "limits", "meaning", "node", "points", "polling"),
+        *("alarms", "bus", "exclusive", "handle", "limits", "meaning", "node", "parameters", "points", "polling"),
         *("reads_after_writes", "requester", "samples", "shared_line", "snapshots", "suitability"),
     },
     "bounds": {""},
@@ -94,8 +94,8 @@ OPEN: dict[str, set[str]] = {
     "wire": {"characters", "checks", "numbers", "readers"},
     "app.cli": {""},
     "app.config": {
-        *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "sections", "service"),
-        *("source", "table", "templates"),
+        *("", "emulated", "names", "parameter_sets", "point_section", "points", "recording", "rewriting", "sections"),
+        *("service", "source", "table", "templates"),
     },
     "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},
     "app.interfaces": {"following", "opcua", "opcua_access", "web"},
@@ -113,7 +113,7 @@ A protocol's folder is open to its own, to those that build on it, and to the ro
 LISTENING = {"capture.decode", "capture.frames", "capture.telegrams"}
 PARTS: dict[str, set[str]] = {
     "codec": {"wire"} | BASE,
-    "handle": {"bus.requester", "bus.points", "bus.handle"} | BASE,
+    "handle": {"bus.requester", "bus.parameters", "bus.points", "bus.handle"} | BASE,
     "device": {"wire", "emulator"} | BASE,
     "capture": {"wire"} | LISTENING | BASE,
     "": {"registry"} | BASE,

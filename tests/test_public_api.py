@@ -184,7 +184,8 @@ SHOWN = {
         running state statistics wall_time worst_case_wait""",
     "node": """address check exclusive health label latest lift limit limits line merge_reads note_stop now of on_return
         planned probe profile request statistics stops suspend suspended timed_request timings use_sync_reads""",
-    "handle": "bus exclusive items node point profile read use_sync_reads write",
+    "handle": """bus differences exclusive in_operation items node parameters point prepare_load profile read
+        save_parameters use_sync_reads write""",
     "controller": "axis element elements io named",
     "drive": "write_all",
     "unit": "",

@@ -6,10 +6,26 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from copy import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, overload
 
+from busmaster.bounds import MOST_MEMBERS
+from busmaster.bus.parameters import (
+    Difference,
+    Entry,
+    Found,
+    Parameter,
+    ParameterLoad,
+    ParameterSet,
+    Prepare,
+    Value,
+    differences,
+    empty_set,
+    prepared,
+    walk,
+)
 from busmaster.bus.points import Point
-from busmaster.bus.requester import NodeSource, ReadOptions, Requester, SeveralRequests, WriteOptions
+from busmaster.bus.requester import NodeSource, Priority, ReadOptions, Requester, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import guess, is_decimal, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
@@ -35,6 +51,8 @@ class Handle(ABC):
     """
 
     profile: ClassVar[Profile]
+    _identity: ClassVar[tuple[str, ...]] = ()
+    """Items by which a node says what it is, such as its firmware."""
 
     def __init__(
         self,
@@ -125,6 +143,120 @@ class Handle(ABC):
     def _names_of_items(cls) -> Mapping[str, str]:
         """Return the names of items by the keys that a listener reads from the line."""
         return {}
+
+    # parameter sets
+
+    def parameters(self, items: Iterable[str] = ()) -> tuple[Parameter, ...]:
+        """Return the parameters of the node, in the document's order; with `items`, these.
+
+        An item with a count stands for so many from there on: "1.01:20", "holding:0:500". Raises InvalidCommand for a
+        protocol that documents no list, where no items are given; and for more than 20 000 parameters.
+        """
+        items = tuple(items)
+        if not items:
+            listed = tuple(self._listed())
+            if not listed:
+                kind = self.profile.kind_name
+                raise InvalidCommand(f"{kind}: this protocol documents no list of parameters: name the items")
+            return listed
+        known = {self.point(one.item).command: one for one in self._listed()}
+        found: dict[Command[Any], Parameter] = {}
+        for name in (name for item in items for name in self._counted(item)):
+            command = self.point(name).command
+            found.setdefault(command, known.get(command) or Parameter(item=name))
+            if len(found) > MOST_MEMBERS:
+                raise InvalidCommand(f"a parameter set has {MOST_MEMBERS} parameters at most")
+        return tuple(found.values())
+
+    async def save_parameters(
+        self,
+        parameters: Iterable[Parameter] | None = None,
+        *,
+        progress: Callable[[Found], object] = lambda found: None,
+        by: str = "",
+    ) -> ParameterSet:
+        """Read parameters, by default all that the document lists, and return them as a set.
+
+        Each is read in the background of other traffic. Parameters that the node does not have are left out; `progress`
+        is called with what came of each. Values are numbers as a handle without decimals reads them. Raises
+        InvalidCommand as `parameters` does, BusError if the node does not reply.
+        """
+        wanted = tuple(self.parameters() if parameters is None else parameters)
+        found: dict[str, Entry] = {}
+        empty = await empty_set(self, by)
+        async for one in walk(self, wanted):
+            progress(one)
+            if one.value is not None:
+                found[one.parameter.item] = Entry(one.parameter, one.value)
+        in_order = {one.item: found[one.item] for one in wanted if one.item in found}
+        return replace(empty, entries=in_order)
+
+    async def prepare_load(
+        self,
+        wanted: ParameterSet,
+        *,
+        parameters: Iterable[Parameter] = (),
+        prepare: Prepare | None = None,
+        by: str = "",
+    ) -> ParameterLoad:
+        """Compare a set with what the node holds, and return what is to be written: `ParameterLoad.write` writes it.
+
+            load = await drive.prepare_load(wanted)
+            async for outcome in load.write(): ...
+            await drive.prepare_load(load.undo)         # what it overwrote
+
+        Ask `in_operation` first. `parameters` says more of the node's parameters than its document does; `prepare`
+        replaces how a write is checked and sent. Raises InvalidCommand for a set of another kind of node or an item
+        that does not exist, BusError if the node does not reply.
+        """
+        plain = self._plain()
+
+        def usual(item: str, value: Value) -> Send:
+            [send] = plain._prepare_write(item, [value], priority=Priority.BACKGROUND)
+            return send
+
+        own = {one.item: one for one in (*self._listed(), *parameters)}
+        return await prepared(plain, wanted, own, prepare or usual, by)
+
+    @classmethod
+    def differences(cls, one: ParameterSet, other: ParameterSet) -> tuple[Difference, ...]:
+        """Return the parameters that are not the same in two sets of this kind of node.
+
+        Raises InvalidCommand for a set of another kind.
+        """
+        return tuple(differences(cls, one, other))
+
+    async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
+        """Return what says that the node is enabled or runs, "" if it does not, None if its protocol does not tell."""
+        return None
+
+    def _listed(self) -> Iterable[Parameter]:
+        """Return the parameters that the protocol's document lists, in its order; nothing if it lists none."""
+        return ()
+
+    def _plain(self) -> Self:
+        """Return this handle as it reads numbers without decimals of its own."""
+        return self
+
+    @classmethod
+    def _same(cls, item: str, one: Value, other: Value) -> bool:
+        """Return whether a node cannot tell one value of an item from the other."""
+        return one == other
+
+    def _written_item(self, item: str, before: Value, value: Value) -> str:
+        """Return the item by which a value is written where another one was before."""
+        return item
+
+    def _counted(self, item: str) -> tuple[str, ...]:
+        """Return the items that "1.01:20" stands for; another item stands for itself."""
+        first, _, count = item_text(item).rpartition(":")
+        if not is_decimal(count) or not first:
+            return (item,)
+        try:
+            self.point(first)
+        except InvalidCommand:  # the number is not a count: flag:5
+            return (item,)
+        return self._run_items(first, whole_number(int(count), 1, MOST_MEMBERS, f"the count of {first}"))
 
     # ITEM and VALUE on the command line
 

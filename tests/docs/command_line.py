@@ -64,6 +64,19 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("replay line.pcapng", RUN),
     ),
     "items": (("items hcp2 axis0 error", RUN),),
+    "params": (),
+    "params diff": (
+        (f"params diff winder.toml 5@{LINE} --protocol hcp2", DRIVES),
+        ("params diff winder.toml press.toml", DRIVES),
+    ),
+    "params load": (
+        ("params load winder.toml press@line.toml --dry-run", DRIVES),
+        ("params load winder.toml press@line.toml", TERMINAL),
+    ),
+    "params save": (
+        (f"params save {LINE} --protocol hcp2 5 -o winder.toml", LONG),
+        ("params save line.toml winder -o winder.toml", DRIVES),
+    ),
 }
 """Of each command, and how a test takes it: run to its end, or until Ctrl-C, or not at all."""
 
@@ -79,7 +92,7 @@ class Described:
 
     @property
     def examples(self) -> tuple[tuple[str, str], ...]:
-        return EXAMPLES[self.name]
+        return EXAMPLES[self.name]  # of a group those of its commands: it has none itself
 
 
 def described(command: click.Command, name: str = "") -> Described:
@@ -114,13 +127,15 @@ def _said(option: click.Option, context: click.Context) -> str:
     return " ".join(" ".join(said).split())
 
 
-def commands() -> Iterator[Described]:
-    """Every command, in the order of the help."""
-    context = click.Context(cli)
-    for name in cli.list_commands(context):
-        command = cli.get_command(context, name)
+def commands(group: click.Group = cli, before: str = "") -> Iterator[Described]:
+    """Every command, in the order of the help; those of a group behind it, as `params save`."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
         assert command is not None
-        yield described(command, name)
+        yield described(command, f"{before}{name}")
+        if isinstance(command, click.Group):
+            yield from commands(command, f"{before}{name} ")
 
 
 def page() -> str:
@@ -151,9 +166,10 @@ system looks for them. In a virtual environment the manual page is found while t
     for command in commands():
         yield f"## busmaster {command.name}\n\n```text\n{command.usage}\n```\n"
         yield from (f"{paragraph}\n" for paragraph in command.paragraphs)
-        yield "| option | meaning |\n|---|---|"
-        yield from (f"| `{names}` | {_cell(about)} |" for names, about in command.options)
-        yield ""
+        if command.options:
+            yield "| option | meaning |\n|---|---|"
+            yield from (f"| `{names}` | {_cell(about)} |" for names, about in command.options)
+            yield ""
         for text, mark in command.examples:
             yield _block(text, mark)
 

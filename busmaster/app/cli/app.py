@@ -55,6 +55,7 @@ COMMANDS = (
     "bench",
     "replay",
     "items",
+    "params",
 )
 """One module of this package each, which defines `command`; imported only when it is used."""
 INTERFACES = "busmaster.interfaces"

@@ -20,7 +20,10 @@ from busmaster.registry import find
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-NOT_THE_FILES = ("capture", "capture_files", "capture_mb", "verify", "as_json")
+NOT_THE_FILES = (
+    *("capture", "capture_files", "capture_mb", "verify", "as_json"),
+    *("items", "output", "dry_run", "yes", "enabled", "undo"),
+)
 """Options that say nothing of a line, and stand beside a LINE.toml."""
 
 
@@ -153,15 +156,15 @@ def span(profile: Profile) -> str:
     return f"{profile.addresses[0]}-{profile.addresses[-1]}"
 
 
-def connected(command: F, *, or_file: bool = False) -> F:
+def connected(command: F, *, or_file: bool = False, port: bool = True) -> F:
     """Give a command PORT, --protocol and the options of a port, as one `Connection` named `connection`.
 
-    `or_file`: PORT may be a LINE.toml, which says all of that; `connection.protocol` is then "".
+    `or_file`: PORT may be a LINE.toml, which says all of that; `connection.protocol` is then "". Without `port` the
+    command has no PORT of its own, and `connection` is a function that returns the connection for one.
     """
 
     @functools.wraps(command)
     def gathered(
-        port: str,
         protocol: str | None,
         baud: int | None,
         echo: bool,
@@ -170,16 +173,23 @@ def connected(command: F, *, or_file: bool = False) -> F:
         capture: str | None,
         **options: Any,
     ) -> Any:
-        if or_file and is_line_file(port):
-            protocol = none_but_the_files(port)
-        elif protocol is None:
-            raise click.UsageError("say what is spoken there: --protocol P, or a LINE.toml in place of the port")
-        own = take_options(handle_options(), protocol, options)
-        connection = Connection(port, protocol, baud, echo, timeout, retries, capture, own)
-        return command(connection=connection, **options)
+        given = {offer.option.name: options.pop(offer.option.name, None) for offer in handle_options()}
+        where = options.pop("port", None)
+
+        def connection(port: str) -> Connection:
+            if or_file and is_line_file(port):
+                spoken = none_but_the_files(port)
+            elif protocol is None:
+                raise click.UsageError("say what is spoken there: --protocol P, or a LINE.toml in place of the port")
+            else:
+                spoken = protocol
+            own = take_options(handle_options(), spoken, dict(given))
+            return Connection(port, spoken, baud, echo, timeout, retries, capture, own)
+
+        return command(connection=connection if where is None else connection(where), **options)
 
     options = (
-        click.argument("port", metavar="PORT|LINE.toml" if or_file else "PORT"),
+        *([click.argument("port", metavar="PORT|LINE.toml" if or_file else "PORT")] if port else []),
         protocol_option(required=not or_file),
         click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default."),
         click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),

@@ -29,10 +29,10 @@ class Bar:
     ) -> None:
         self._hide()
 
-    def advance(self) -> None:
-        """Count one more and draw the bar."""
+    def advance(self, count: int = 1) -> None:
+        """Count so many more and draw the bar."""
         if self._bar is not None:
-            self._bar.update(self._task, advance=1, refresh=True)
+            self._bar.update(self._task, advance=count, refresh=True)
 
     @contextmanager
     def hidden(self) -> Iterator[None]:

@@ -11,12 +11,16 @@ from busmaster.contract.items import Access, Bit, Item
 T_co = TypeVar("T_co", covariant=True)
 
 
+STARTS_EVENT = range(1, 6)
+"""Comms 1 to 5: a write starts an event of the Mint program, even if the value is the same."""
+
+
 @dataclass(frozen=True, slots=True)
 class Element(Generic[T_co]):
     """Describe one named element: what its number means (`decode`), in which unit, and whether the map says R/W.
 
-    `keyword` is the Mint keyword that it stands for. A writable element is a level, such as outputs or a reference:
-    writing it again changes nothing.
+    `kept` is why a load of parameters never writes it. `keyword` is the Mint keyword that it stands for. A writable
+    element is a level, such as outputs or a reference: writing it again changes nothing.
     """
 
     name: str
@@ -27,6 +31,7 @@ class Element(Generic[T_co]):
     keyword: str = ""
     writable: bool = False
     bits: tuple[Bit, ...] = ()
+    kept: str = ""
 
     @property
     def item(self) -> Item:

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
 from busmaster.bus.handle import Handle, Send, checked_count, item_text, read_each, unknown_item
+from busmaster.bus.parameters import Parameter, Value
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
+from busmaster.contract.items import Access
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
-from busmaster.protocols._comms.elements import Element
+from busmaster.protocols._comms.elements import STARTS_EVENT, Element
 
 T = TypeVar("T")
+
+LAST_OF_PROGRAM = 99
+"""The elements up to it are the Mint program's own."""
 
 
 class CommsHandle(Handle):
@@ -129,6 +134,19 @@ class CommsHandle(Handle):
         element = int(item) if is_decimal(item) else item
         self._writes(element, values, stop=options.get("safe"))
         return [lambda: self.write(element, *values, **options)]
+
+    def _listed(self) -> Iterable[Parameter]:
+        """Return the program's own elements, if the map has them, then those that the map names."""
+        for number in () if self._definite else range(1, LAST_OF_PROGRAM + 1):
+            kept = "a write starts an event of the Mint program" if number in STARTS_EVENT else ""
+            yield Parameter(item=str(number), kept=kept)
+        for element in self.elements.values():
+            access: Access = "read/write" if element.writable else "read"
+            yield Parameter(item=element.name, unit=element.unit, access=access, kept=element.kept)
+
+    @classmethod
+    def _same(cls, item: str, one: Value, other: Value) -> bool:
+        return is_read_back(one, other)
 
     async def _verify(self, requests: SeveralRequests, number: int, written: float) -> None:
         command = self._read_command(number)

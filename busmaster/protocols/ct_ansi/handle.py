@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from decimal import ROUND_HALF_UP, Decimal
 from typing import Any, ClassVar, Unpack
 
 from busmaster.bus.handle import Send, encoder, item_text, unknown_item
+from busmaster.bus.parameters import Parameter
 from busmaster.bus.points import Point
 from busmaster.bus.requester import SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -14,6 +16,8 @@ from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write, is_sendable
 from busmaster.protocols.mentor.handle import ParameterHandle
 
+REACHED_BY = {(11, 23): "serial address", (11, 24): "serial mode", (11, 25): "baud rate"}
+"""Of Unidrive and Commander."""
 FORM = "a parameter such as 1.21, or 1.21:8 for a run of 8"
 
 
@@ -70,6 +74,13 @@ class CtAnsiDrive(ParameterHandle):
                 raise VerifyFailed(
                     f"{name} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
+
+    @classmethod
+    def _known(cls) -> Mapping[tuple[int, int], Parameter]:
+        return {
+            place: Parameter(item=f"{place[0]}.{place[1]:02d}", kept=f"the drive is reached by it: {what}")
+            for place, what in REACHED_BY.items()
+        }
 
     def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))

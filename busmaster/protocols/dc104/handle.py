@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, ClassVar, Unpack, overload
 
 from busmaster.bus.handle import Handle, Send, checked_count, encoder, item_text, read_each, unknown_item
+from busmaster.bus.parameters import Parameter
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -101,6 +103,10 @@ class Dc104Drive(Handle):
     def _prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         return lambda: self.write(int(item), value, **options)
+
+    def _listed(self) -> Iterable[Parameter]:
+        """Return every number that the drive can have: what they mean is not published."""
+        return (Parameter(item=str(number)) for number in range(self._minimum, self._maximum + 1))
 
     def _read(self, parameter: int) -> Read:
         return Read(parameter, self._maximum, self._minimum)

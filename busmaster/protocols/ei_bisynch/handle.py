@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from copy import copy
 from decimal import ROUND_HALF_UP, Decimal
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar, Self, Unpack
 
 from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
+from busmaster.bus.parameters import FIRST, USUAL, Parameter
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal, whole_number
@@ -24,7 +26,15 @@ from busmaster.protocols.ei_bisynch.codec import (
     check_name,
     is_sendable,
 )
-from busmaster.protocols.ei_bisynch.parameters import LAST_ERROR, NAMED, TAG, error_text, mnemonic_of_tag
+from busmaster.protocols.ei_bisynch.parameters import (
+    LAST_ERROR,
+    MANUAL,
+    NAMED,
+    PARAMETERS,
+    TAG,
+    error_text,
+    mnemonic_of_tag,
+)
 
 FORM = "a mnemonic such as PV, 1PV of channel 1, tag247, SW:hex to write hexadecimal, PV,SL,OP as one run, or a name"
 HEX = ":hex"
@@ -46,6 +56,7 @@ class BisynchInstrument(Handle):
     """
 
     profile: ClassVar[Profile] = PROFILE
+    _identity = ("II", "V0")
 
     def __init__(
         self,
@@ -155,6 +166,23 @@ class BisynchInstrument(Handle):
         if number == first or not is_decimal(number):
             raise InvalidCommand(f"several values begin at a tag, such as tag247, not at {item!r}")
         return tuple(f"{TAG}{int(number) + i}{colon}{kind}" for i in range(count))
+
+    def _listed(self) -> Iterable[Parameter]:
+        """Return what the documents name: an instrument has a part of it. The mode is written first."""
+        for one in PARAMETERS:
+            yield Parameter(
+                item=one.item,
+                name=one.name,
+                unit=one.unit,
+                access=one.access,
+                kept=one.kept,
+                stage=FIRST if one is MANUAL else USUAL,
+            )
+
+    def _plain(self) -> Self:
+        plain = copy(self)
+        plain._decimals = {}
+        return plain
 
     def _read(self, name: str) -> Read:
         return Read(name, self._printable_check)

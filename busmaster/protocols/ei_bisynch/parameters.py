@@ -52,6 +52,8 @@ class Parameter:
     access: Access = ""
     unit: str = ""
     hexadecimal: bool = False
+    kept: str = ""
+    """Why a load of parameters never writes it."""
 
     @property
     def documented(self) -> Item:
@@ -59,17 +61,26 @@ class Parameter:
         return Item(self.name, self.item, self.meaning, self.unit, self.access)
 
 
+REACHED_BY = "the drive may be reached by this port: change it at the drive"
+MANUAL = Parameter("manual", "mA", "0: automatic, 1: manual")
+"""In manual mode the output level can be written."""
 PARAMETERS = (
     # of both families
     Parameter("identity", "II", "identity of the instrument, hexadecimal digits on the line", "read"),
     Parameter("software_version", "V0", "version of its software", "read"),
-    Parameter("last_error", "EE", "last error of the communication; writing any value clears it", hexadecimal=True),
+    Parameter(
+        "last_error",
+        "EE",
+        "last error of the communication; writing any value clears it",
+        hexadecimal=True,
+        kept="it is the last error, which a write clears",
+    ),
     # of the 2000 series
     Parameter("process_value", "PV", "process value", "read"),
     Parameter("target_setpoint", "SL", "target setpoint"),
     Parameter("working_setpoint", "SP", "working setpoint", "read"),
     Parameter("output_power", "OP", "output level; writable in manual mode", unit="%"),
-    Parameter("manual", "mA", "0: automatic, 1: manual"),
+    MANUAL,
     Parameter("heater_current", "LI", "heater current, with PDSIO mode 2", "read"),
     Parameter("identification", "ID", "identification number, set by the customer"),
     Parameter("proportional_band", "XP", "proportional band"),
@@ -77,8 +88,8 @@ PARAMETERS = (
     Parameter("derivative_time", "TD", "derivative time"),
     Parameter("setpoint_rate", "RR", "rate limit of the setpoint"),
     # of the 590+
-    Parameter("port_mode", "tag130", "protocol of the port P3"),
-    Parameter("port_baud_rate", "tag198", "baud rate of the port P3"),
+    Parameter("port_mode", "tag130", "protocol of the port P3", kept=REACHED_BY),
+    Parameter("port_baud_rate", "tag198", "baud rate of the port P3", kept=REACHED_BY),
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
 ITEMS = (

@@ -38,7 +38,9 @@ def axis_elements(axis: int) -> list[Element[object]]:
 
 
 INPUTS = Element("inputs", 220, bits, "digital inputs, bank 0", keyword="IN")
-OUTPUTS = Element("outputs", 222, bits, "digital outputs, bank 0", keyword="OUT", writable=True)
+OUTPUTS = Element(
+    "outputs", 222, bits, "digital outputs, bank 0", keyword="OUT", writable=True, kept="it switches outputs"
+)
 ANALOG = [
     Element(f"adc{channel}", 224 + channel, float, f"analogue input {channel}", keyword=f"ADC({channel})")
     for channel in range(ANALOG_INPUTS)

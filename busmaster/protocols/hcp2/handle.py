@@ -25,6 +25,7 @@ class Hcp2Controller(CommsHandle):
     _read_command = hcp2.Read
     _write_command = hcp2.Write
     elements = comms_array.ELEMENTS
+    _identity = (comms_array.FIRMWARE.name,)
     _form = "an element number, 1 to 255, or a name such as axis0.position"
 
     def axis(self, number: int) -> Axis:

@@ -64,7 +64,15 @@ def status_word(value: float) -> StatusWord:
 POSITION = Element("position", 100, float, "position", "counts")
 AXIS_ERROR = Element("axis_error", 103, bits, "errors of the axis, a bitmap")
 FOLLOWING_ERROR = Element("following_error", 107, float, "how far the position is behind its demand", "counts")
-COMMAND_WORD = Element("command_word", 108, command_word, "what the drive is told", writable=True, bits=COMMAND_BITS)
+COMMAND_WORD = Element(
+    "command_word",
+    108,
+    command_word,
+    "what the drive is told",
+    writable=True,
+    bits=COMMAND_BITS,
+    kept="it enables the drive",
+)
 STATUS_WORD = Element("status_word", 109, status_word, "what the drive does", bits=STATUS_BITS)
 DRIVE_ERROR = Element("drive_error", 110, bits, "errors of the drive, a bitmap")
 DEMAND_POSITION = Element("demand_position", 111, float, "position demand", "counts")

@@ -41,6 +41,7 @@ class MicroFlexDrive(CommsHandle):
     _write_command = hcp2.Write
     elements = microflex.ELEMENTS
     _definite = True
+    _identity = (microflex.FIRMWARE.name,)
     _form = "an element number, 1 to 255, or a name such as speed_measured"
 
     position = Named(microflex.POSITION)
@@ -74,6 +75,11 @@ class MicroFlexDrive(CommsHandle):
     async def status(self, **options: Unpack[ReadOptions]) -> StatusWord:
         """Return the status word."""
         return await self.status_word.read(**options)
+
+    async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
+        """Return that the drive is enabled, as its status word says; "" if it is not."""
+        status = await self.status(**options)
+        return "its status word says ENABLED" if StatusWord.ENABLED in status else ""
 
     async def check_firmware(self, **options: Unpack[ReadOptions]) -> int:
         """Return the drive's firmware build. Raises VerifyFailed if it is too old to have this map."""

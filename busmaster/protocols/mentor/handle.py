@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import Any, ClassVar, NamedTuple, TypeVar, Unpack, overload
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar, Unpack, overload
 
 from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
+from busmaster.bus.parameters import LAST, USUAL, Parameter, Value
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal, whole_number
@@ -19,12 +21,19 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
-from busmaster.protocols.mentor.parameters import NAMED, WIDE
+from busmaster.protocols.mentor.parameters import NAMED, PARAMETERS, WIDE
 
 T = TypeVar("T")
 
 _BEYOND_ANY_FORM = 1e9
+FINE = 10
+"""Steps of the high resolution to one of the ordinary."""
 MOST_DECIMALS = 9
+MENUS = NUMBERS = range(100)
+"""The document has no list: any of these may be a parameter of the drive."""
+STORE = 0
+"""The number in each menu that is a command to the drive, such as to store its parameters."""
+LARGEST_WITH_SIGN = 9999
 FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, 1.17:20 for a run of 20, or a name"
 
 
@@ -115,6 +124,28 @@ class ParameterHandle(Handle):
     async def _read_one(self, item: str, options: ReadOptions) -> float:
         return await self.node.request(self._read_command(*self._place_of(item)), **options)
 
+    @classmethod
+    def _known(cls) -> Mapping[tuple[int, int], Parameter]:
+        """Return what a document says of parameters, by their places."""
+        return {}
+
+    def _listed(self) -> Iterable[Parameter]:
+        """Return every menu and number: the drive replies to those that it does not have, and they are left out.
+
+        The command of each menu is written last.
+        """
+        known = self._known()
+        for place in ((menu, number) for menu in MENUS for number in NUMBERS):
+            stage = LAST if place[1] == STORE else USUAL
+            yield known.get(place) or Parameter(item=f"{place[0]}.{place[1]:02d}", stage=stage)
+
+    def _plain(self) -> Self:
+        if not self._decimals:
+            return self
+        plain = copy(self)
+        plain._decimals = {}
+        return plain
+
     async def _read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
         """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
         parameter, _, count = item_text(item).partition(":")
@@ -202,6 +233,29 @@ class MentorDrive(ParameterHandle):
     def _run_point(self, item: str, run: ReadRun) -> Point[tuple[float, ...]]:
         decimals = tuple(self._decimals.get(parameter) for parameter in places_of(run))
         return ScaledPoint(self.node, item, run, decode=lambda sent: self._values_of(run, sent), decimals=decimals)
+
+    @classmethod
+    def _known(cls) -> Mapping[tuple[int, int], Parameter]:
+        return {
+            one.place: Parameter(
+                item=f"{one.menu}.{one.number:02d}",
+                name=one.name,
+                unit=one.unit,
+                access=one.access,
+                decimals=one.decimals,
+                kept=one.kept,
+            )
+            for one in PARAMETERS
+        }
+
+    @classmethod
+    def _same(cls, item: str, one: Value, other: Value) -> bool:
+        # a reply has five characters always, and so not the tenths that were written
+        return abs(one - other) < FINE if item.endswith(":hires") else one == other
+
+    def _written_item(self, item: str, before: Value, value: Value) -> str:
+        """Return the item as a wide one where the value before, or this one, has no other form."""
+        return f"{item}:wide" if ":" not in item and max(before, value) > LARGEST_WITH_SIGN else item
 
     async def _read_one(self, item: str, options: ReadOptions) -> float:
         place = self._place(item)

@@ -23,6 +23,8 @@ class Parameter:
     access: Access = ""
     decimals: int = 0
     wide: bool = False
+    kept: str = ""
+    """Why a load of parameters never writes it."""
 
     @property
     def place(self) -> tuple[int, int]:
@@ -36,13 +38,14 @@ class Parameter:
         return Item(self.name or number, number, self.meaning, self.unit, self.access, decimals=self.decimals)
 
 
+REACHED_BY = "the drive is reached by it: change it at the drive"
 SPEED_REFERENCE_1 = Parameter(
     1, 17, "speed reference 1, of the maximum speed", "speed_reference_1", "%", "read/write", decimals=1
 )
 PARAMETERS = (
     SPEED_REFERENCE_1,
-    Parameter(11, 11, "the drive's address on the line, 1 to 99", "serial_address"),
-    Parameter(11, 13, "mode of the serial port; 4 is wide integers", "serial_mode"),
+    Parameter(11, 11, "the drive's address on the line, 1 to 99", "serial_address", kept=REACHED_BY),
+    Parameter(11, 13, "mode of the serial port; 4 is wide integers", "serial_mode", kept=REACHED_BY),
     *(
         Parameter(menu, number, "a wide integer, 0 to 65535", access="read/write", wide=True)
         for menu, number in ((13, 14), (15, 60), (15, 61), (15, 62), (15, 63))

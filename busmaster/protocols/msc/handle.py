@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NoReturn, Unpack, overload
 
 from busmaster.bus.handle import Handle, Send, checked_count, encoder, item_text, unknown_item
+from busmaster.bus.parameters import Parameter
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, Priority, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
@@ -287,7 +288,17 @@ class MscController(Handle):
         """Return the macroprogram status word."""
         return await self.node.request(ReadStatus(), **options)
 
+    async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
+        """Return that the program runs, which uses the data, as its status word says; "" if it does not."""
+        running = ProgramStatus.PROGRAM_RUNNING in await self.status(**options)
+        return "its status word says PROGRAM_RUNNING" if running else ""
+
     # inside
+
+    def _listed(self) -> Iterable[Parameter]:
+        """Return the symbols of the program, by their addresses: the document lists no data."""
+        names = {address: name for name, address in self.symbols.items()}
+        return (Parameter(item=str(address), name=names[address]) for address in sorted(names))
 
     @property
     def _merging(self) -> Merging:

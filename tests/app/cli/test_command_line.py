@@ -14,6 +14,7 @@ from busmaster.emulator.serve import TcpServer
 from busmaster.registry import kinds
 from tests.app.cli.conftest import Command, serve
 
+SIDE = "FILE.toml|NODE@PORT|NODE@LINE.toml"
 PROMISED = {
     "demo": "[--seconds S] [--plain]",
     "read": "PORT|LINE.toml [--protocol P] [--node N] ITEM... [--json]",
@@ -41,6 +42,11 @@ PROMISED = {
     "points": "LINE.toml [--csv] [--from CSV]",
     "items": "PROTOCOL [WORD]... [--json]",
     "discover": "PORT [--yes] [--output LINE.toml]",
+    "params": "",
+    "params save": "PORT|LINE.toml [--protocol P] [NODE] --output FILE.toml [--items ITEM,ITEM...]",
+    "params diff": f"{SIDE} {SIDE} [--protocol P] [--items ITEM,ITEM...] [--json]",
+    "params load": "FILE.toml NODE@PORT|NODE@LINE.toml [--protocol P] [--dry-run] [--yes] [--enabled]"
+    " [--undo FILE.toml]",
 }
 """What follows each command; options in brackets may be left out."""
 CAPTURE = "[--capture FILE] [--capture-mb MB] [--capture-files N]"
@@ -59,6 +65,7 @@ BESIDE = {
     "opcua": "[--allow POINT] [--token-file FILE] [--certificate FILE] [--key FILE] [--trusted FOLDER]",
     "safe": f"{CAPTURE} [--port PORT]",
     "bench": NODE,
+    **dict.fromkeys(("params save", "params diff", "params load"), f"{CAPTURE} {NODE}"),
     "discover": f"{CAPTURE} [--protocol P] [--nodes N-M,K]",
 }
 """What a line, a node, a recording or an interface takes besides."""
@@ -74,7 +81,10 @@ def promised(name: str) -> set[str]:
 def found(name: str) -> Iterator[str]:
     """The same words, of the command as it is."""
     context = click.Context(cli)
-    command = cli.get_command(context, name)
+    command: click.Command | None = cli
+    for part in name.split():
+        assert isinstance(command, click.Group)
+        command = command.get_command(context, part)
     assert command is not None
     for parameter in command.get_params(context):
         word = parameter.make_metavar(context)
@@ -88,7 +98,9 @@ def found(name: str) -> Iterator[str]:
 
 
 def test_the_commands_are_those_that_are_promised() -> None:
-    assert set(cli.list_commands(click.Context(cli))) == set(PROMISED)
+    found = {name: cli.get_command(click.Context(cli), name) for name in cli.list_commands(click.Context(cli))}
+    groups = {name: list(group.commands) for name, group in found.items() if isinstance(group, click.Group)}
+    assert {*found, *(f"{name} {one}" for name, names in groups.items() for one in names)} == set(PROMISED)
     assert set(kinds()) >= SPOKEN
 
 

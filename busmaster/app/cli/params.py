@@ -1,0 +1,541 @@
+"""`busmaster params`: the parameters of a node saved to a file, compared, and written to a node."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AsyncExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+
+import click
+
+from busmaster import Bus, Priority, ext
+from busmaster.app.cli.app import FAILED, OK, bus_error_text
+from busmaster.app.cli.arguments import Connection, connected, json_option
+from busmaster.app.cli.capturing import capturing
+from busmaster.app.cli.ending import until_ended
+from busmaster.app.cli.late import late_nodes
+from busmaster.app.cli.lines import is_line_file, keep, load
+from busmaster.app.cli.output import Level, columns, emit, json_line, note, value_text
+from busmaster.app.cli.parsing import option_type, parse_items
+from busmaster.app.cli.protocols import ItemCommand, NodeCommand
+from busmaster.app.cli.reaching import owner_of, reach, tell_owner
+from busmaster.app.config.parameter_sets import (
+    PART,
+    PartFile,
+    SetFile,
+    check_new,
+    in_unit,
+    line_parameters,
+    read_set,
+    write_set,
+)
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.service.authorisation import Wish
+from busmaster.app.service.record import WriteRecord, this_user
+from busmaster.app.service.remote import RemoteBus, connect
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.ext import (
+    Change,
+    Found,
+    Handle,
+    Left,
+    Outcome,
+    Parameter,
+    ParameterLoad,
+    ParameterSet,
+    Result,
+    Send,
+    Value,
+    empty_set,
+    is_decimal,
+    meant,
+    walk,
+)
+from busmaster.registry import NodeKind, find
+
+DIFFERENT = 1
+AT = "@"
+NODE_AT = "NODE@PORT|NODE@LINE.toml"
+items_option = click.option(
+    "--items",
+    type=option_type(parse_items),
+    metavar="ITEM,ITEM...",
+    help="These alone; 1.17:20 is 20 from there on. By default all that the protocol's document and LINE.toml list.",
+)
+
+
+class Subcommands(click.Group):
+    """A group that says which command was meant."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that the arguments name. Raises UsageError, with what was meant, for a name that is none."""
+        if args and not args[0].startswith("-") and args[0] not in self.commands:
+            raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], self.commands)}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+@click.group(short_help="Save, compare and load the parameters of a node.", cls=Subcommands)
+def command() -> None:
+    """Save the parameters of a node to a file, compare files and nodes, and write a file to a node.
+
+    Each of the three says more with --help.
+    """
+
+
+# nodes and their lines
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A node: a handle without decimals of its own, and what is known of its parameters.
+
+    `line` is that of its LINE.toml, None for a node of a PORT; `name` is what the file calls it. `owned`: the bus is
+    that of the program that owns the line.
+    """
+
+    kind: NodeKind
+    bus: Bus | RemoteBus
+    handle: Handle
+    line: ConfiguredLine | None = None
+    name: str = ""
+    owned: bool = False
+
+    @property
+    def label(self) -> str:
+        return self.handle.node.label
+
+    def parameters(self, items: Sequence[str] | None = None) -> tuple[Parameter, ...]:
+        """Return its parameters, or those of `items`. Raises InvalidCommand if there are none."""
+        if self.line is None:
+            return self.handle.parameters(items or ())
+        return line_parameters(self.line, self.name, self.handle, items or ())
+
+    def known(self) -> tuple[Parameter, ...]:
+        """Return its parameters, none if there is no list."""
+        try:
+            return self.parameters()
+        except InvalidCommand:
+            return ()
+
+    def prepare(self, item: str, value: Value) -> Send:
+        """Return what writes a value, in the background. Raises InvalidCommand for one beyond a limit of the file."""
+        if self.line is not None and self.owned:
+            ext.prepare_write(ext.plain_handle(self.line.nodes[self.name]), item, [value])  # its owner has limits too
+        [send] = ext.prepare_write(self.handle, item, [value], priority=Priority.BACKGROUND)
+        return send
+
+    @contextmanager
+    def recorded(self, change: Change) -> Iterator[None]:
+        """Keep a record of a write, where no owner does."""
+        if self.line is None or self.owned:
+            yield
+            return
+        parameter = change.parameter
+        name = parameter.name if parameter.name in self.line.file.nodes[self.name].points else parameter.item
+        wish = Wish(
+            interface="command line",
+            by="busmaster params load",
+            name=f"{self.name}/{name}",
+            point=self.line.point(f"{self.name}/{name}"),
+            value=in_unit(parameter, change.value, self.kind),
+        )
+        with self.line.authorisation.begin(wish):
+            yield
+
+
+@dataclass
+class Lines:
+    """The lines of the nodes of one command: a line is opened once, though two of its nodes are compared."""
+
+    buses: dict[str, Bus | RemoteBus] = field(default_factory=dict)
+    files: dict[str, ConfiguredLine] = field(default_factory=dict)
+
+    def target(self, connection: Connection, node: str) -> Target:
+        """Return a node. Raises UsageError or InvalidCommand for one that does not exist."""
+        port = connection.port
+        if is_line_file(port):
+            return self._of_file(connection, node)
+        if node and not is_decimal(node):
+            raise click.UsageError(f"a node of a port is named by its address, not {node!r}")
+        address = connection.one_address(int(node) if node else None)
+        bus = self.buses.get(port) or self.buses.setdefault(port, reach(connection))
+        return Target(find(connection.protocol), bus, ext.plain_handle(connection.open_handle(bus, address)))
+
+    def _of_file(self, connection: Connection, node: str) -> Target:
+        port = connection.port
+        if port not in self.files:
+            file = load(port)
+            owner = owner_of(file.port)
+            if owner is not None and connection.capture is not None:
+                raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+            recording = capturing(connection.capture, port=file.port.name, echo=file.port.echo)
+            recorder = click.get_current_context().with_resource(recording)
+            self.files[port] = ConfiguredLine(file, outputs=False, tap=recorder)
+            self.buses[port] = self.files[port].bus if owner is None else connect(owner.address)
+            if owner is not None:
+                tell_owner(owner)
+        line, bus = self.files[port], self.buses[port]
+        if node not in line.nodes:
+            raise click.UsageError(f"{port} has no node {node!r}; {meant(node, line.nodes)}")
+        owned = bus is not line.bus
+        handle = ext.plain_handle(line.handle(node, bus if owned else None))
+        return Target(line.file.nodes[node].kind, bus, handle, line, node, owned)
+
+
+def split(text: str) -> tuple[str, str]:
+    """Return the node and the port or file of NODE@PORT. Raises UsageError."""
+    node, at, where = text.partition(AT)
+    if not at or not where:
+        raise click.UsageError(f"a node is written {NODE_AT}, like winder@line.toml, not {text!r}")
+    return node, where
+
+
+def me() -> str:
+    """Return who saves."""
+    return f"{this_user()}@{platform.node()}"
+
+
+def text_of(parameter: Parameter, value: Value | None, kind: NodeKind) -> str:
+    """Return a value in its unit; "-" for none."""
+    return "-" if value is None else value_text(in_unit(parameter, value, kind))
+
+
+def called(parameter: Parameter) -> str:
+    """Return item and name of a parameter."""
+    return f"{parameter.item} ({parameter.name})" if parameter.name else parameter.item
+
+
+# saving
+
+
+@command.command("save", short_help="Save the parameters of a node to a file.", cls=ItemCommand)
+@partial(connected, or_file=True)
+@click.argument("node", required=False, metavar="[NODE]")
+@click.option("-o", "--output", required=True, metavar="FILE.toml", help="The file to write.")
+@items_option
+def save_command(connection: Connection, node: str | None, output: str, items: tuple[str, ...] | None) -> int:
+    """Read all parameters of a node and write them to a file: item, name, value, unit, range, and of which node.
+
+    NODE is the name of a node in LINE.toml, or an address on PORT; it is left out where the protocol has no addresses.
+    The reads are in the background of other traffic. Parameters that the node does not have are left out.
+
+    What was read is kept in FILE.toml.part: if the command is interrupted, the same command goes on from there.
+    FILE.toml is written at the end, as a whole. Where another busmaster owns the line, the reads go through it.
+    """
+    parsed_output(output)
+    target = Lines().target(connection, node or "")
+    return until_ended(save, target, target.parameters(items), output)
+
+
+def parsed_output(path: str) -> None:
+    """Raise UsageError for a file that exists."""
+    try:
+        check_new(path)
+    except InvalidCommand as error:
+        raise click.UsageError(str(error)) from None
+
+
+async def save(target: Target, parameters: Sequence[Parameter], path: str) -> int:
+    """Read the parameters and write the file. Raises BusError for a node that does not reply; what was read is kept."""
+    from busmaster.app.cli.progress import Bar  # it takes a fifth of the time of --help
+
+    read = 0
+    try:
+        async with target.bus, late_nodes(target.bus, in_file=target.line is not None):
+            empty = await empty_set(target.handle, me())
+            with PartFile(path, empty, parameters, target.kind) as part, Bar(target.label, len(parameters)) as bar:
+                read = len(parameters) - len(part.missing)
+                if read:
+                    note(f"{path}{PART}: {read} of {len(parameters)} were read before; going on")
+                bar.advance(read)
+                async for found in walk(target.handle, part.missing):
+                    part.add(found)
+                    read += 1
+                    bar.advance()
+    except BaseException:
+        if read:
+            note(f"{read} of {len(parameters)} are in {path}{PART}: the same command goes on from there", Level.NOTICE)
+        raise
+    done = part.finish()
+    gaps = sum(one.gap for one in part.gaps.values())
+    note(f"{path}: {len(done.entries)} parameters of {target.label}; {gaps} that it does not have are left out")
+    unread = [one for one in part.gaps.values() if not one.gap]
+    for one in unread:
+        note(f"{called(one.parameter)} is not in it: {one.why}", Level.WARNING)
+    return FAILED if unread else OK
+
+
+# comparing
+
+
+@command.command("diff", short_help="Compare two files, or a file and a node.", cls=NodeCommand)
+@partial(connected, or_file=True, port=False)
+@click.argument("one", metavar=f"FILE.toml|{NODE_AT}")
+@click.argument("other", metavar=f"FILE.toml|{NODE_AT}")
+@items_option
+@json_option
+def diff_command(
+    connection: Callable[[str], Connection], one: str, other: str, items: tuple[str, ...] | None, as_json: bool
+) -> int:
+    """Print the parameters that differ between two files, two nodes, or a file and a node, a line each.
+
+    The exit status is 0 if all are equal, 1 if some differ, and 2 if they could not be compared. Of a node that is
+    compared with a file, the parameters of the file are read.
+    """
+    lines = Lines()
+    sides = [side(lines, connection, text) for text in (one, other)]
+    kinds = [each.kind for each in sides]
+    if kinds[0] is not kinds[1]:
+        raise click.UsageError(f"{one} is of a {kinds[0].name}, {other} of a {kinds[1].name}: their items differ")
+    try:
+        return until_ended(diff, lines, sides, items, as_json)
+    except BusError as error:
+        raise click.ClickException(bus_error_text(error)) from error
+
+
+def side(lines: Lines, connection: Callable[[str], Connection], text: str) -> SetFile | Target:
+    """Return a file that was read, or a node."""
+    if os.path.isfile(text) or AT not in text:
+        return read_set(text)
+    node, where = split(text)
+    return lines.target(connection(where), node)
+
+
+async def diff(lines: Lines, sides: Sequence[SetFile | Target], items: Sequence[str] | None, as_json: bool) -> int:
+    """Print the differences and return the exit status."""
+    files = [each.set for each in sides if isinstance(each, SetFile)]
+    async with AsyncExitStack() as opened:
+        for bus in lines.buses.values():
+            await opened.enter_async_context(bus)
+            await opened.enter_async_context(late_nodes(bus))
+        one, other = [each.set if isinstance(each, SetFile) else await read(each, files, items) for each in sides]
+    kind = sides[0].kind
+    wanted: set[str] | None = None
+    if items is not None:
+        wanted = {parameter.item for each in sides if isinstance(each, Target) for parameter in each.parameters(items)}
+        wanted = wanted or set(items)
+    found = [each for each in kind.handle.differences(one, other) if wanted is None or each.parameter.item in wanted]
+    for item in one.identity.keys() & other.identity.keys():
+        if one.identity[item] != other.identity[item]:
+            note(f"{item} is {value_text(one.identity[item])} and {value_text(other.identity[item])}", Level.WARNING)
+    rows = [
+        (
+            each.parameter.item,
+            each.parameter.name,
+            text_of(each.parameter, each.one, kind),
+            text_of(each.parameter, each.other, kind),
+            each.parameter.unit,
+        )
+        for each in found
+    ]
+    if as_json:
+        for each in found:
+            values = [None if v is None else in_unit(each.parameter, v, kind) for v in (each.one, each.other)]
+            fields = {"item": each.parameter.item, "name": each.parameter.name or None, "unit": each.parameter.unit}
+            emit(json_line(**fields, one=values[0], other=values[1]))
+    elif rows:
+        emit(*columns([("ITEM", "NAME", "ONE", "OTHER", "UNIT"), *rows], right=(2, 3)))
+    return DIFFERENT if found else OK
+
+
+async def read(target: Target, files: Sequence[ParameterSet], items: Sequence[str] | None) -> ParameterSet:
+    """Read a node: what a file has that it is compared with, else all its parameters."""
+    from busmaster.app.cli.progress import Bar
+
+    if files and items is None:
+        own = {one.item: one for one in target.known()}
+        parameters = [own.get(item, entry.parameter) for item, entry in files[0].entries.items()]
+    else:
+        parameters = list(target.parameters(items))
+    with Bar(target.label, len(parameters)) as bar:
+
+        def progress(found: Found) -> None:
+            bar.advance()
+
+        return await target.handle.save_parameters(parameters, progress=progress, by=me())
+
+
+# loading
+
+
+@command.command("load", short_help="Write the parameters of a file to a node.", cls=NodeCommand)
+@partial(connected, or_file=True, port=False)
+@click.argument("path", metavar="FILE.toml", type=click.Path(exists=True, dir_okay=False))
+@click.argument("node", metavar=NODE_AT)
+@click.option("--dry-run", is_flag=True, help="Print what would be written, and write nothing.")
+@click.option("--yes", is_flag=True, help="Write without asking first.")
+@click.option("--enabled", is_flag=True, help="Write to a drive that is enabled or runs, too.")
+@click.option(
+    "--undo",
+    metavar="FILE.toml",
+    help="Where to save what is overwritten; by default beside FILE.toml, with the time.",
+)
+def load_command(
+    connection: Callable[[str], Connection],
+    path: str,
+    node: str,
+    dry_run: bool,
+    yes: bool,
+    enabled: bool,
+    undo: str | None,
+) -> int:
+    """Write to a node what differs from the file, after one question, and print `ITEM ok` for each.
+
+    Parameters are written in the order of the protocol's document, a mode before all others and a command that stores
+    them after all others; each is read back. What the document or LINE.toml calls read-only, and what the node is
+    reached by, is not written. What cannot be written is named with the reason, and the exit status is 1.
+
+    What is overwritten is saved first, to a file that the same command loads again. A drive that is enabled is refused
+    unless --enabled is given; where its protocol does not tell, a message says so. The limits of LINE.toml hold, and
+    its outputs keep a record of each write. If the line is lost meanwhile, the same command writes what is left.
+    """
+    wanted = read_set(path)
+    name, where = split(node)
+    target = Lines().target(connection(where), name)
+    wanted.check(target.handle)
+    undo = undo or default_undo(path)
+    parsed_output(undo)
+    if not (yes or dry_run) and not sys.stdin.isatty():
+        raise click.UsageError("nobody can be asked here, so nothing was sent: say --yes, or --dry-run")
+    return until_ended(write, target, wanted, dry_run, yes, enabled, undo, node)
+
+
+def default_undo(path: str) -> str:
+    """Return the name of a file beside a set for what a load of it overwrites."""
+    return f"{path.removesuffix('.toml')}.undo-{datetime.now(UTC):%Y%m%dT%H%M%S}.toml"
+
+
+async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabled: bool, undo: str, node: str) -> int:
+    """Write the differences of a set to a node, and return the exit status."""
+    records: list[WriteRecord] = []
+    audit = None
+    if target.line is not None and not target.owned:
+        audit = target.line.audit(note)  # first: nothing is written of which no record can be kept
+        target.line.authorisation.record = records.append
+    try:
+        async with target.bus, late_nodes(target.bus, in_file=target.line is not None):
+            if not dry_run and not await may_be_written(target, enabled):
+                return FAILED
+            plan = await prepare(target, wanted.set)
+            tell_plan(plan, target)
+            status = FAILED if any(not left.expected for left in plan.left) else OK
+            if dry_run or not plan.changes:
+                return status
+            if not yes:
+                if not await agreed(f"Write {len(plan.changes)} parameters to {target.label}?"):
+                    note("nothing was written")
+                    return FAILED
+                if not await may_be_written(target, enabled, again=True):
+                    return FAILED
+            write_set(undo, plan.undo, target.kind)
+            note(f"what is overwritten is in {undo}: `busmaster params load {undo} {node}` writes it again")
+            return max(status, await carry_out(plan, target))
+    finally:
+        if audit is not None:
+            await keep(audit, records)
+
+
+async def may_be_written(target: Target, enabled: bool, *, again: bool = False) -> bool:
+    """Return whether the node is at rest, or is to be written to in any case; say so if it is not, or does not tell.
+
+    `again`: it was asked before, and nothing that was said then is repeated.
+    """
+    why = await target.handle.in_operation(priority=Priority.BACKGROUND)
+    if why is None and not enabled and not again:
+        kind = target.kind.name
+        note(f"{target.label}: {kind} does not tell whether it is enabled: make sure that it is not", Level.WARNING)
+    elif why and not (again and enabled):
+        level = Level.WARNING if enabled else Level.ERROR
+        advice = "" if enabled else "; nothing was written: stop it first, or say --enabled"
+        note(f"{target.label} is in operation: {why}{advice}", level)
+    return enabled or not why
+
+
+async def prepare(target: Target, wanted: ParameterSet) -> ParameterLoad:
+    """Read what the node holds of a set."""
+    plan = await target.handle.prepare_load(wanted, parameters=target.known(), prepare=target.prepare, by=me())
+    for item, value in wanted.identity.items():
+        now = plan.undo.identity.get(item)
+        if now is not None and now != value:
+            note(f"{item} of {target.label} is {value_text(now)}, in the file {value_text(value)}", Level.WARNING)
+    return plan
+
+
+def tell_plan(plan: ParameterLoad, target: Target) -> None:
+    """Print what is to be written, and what is not and why."""
+    rows = [
+        (
+            each.parameter.item,
+            each.parameter.name,
+            text_of(each.parameter, each.before, target.kind),
+            text_of(each.parameter, each.value, target.kind),
+            each.parameter.unit,
+        )
+        for each in plan.changes
+    ]
+    if rows:
+        emit(*columns([("ITEM", "NAME", "NOW", "FILE", "UNIT"), *rows], right=(2, 3)))
+    for left in plan.left:
+        note(left_text(left, target.kind), Level.INFO if left.expected else Level.WARNING)
+    note(
+        f"{target.label}: {len(rows)} to be written, {plan.equal} are as in the file, {len(plan.left)} are not written"
+    )
+
+
+def left_text(left: Left, kind: NodeKind) -> str:
+    """Return why a parameter is not written."""
+    now, value = (text_of(left.parameter, one, kind) for one in (left.before, left.value))
+    return f"{called(left.parameter)} is not written ({now}, in the file {value}): {left.why}"
+
+
+async def agreed(question: str) -> bool:
+    """Return whether the user agrees. The line goes on meanwhile."""
+    os.write(sys.stderr.fileno(), f"{question} [y/N]: ".encode())
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[bytes] = loop.create_future()
+
+    def heard() -> None:
+        loop.remove_reader(sys.stdin.fileno())
+        if not answer.done():
+            answer.set_result(os.read(sys.stdin.fileno(), 1024))
+
+    loop.add_reader(sys.stdin.fileno(), heard)
+    try:
+        text = await answer
+    finally:
+        loop.remove_reader(sys.stdin.fileno())
+    return text.strip().lower() in (b"y", b"yes")
+
+
+async def carry_out(plan: ParameterLoad, target: Target) -> int:
+    """Write the changes, print what became of each, and return the exit status."""
+    outcomes: list[Outcome] = []
+    try:
+        async for outcome in plan.write(around=target.recorded):
+            outcomes.append(outcome)
+            if outcome.result is Result.WRITTEN:
+                emit(f"{outcome.change.parameter.item} ok")
+            else:
+                tell_failure(outcome)
+    finally:
+        # A signal, or an error that no one foresaw: none is left out.
+        for number, change in enumerate(plan.changes[len(outcomes) :]):
+            result = Result.UNCONFIRMED if number == 0 else Result.NOT_WRITTEN
+            tell_failure(Outcome(change, result, "the command was ended"))
+    written = sum(outcome.result is Result.WRITTEN for outcome in outcomes)
+    note(f"{target.label}: {written} of {len(plan.changes)} written")
+    return OK if written == len(plan.changes) else FAILED
+
+
+def tell_failure(outcome: Outcome) -> None:
+    """Say on standard error what became of a change that was not written."""
+    level = Level.CRITICAL if outcome.result is Result.UNCONFIRMED else Level.ERROR
+    note(f"{called(outcome.change.parameter)}: {outcome.result.value}: {outcome.why}", level)

@@ -1,0 +1,437 @@
+"""Parameter sets: what a node holds, item by item, to be saved, compared, and written to a node again."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from enum import Enum
+from math import isclose, isfinite
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias
+
+from busmaster.arbiter.transaction import BACKGROUND
+from busmaster.bus.points import Point
+from busmaster.bus.requester import Requester
+from busmaster.contract.exchange import Command
+from busmaster.contract.items import Access
+from busmaster.contract.profile import Profile
+from busmaster.errors import (
+    BusError,
+    GarbledReply,
+    InvalidCommand,
+    NoReply,
+    NoSuchParameter,
+    NotStarted,
+    Refused,
+    VerifyFailed,
+    WriteUnconfirmed,
+)
+
+Value: TypeAlias = bool | int | float
+
+FIRST, USUAL, LAST = -1, 0, 1
+"""When a load writes a parameter: before all others (a mode on which they depend), in the document's order, or after
+all others (a command that stores them)."""
+ROUNDS = 3
+"""How often a request is made that gets no reply while the node replies to others, each time with its retries. On a
+line that loses 2 % of all telegrams one request in some 10 000 fails, and a list may have as many parameters."""
+AT_A_TIME = 128
+"""Reads among which cheaper exchanges are looked for."""
+ROUNDING = 1e-12
+"""Relative difference of two numbers that are the same but for their conversion to and from a unit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """One parameter of a node.
+
+    `item` names it as the handle's `point` does, `name` is what people call it. `access` is what the document says,
+    empty where it says nothing. A number on the line stands for number / 10**decimals * factor + offset in `unit`;
+    `minimum` and `maximum` are in that unit. `kept` is the reason why a load never writes it, empty if it does.
+    `stage` says when a load writes it: FIRST, USUAL or LAST.
+    """
+
+    item: str
+    name: str = ""
+    unit: str = ""
+    access: Access = ""
+    decimals: int = 0
+    factor: float = 1
+    offset: float = 0
+    minimum: float | None = None
+    maximum: float | None = None
+    kept: str = ""
+    stage: int = USUAL
+
+
+class Entry(NamedTuple):
+    """A parameter and its value, as a handle without decimals reads it."""
+
+    parameter: Parameter
+    value: Value
+
+
+class Difference(NamedTuple):
+    """A parameter of two sets; None is the value of the set that does not have it."""
+
+    parameter: Parameter
+    one: Value | None
+    other: Value | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterSet:
+    """The parameters of one node at one time, by item, in the order of the document.
+
+    `protocol` is the name of the kind of node, as LINE.toml has it; `line` the name of the port; `identity` what the
+    node says of itself, by item, where its protocol has such items. `by` is who saved it.
+    """
+
+    protocol: str
+    address: int
+    label: str = ""
+    line: str = ""
+    saved: datetime
+    by: str = ""
+    identity: Mapping[str, Value] = field(default_factory=dict)
+    entries: Mapping[str, Entry] = field(default_factory=dict)
+
+
+class Found(NamedTuple):
+    """What came of reading one parameter: its value, or why there is none. `gap`: the node says that it has none."""
+
+    parameter: Parameter
+    value: Value | None = None
+    why: str = ""
+    gap: bool = False
+
+
+class Change(NamedTuple):
+    """What a load writes to one parameter."""
+
+    parameter: Parameter
+    before: Value
+    value: Value
+
+
+class Left(NamedTuple):
+    """A parameter that a load does not write, and why. `before` is None if it could not be read.
+
+    `expected`: the document or LINE.toml says that it is not written.
+    """
+
+    parameter: Parameter
+    before: Value | None
+    value: Value
+    why: str
+    expected: bool
+
+
+class Result(Enum):
+    """What became of one change."""
+
+    WRITTEN = "written"
+    """It was written and read back."""
+    REFUSED = "refused"
+    """The node, or a limit, refused it: the value is as before."""
+    DIFFERS = "differs"
+    """It was written, but something else was read back."""
+    UNCONFIRMED = "unconfirmed"
+    """It was sent, and it is not known what the node holds now."""
+    NOT_WRITTEN = "not written"
+    """Nothing was sent."""
+
+
+class Outcome(NamedTuple):
+    """A change, what became of it, and why."""
+
+    change: Change
+    result: Result
+    why: str = ""
+
+
+Prepare: TypeAlias = Callable[[str, Value], Callable[[], Awaitable[None]]]
+"""Returns what writes a value to an item. Raises InvalidCommand for one that may not be written."""
+Around: TypeAlias = Callable[[Change], AbstractContextManager[object]]
+"""What a change is written in: a record is kept of it."""
+
+
+class Holder(Protocol):
+    """What parameter sets need of a handle."""
+
+    profile: ClassVar[Profile]
+    node: Requester
+    _identity: ClassVar[tuple[str, ...]]
+
+    def point(self, item: str, /) -> Point[Any]: ...
+
+    def _plain(self) -> Holder: ...
+
+    @classmethod
+    def _same(cls, item: str, one: Value, other: Value) -> bool: ...
+
+    def _written_item(self, item: str, before: Value, value: Value) -> str: ...
+
+
+def alike(handle: type[Holder], item: str, one: Value, other: Value) -> bool:
+    """Return whether two values of an item are the same to a node of this kind."""
+    return isclose(one, other, rel_tol=ROUNDING) or handle._same(item, one, other)
+
+
+def differences(handle: type[Holder], one: ParameterSet, other: ParameterSet) -> Iterator[Difference]:
+    """Yield the parameters that are not alike in two sets of this kind of node, in the order of the first set.
+
+    Raises InvalidCommand for a set of another kind.
+    """
+    kind = handle.profile.kind_name
+    for each in (one, other):
+        if each.protocol != kind:
+            raise InvalidCommand(f"a set of a {each.protocol} cannot be compared with one of a {kind}")
+    for item, entry in one.entries.items():
+        found = other.entries.get(item)
+        if found is None or not alike(handle, item, entry.value, found.value):
+            yield Difference(entry.parameter, entry.value, None if found is None else found.value)
+    for item, entry in other.entries.items():
+        if item not in one.entries:
+            yield Difference(entry.parameter, None, entry.value)
+
+
+async def walk(handle: Holder, parameters: Sequence[Parameter]) -> AsyncIterator[Found]:
+    """Read parameters one after the other, and yield what comes of each, in the background of other traffic.
+
+    Where the node's profile merges reads, those that are merged come together. What the node refuses is a gap. Raises
+    the BusError of a node that does not reply any more, InvalidCommand for an item that does not exist.
+    """
+    handle = handle._plain()
+    merge = handle.node.profile.merge
+    commands = [handle.point(parameter.item).command for parameter in parameters]
+    for start in range(0, len(parameters), AT_A_TIME):
+        part = commands[start : start + AT_A_TIME]
+        left = dict.fromkeys(range(len(part)))
+        for batch in sorted(merge(part) if merge else (), key=lambda batch: -len(batch.serves)):
+            if not left.keys() >= set(batch.serves):
+                continue
+            try:
+                values = await _answer(handle.node, batch.command)
+            except (Refused, NoReply, GarbledReply):
+                continue  # one of them does not exist: they are read one by one
+            for index, raw in zip(batch.serves, values, strict=True):
+                del left[index]
+                yield _found(handle, parameters[start + index], raw)
+        for index in left:
+            yield await read_one(handle, parameters[start + index], part[index])
+
+
+async def read_one(handle: Holder, parameter: Parameter, command: Command[Any] | None = None) -> Found:
+    """Read one parameter. Raises as `walk`."""
+    handle = handle._plain()
+    command = handle.point(parameter.item).command if command is None else command
+    try:
+        return _found(handle, parameter, await _answer(handle.node, command))
+    except NoSuchParameter:
+        return Found(parameter, why="no such parameter", gap=True)
+    except Refused as refusal:
+        return Found(parameter, why=refusal.what, gap=True)
+    except (NoReply, GarbledReply) as error:
+        return Found(parameter, why=f"{error.what}, though the node replies to other reads")
+
+
+async def _answer(node: Requester, command: Command[Any]) -> Any:
+    """Return what a read returns. Raises NoReply or GarbledReply only of a node that replies to its probe."""
+    for turn in range(ROUNDS):
+        try:
+            return await node.request(command, priority=BACKGROUND)
+        except (NoReply, GarbledReply):
+            try:
+                await node.request(node.profile.probe, priority=BACKGROUND)
+            except Refused:
+                pass  # it replies
+            if turn == ROUNDS - 1:
+                raise
+    raise AssertionError
+
+
+def _found(handle: Holder, parameter: Parameter, raw: Any) -> Found:
+    try:
+        value = handle.point(parameter.item).value_of(raw)
+    except GarbledReply as error:
+        return Found(parameter, why=error.what)
+    if isinstance(value, bool):
+        return Found(parameter, value)
+    if isinstance(value, int):
+        return Found(parameter, int(value))  # of a word the number
+    if isinstance(value, float) and isfinite(value):
+        return Found(parameter, value)
+    return Found(parameter, why=f"it holds {value!r}, which is not one finite number")
+
+
+class ParameterLoad:
+    """What writing a set to a node comes to; nothing is written yet.
+
+    `changes` are the differences that `write` writes, in that order; `left` those that it does not write, each with the
+    reason. `equal` counts the parameters that the node holds already. `undo` has what the changes overwrite. Changes
+    are checked by `prepare` before the first is written.
+    """
+
+    def __init__(self, handle: Holder, before: ParameterSet, prepare: Prepare) -> None:
+        self.changes: tuple[Change, ...] = ()
+        self.left: tuple[Left, ...] = ()
+        self.equal = 0
+        self.undo = before
+        self._handle = handle
+        self._prepare = prepare
+
+    def _take(self, found: Iterable[tuple[Entry, Found]]) -> None:
+        """Sort what was read: into what is equal, what is to be written, and what cannot be."""
+        changes, left = [], []
+        for (own, value), now in found:
+            if now.value is None:
+                left.append(Left(own, None, value, now.why, False))
+            elif alike(type(self._handle), own.item, now.value, value):
+                self.equal += 1
+            elif why := self._why_never(own):
+                left.append(Left(own, now.value, value, why, True))
+            elif why := self._why_not(Change(own, now.value, value)):
+                left.append(Left(own, now.value, value, why, False))
+            else:
+                changes.append(Change(own, now.value, value))
+        self.changes = tuple(sorted(changes, key=lambda change: change.parameter.stage))
+        self.left = tuple(left)
+        entries = {change.parameter.item: Entry(change.parameter, change.before) for change in self.changes}
+        self.undo = replace(self.undo, entries=entries)
+
+    def _why_never(self, parameter: Parameter) -> str:
+        if parameter.kept:
+            return parameter.kept
+        read_only = parameter.access == "read" or not self._handle.point(parameter.item).writable
+        return "it is read-only" if read_only else ""
+
+    def _why_not(self, change: Change) -> str:
+        try:
+            self._sending(change)
+        except InvalidCommand as error:
+            return str(error)
+        return ""
+
+    def _sending(self, change: Change) -> Callable[[], Awaitable[None]]:
+        item = self._handle._written_item(change.parameter.item, change.before, change.value)
+        return self._prepare(item, change.value)
+
+    async def write(self, *, around: Around = lambda change: nullcontext()) -> AsyncIterator[Outcome]:
+        """Write the changes one after the other, each verified by reading it back, and yield what became of each.
+
+        What the node refuses does not stop the others. Once it is not known what became of a write, or nothing can be
+        sent, nothing more is written. `around` makes the context in which each change is written.
+        """
+        stopped = ""
+        for change in self.changes:
+            if stopped:
+                yield Outcome(change, Result.NOT_WRITTEN, stopped)
+                continue
+            outcome = await self._outcome(change, around)
+            if outcome.result in (Result.UNCONFIRMED, Result.NOT_WRITTEN):
+                stopped = f"nothing is written after {change.parameter.item}, whose write did not succeed"
+            yield outcome
+
+    async def _outcome(self, change: Change, around: Around) -> Outcome:
+        try:
+            with around(change):
+                await self._write(change)
+        except (Refused, InvalidCommand) as error:
+            return Outcome(change, Result.REFUSED, error.what if isinstance(error, BusError) else str(error))
+        except VerifyFailed as error:
+            return Outcome(change, Result.DIFFERS, error.what)
+        except NotStarted as error:
+            return Outcome(change, Result.NOT_WRITTEN, error.what)
+        except BusError as error:
+            return Outcome(change, Result.UNCONFIRMED, error.what)
+        return Outcome(change, Result.WRITTEN)
+
+    async def _write(self, change: Change) -> None:
+        """Write and read back. A write of which it is not known what became of it is repeated if the old value is read:
+        it was not carried out, and may be."""
+        unconfirmed: BusError | None = None
+        for _ in range(ROUNDS):
+            try:
+                await self._sending(change)()
+                unconfirmed = None
+            except (WriteUnconfirmed, NoReply, GarbledReply) as error:
+                unconfirmed = error
+            found = await self._read_back(change, unconfirmed)
+            if alike(type(self._handle), change.parameter.item, found, change.value):
+                return
+            if unconfirmed is None or not alike(type(self._handle), change.parameter.item, found, change.before):
+                raise VerifyFailed(f"it reads {found!r} after {change.value!r} was written", node=self._handle.node)
+        assert unconfirmed is not None
+        raise unconfirmed
+
+    async def _read_back(self, change: Change, unconfirmed: BusError | None) -> Value:
+        try:
+            found = await read_one(self._handle, change.parameter)
+        except BusError as error:
+            what = "sent, and not answered" if unconfirmed is not None else "acknowledged, but not read back"
+            raise WriteUnconfirmed(f"{what}: {error.what}", node=self._handle.node) from error
+        if found.value is None:
+            raise WriteUnconfirmed(f"it cannot be read back: {found.why}", node=self._handle.node)
+        return found.value
+
+
+async def identity_of(handle: Holder) -> dict[str, Value]:
+    """Return what a node says of itself, by item; without what it does not have. Raises as `walk`."""
+    found = [await read_one(handle, Parameter(item=item)) for item in handle._identity]
+    return {one.parameter.item: one.value for one in found if one.value is not None}
+
+
+async def empty_set(handle: Holder, by: str = "") -> ParameterSet:
+    """Return a set of a node without parameters, with what it says of itself. Raises as `walk`."""
+    node = handle.node
+    return ParameterSet(
+        protocol=handle.profile.kind_name,
+        address=node.address,
+        label=node.label,
+        line=node.line,
+        saved=datetime.now(UTC).replace(microsecond=0),
+        by=by,
+        identity=await identity_of(handle),
+    )
+
+
+async def prepared(
+    handle: Holder, wanted: ParameterSet, own: Mapping[str, Parameter], prepare: Prepare, by: str
+) -> ParameterLoad:
+    """Read what a node holds of a set, and return what writing the set comes to.
+
+    `own` are the parameters of the node. `handle` is a plain one.
+
+    Raises InvalidCommand for a set of another kind of node, BusError for a node that does not reply.
+    """
+    kind = handle.profile.kind_name
+    if wanted.protocol != kind:
+        raise InvalidCommand(f"{handle.node.label} is a {kind}: a set of a {wanted.protocol} is not for it")
+    load = ParameterLoad(handle, await empty_set(handle, by), prepare)
+    asked = [own.get(item, entry.parameter) for item, entry in wanted.entries.items()]
+    found = {one.parameter.item: one async for one in walk(handle, asked)}
+    order = {item: number for number, item in enumerate(own)}
+    # In the document's order; what the document does not list comes behind that, as the set has it.
+    items = sorted(wanted.entries, key=lambda item: order.get(item, len(order)))
+    load._take((Entry(found[item].parameter, wanted.entries[item].value), found[item]) for item in items)
+    return load
+
+
+__all__ = [
+    "FIRST",
+    "LAST",
+    "USUAL",
+    "Change",
+    "Difference",
+    "Entry",
+    "Found",
+    "Left",
+    "Outcome",
+    "Parameter",
+    "ParameterLoad",
+    "ParameterSet",
+    "Result",
+    "Value",
+]
