@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar, Unpac
 
 from busmaster.bounds import MOST_MEMBERS
 from busmaster.bus.parameters import (
+    Change,
     Difference,
     Entry,
     Found,
@@ -211,8 +212,8 @@ class Handle(ABC):
         """
         plain = self._plain()
 
-        def usual(item: str, value: Value) -> Send:
-            [send] = plain._prepare_write(item, [value], priority=Priority.BACKGROUND)
+        def usual(change: Change, item: str) -> Send:
+            [send] = plain._prepare_write(item, [change.value], priority=Priority.BACKGROUND)
             return send
 
         own = {one.item: one for one in (*self._listed(), *parameters)}

@@ -151,8 +151,9 @@ class Outcome(NamedTuple):
     why: str = ""
 
 
-Prepare: TypeAlias = Callable[[str, Value], Callable[[], Awaitable[None]]]
-"""Returns what writes a value to an item. Raises InvalidCommand for one that may not be written."""
+Prepare: TypeAlias = Callable[[Change, str], Callable[[], Awaitable[None]]]
+"""Returns what carries out a change, by the item that the node is written by. Raises InvalidCommand for a value that
+may not be written."""
 Around: TypeAlias = Callable[[Change], AbstractContextManager[object]]
 """What a change is written in: a record is kept of it."""
 
@@ -316,7 +317,7 @@ class ParameterLoad:
 
     def _sending(self, change: Change) -> Callable[[], Awaitable[None]]:
         item = self._handle._written_item(change.parameter.item, change.before, change.value)
-        return self._prepare(item, change.value)
+        return self._prepare(change, item)
 
     async def write(self, *, around: Around = lambda change: nullcontext()) -> AsyncIterator[Outcome]:
         """Write the changes one after the other, each verified by reading it back, and yield what became of each.

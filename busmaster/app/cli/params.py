@@ -125,11 +125,14 @@ class Target:
         except InvalidCommand:
             return ()
 
-    def prepare(self, item: str, value: Value) -> Send:
-        """Return what writes a value, in the background. Raises InvalidCommand for one beyond a limit of the file."""
+    def prepare(self, wanted: SetFile, change: Change, item: str) -> Send:
+        """Return what writes a value, in the background. Raises InvalidCommand for one beyond a limit of LINE.toml or
+        the range in the set."""
+        wanted.check_range(change.parameter.item)
         if self.line is not None and self.owned:
-            ext.prepare_write(ext.plain_handle(self.line.nodes[self.name]), item, [value])  # its owner has limits too
-        [send] = ext.prepare_write(self.handle, item, [value], priority=Priority.BACKGROUND)
+            own = ext.plain_handle(self.line.nodes[self.name])
+            ext.prepare_write(own, item, [change.value])  # its owner has limits too
+        [send] = ext.prepare_write(self.handle, item, [change.value], priority=Priority.BACKGROUND)
         return send
 
     @contextmanager
@@ -424,7 +427,7 @@ async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabl
         async with target.bus, late_nodes(target.bus, in_file=target.line is not None):
             if not dry_run and not await may_be_written(target, enabled):
                 return FAILED
-            plan = await prepare(target, wanted.set)
+            plan = await prepare(target, wanted)
             tell_plan(plan, target)
             status = FAILED if any(not left.expected for left in plan.left) else OK
             if dry_run or not plan.changes:
@@ -459,10 +462,11 @@ async def may_be_written(target: Target, enabled: bool, *, again: bool = False) 
     return enabled or not why
 
 
-async def prepare(target: Target, wanted: ParameterSet) -> ParameterLoad:
+async def prepare(target: Target, wanted: SetFile) -> ParameterLoad:
     """Read what the node holds of a set."""
-    plan = await target.handle.prepare_load(wanted, parameters=target.known(), prepare=target.prepare, by=me())
-    for item, value in wanted.identity.items():
+    prepared = partial(target.prepare, wanted)
+    plan = await target.handle.prepare_load(wanted.set, parameters=target.known(), prepare=prepared, by=me())
+    for item, value in wanted.set.identity.items():
         now = plan.undo.identity.get(item)
         if now is not None and now != value:
             note(f"{item} of {target.label} is {value_text(now)}, in the file {value_text(value)}", Level.WARNING)
@@ -485,9 +489,7 @@ def tell_plan(plan: ParameterLoad, target: Target) -> None:
         emit(*columns([("ITEM", "NAME", "NOW", "FILE", "UNIT"), *rows], right=(2, 3)))
     for left in plan.left:
         note(left_text(left, target.kind), Level.INFO if left.expected else Level.WARNING)
-    note(
-        f"{target.label}: {len(rows)} to be written, {plan.equal} are as in the file, {len(plan.left)} are not written"
-    )
+    note(f"{target.label}: to be written {len(rows)}, as in the file {plan.equal}, not written {len(plan.left)}")
 
 
 def left_text(left: Left, kind: NodeKind) -> str:

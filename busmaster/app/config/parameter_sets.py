@@ -53,6 +53,19 @@ class SetFile:
             with Table(self._source).at("parameters", item):
                 handle.point(item)
 
+    def check_range(self, item: str) -> None:
+        """Raise FileError for a value that is beyond the range that the file says of it: it is not to be written. One
+        that a node was found to hold may be."""
+        parameter, number = self.set.entries[item]
+        value = in_unit(parameter, number, self.kind)
+        for limit, beyond in (
+            ("minimum", parameter.minimum is not None and value < parameter.minimum),
+            ("maximum", parameter.maximum is not None and value > parameter.maximum),
+        ):
+            if beyond:
+                what = f"{toml_text(value)} is beyond its {limit} of {toml_text(getattr(parameter, limit))}"
+                raise self._source.error(("parameters", item, "value"), what)
+
 
 def scale_of(parameter: Parameter, kind: NodeKind) -> Scale:
     """Return what the numbers of a parameter mean in its unit. Raises InvalidCommand for an item of no such kind."""
@@ -133,9 +146,6 @@ def _entries(table: Table, kind: NodeKind) -> Iterator[tuple[Parameter, Value]]:
             maximum=entry.number("maximum", None),
         )
         value = _value(entry, "value")
-        for limit, beyond in (("minimum", parameter.minimum), ("maximum", parameter.maximum)):
-            if beyond is not None and (value < beyond if limit == "minimum" else value > beyond):
-                raise entry.error(f"{toml_text(value)} is beyond its {limit} of {toml_text(beyond)}", "value")
         with entry.at():
             scale = scale_of(parameter, kind)
         with entry.at("value"):

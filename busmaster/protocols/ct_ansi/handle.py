@@ -35,6 +35,7 @@ class CtAnsiDrive(ParameterHandle):
     profile: ClassVar[Profile] = PROFILE
     _read_command = Read
     _run_command = ReadRun
+    _menus = range(23)
 
     def point(self, item: str) -> Point[Any]:
         """Return the point of a parameter ("1.21"), or of a run, always read in one exchange ("1.21:8")."""

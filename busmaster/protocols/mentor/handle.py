@@ -29,8 +29,8 @@ _BEYOND_ANY_FORM = 1e9
 FINE = 10
 """Steps of the high resolution to one of the ordinary."""
 MOST_DECIMALS = 9
-MENUS = NUMBERS = range(100)
-"""The document has no list: any of these may be a parameter of the drive."""
+NUMBERS = range(100)
+"""The document has no list: any of these may be a parameter of a menu."""
 STORE = 0
 """The number in each menu that is a command to the drive, such as to store its parameters."""
 LARGEST_WITH_SIGN = 9999
@@ -59,6 +59,9 @@ class ParameterHandle(Handle):
 
     _read_command: ClassVar[type[Read]] = Read
     _run_command: ClassVar[type[ReadRun]] = ReadRun
+    _menus: ClassVar[range] = range(17)
+    """Those that the drives have: Mentor II has 1 to 16, and 0 for what its user puts there. A read of a parameter that
+    does not exist takes two exchanges and the maximum reply delay (R7), so the numbers up to 99 would take an hour."""
 
     def __init__(
         self,
@@ -130,12 +133,12 @@ class ParameterHandle(Handle):
         return {}
 
     def _listed(self) -> Iterable[Parameter]:
-        """Return every menu and number: the drive replies to those that it does not have, and they are left out.
+        """Return all numbers of all menus: the drive replies to those that it does not have, and they are left out.
 
         The command of each menu is written last.
         """
         known = self._known()
-        for place in ((menu, number) for menu in MENUS for number in NUMBERS):
+        for place in ((menu, number) for menu in self._menus for number in NUMBERS):
             stage = LAST if place[1] == STORE else USUAL
             yield known.get(place) or Parameter(item=f"{place[0]}.{place[1]:02d}", stage=stage)
 
