@@ -294,7 +294,10 @@ def diff_command(
     compared with a file, the parameters of the file are read.
     """
     lines = Lines()
-    sides = [side(lines, connection, text) for text in (one, other)]
+    try:
+        sides = [side(lines, connection, text) for text in (one, other)]
+    except OSError as error:  # status 1 would say that they differ
+        raise click.ClickException(f"{error.filename}: {error.strerror}") from error
     kinds = [each.kind for each in sides]
     if kinds[0] is not kinds[1]:
         raise click.UsageError(f"{one} is of a {kinds[0].name}, {other} of a {kinds[1].name}: their items differ")
