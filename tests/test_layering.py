@@ -94,12 +94,12 @@ OPEN: dict[str, set[str]] = {
     "wire": {"characters", "checks", "numbers", "readers"},
     "app.cli": {""},
     "app.config": {
-        *("", "emulated", "names", "parameter_sets", "point_section", "points", "recording", "rewriting", "sections"),
+        *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "sections"),
         *("service", "source", "table", "templates"),
     },
     "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},
     "app.interfaces": {"following", "opcua", "opcua_access", "web"},
-    "app.line": {"", "points_table", "points_taking"},
+    "app.line": {"", "parameter_sets", "points_table", "points_taking"},
     "app.outputs": {"base", "cells", "distributor", "kinds", "settings"},
     "app.service": {
         *("authorisation", "folder", "messages", "payload", "permission", "picture", "record", "refusals", "remote"),

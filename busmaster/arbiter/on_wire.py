@@ -185,6 +185,10 @@ class Step:
         self.out += seconds
         self.taint_until += seconds
 
+    def wire_time(self) -> float:
+        """Return the time, in seconds, that the longest reply needs on the wire."""
+        return self.longest * self.byte_time
+
     def quiet(self) -> float:
         """Return the silence, in seconds, after which no further byte of a frame can arrive."""
         silence = self.timing.silence

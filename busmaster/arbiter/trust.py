@@ -84,8 +84,8 @@ class Trust:
             # The node continues with steps that need no transmission by the host (MSC: the packet after its ACK).
             over += sum(later.timing.max_reply_delay for later in exchange.later if not later.sent)
             silence = max(QUIET, transaction.node.timings.read.inter_byte_timeout) + step.latency + step.byte_time
-            lasts = step.longest * step.byte_time + silence  # with one pause
-            awaited = Awaited(transaction.command, step.timing.window, silence, lasts)
+            # with one pause
+            awaited = Awaited(transaction.command, step.timing.window, silence, step.wire_time() + silence)
         # The ACK before the packet (MSC) may have been an overdue one. This request's own ACK is then still to come.
         ack_in_doubt = exchange.later and self._in_sync.lone_byte_is_overdue()
         if heard or (awaited is not None and keys) or ack_in_doubt:

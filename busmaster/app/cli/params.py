@@ -25,7 +25,8 @@ from busmaster.app.cli.output import Level, columns, emit, json_line, note, valu
 from busmaster.app.cli.parsing import option_type, parse_items
 from busmaster.app.cli.protocols import ItemCommand, NodeCommand
 from busmaster.app.cli.reaching import owner_of, reach, tell_owner
-from busmaster.app.config.parameter_sets import (
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.line.parameter_sets import (
     PART,
     PartFile,
     SetFile,
@@ -35,7 +36,6 @@ from busmaster.app.config.parameter_sets import (
     read_set,
     write_set,
 )
-from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.authorisation import Wish
 from busmaster.app.service.record import WriteRecord, this_user
 from busmaster.app.service.remote import RemoteBus, connect

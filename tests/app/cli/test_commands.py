@@ -110,7 +110,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and ei-bisynch"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
         (("read", "rfc2217://host", *HCP2, "--node", "1", "1"), "is not of the form rfc2217://HOST:PORT"),
-        (("read", "host:5020", *HCP2, "--node", "1", "1"), "a TCP port is written socket://host:5020"),
+        (("read", "host:5020", *HCP2, "--node", "1", "1"), "write a TCP port as socket://host:5020"),
         (("read", "PORT", *HCP2, "--node", "one", "1"), "'one' is not a valid whole number"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "9e9"), "at most 60000 ms"),
         (("read", "PORT", "--protcol", "hcp2", "1"), "no such option '--protcol': did you mean '--protocol'?\n"),

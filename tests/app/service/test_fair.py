@@ -202,7 +202,7 @@ def test_a_sequence_whose_time_is_over_says_so_to_its_program(tmp_path: Path) ->
         async with Hcp2Controller(remote, 5).exclusive(max_hold=0.02) as held:
             await held.write(1, 5)
             await Hcp2Controller(line.bus, 6).read(1)  # waits until it is over
-            with pytest.raises(HoldEnded, match=r"node 5: the 0\.02 s .* \(max_hold\)"):
+            with pytest.raises(HoldEnded, match=r"node 5: the sequence has ended: its 0\.02 s .* max_hold"):
                 await held.write(1, 6)
         assert line.audit() == [("5/write element 1 = 5", "written"), ("5/write element 1 = 6", "not started")]
 

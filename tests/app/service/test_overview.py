@@ -84,7 +84,7 @@ def test_a_name_a_number_of_digits_and_a_cause_are_the_owners(tmp_path: Path) ->
         assert (shown["5/10"].value, shown["5/10"].precision) == (1.25, 3)
         assert shown["5/11"].value == "1 on"
         assert shown["8/1"].value is None
-        assert shown["8/1"].error.startswith(("no reply", "down"))
+        assert shown["8/1"].error.startswith(("no reply", "not responding"))
 
     on_a_watched_line(tmp_path, story)
 

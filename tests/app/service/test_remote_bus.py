@@ -148,7 +148,7 @@ def test_a_stop_of_one_program_counts_for_all(tmp_path: Path) -> None:
             await mine.disable()
             await until(lambda: theirs.node.stops == stops + 1)
             assert own.node.stops == mine.node.stops == stops + 1
-            with pytest.raises(Superseded, match="told to stop"):
+            with pytest.raises(Superseded, match="the node was stopped"):
                 await theirs.node.request(hcp2.Write(5, (1,)), stops_seen=stops)
             own.node.note_stop()
             await until(lambda: theirs.node.stops == mine.node.stops == stops + 2)

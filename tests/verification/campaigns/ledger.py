@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from math import inf
+from math import inf, nextafter
 from typing import Any, NamedTuple
 
 from busmaster.emulator.device import Device
@@ -301,7 +301,10 @@ class WatchedLine(Line):
         self._spoiled(talk, "collides with another")
 
     def _spoiled(self, talk: Talk, what: str) -> None:
-        self.ledger.spoiled(talk.start, talk.end)
+        # On a line without pacing a request takes no time, and its exchange begins at the same moment: it is damage to
+        # that exchange. The reply before it, which ends then, is not.
+        end = nextafter(talk.end, inf) if talk.talker is None else talk.end
+        self.ledger.spoiled(talk.start, end)
         if self.record is not None:
             who = "the host's" if talk.talker is None else f"{talk.talker!r}'s"
             self.record(f"{self.ledger.now():.6f} {who} talk from {talk.start:.6f} to {talk.end:.6f} {what}")

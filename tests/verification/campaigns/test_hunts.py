@@ -12,6 +12,7 @@ import pytest
 
 from busmaster.arbiter import learned as learning
 from busmaster.arbiter.in_sync import InSync
+from busmaster.emulator.line import Talk
 from tests.tiers import in_turn_by_default, one_by_default
 from tests.verification.campaigns.__main__ import main
 from tests.verification.campaigns.hunt import Hunt
@@ -186,3 +187,17 @@ def test_r15_with_learned_times_nothing_is_wrong_or_lost_and_everything_heals(
     check(totals, hunt)
     assert totals.confused == totals.lost == 0
     assert totals.transactions >= EACH
+
+
+def test_damage_to_a_request_that_takes_no_time_belongs_to_its_own_exchange() -> None:
+    """On a line without pacing. Seed 20900 of Mentor II blamed the master for the reply to a request that noise cut."""
+    hunt = Hunt("mentor", "everything", 20900)
+    totals = hunt.run(150)
+    ledger, line = hunt.ledger, hunt.line
+    assert totals.confused == 0
+    host = Talk(None, 5.0, 5.0, b"\x04", clean=False, chunk=1)
+    drive = Talk(hunt.devices[0], 7.0, 7.0, b"\x06", clean=False, chunk=1)
+    for talk in (host, drive):
+        line._spoiled(talk, "passes as something else")
+    assert ledger.damaged(5.0, 5.1)
+    assert not ledger.damaged(7.0, 7.1)

@@ -48,6 +48,7 @@ ALLOWED = {
     "said * self.byte_time": BYTES,
     "TAINT_SHARE * said * self.byte_time": BYTES,
     "self.longest * byte_time": BYTES,
+    "self.longest * self.byte_time": BYTES,
     "count * self._step.byte_time": BYTES,
     "2 * step.byte_time": BYTES,
     "(len(step.first_bytes) - 1) * step.byte_time": BYTES,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.app.config.parameter_sets import PartFile, read_set, write_set
 from busmaster.app.config.source import FileError
+from busmaster.app.line.parameter_sets import PartFile, read_set, write_set
 from busmaster.bus.parameters import Entry, Found, Parameter, ParameterSet
 from busmaster.errors import InvalidCommand
 from busmaster.registry import find
