@@ -54,6 +54,7 @@ from busmaster.bus.suitability import check_company, check_settings
 from busmaster.contract.arguments import (
     LONGEST_NUMBER,
     Between,
+    Parsed,
     guess,
     host_and_port,
     is_decimal,
@@ -136,6 +137,7 @@ __all__ = [
     "Parameter",
     "ParameterLoad",
     "ParameterSet",
+    "Parsed",
     "Placed",
     "Plan",
     "PlannedGroup",

@@ -94,7 +94,7 @@ OPEN: dict[str, set[str]] = {
     "wire": {"characters", "checks", "numbers", "readers"},
     "app.cli": {""},
     "app.config": {
-        *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "sections"),
+        *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "schema", "sections"),
         *("service", "source", "table", "templates"),
     },
     "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from math import isfinite
-from typing import Any
+from typing import Annotated, Any
 
+from busmaster.contract.arguments import Between
 from busmaster.errors import InvalidCommand
 
 
@@ -57,25 +58,30 @@ class Meaning:
         status = replace(drive.point("11"), meaning=Meaning(bits={"READY": 0, "FAULT": 3}))
         group.add(status, *status.bits)
 
-    `precision`: decimals for display, 0 to 15; calculations and stored values are not rounded. `bits`: names of bits of
-    a word, 0 the lowest; each is a point of its own. `labels`: names of whole numbers. `deadband`: outputs get a value
-    only if it differs from the last one sent by more than this; 0 for every change. `heartbeat`: they get it after this
-    many seconds at the latest. A value above `high` or below `low` begins an alarm, which ends when the value has
-    returned by `hysteresis`; by default a hundredth of the range between the two, or of the one that is given. All
-    except seconds are in the unit of the value. `alarm_if_set`, `alarm_if_clear`: names of `bits` that begin an alarm
-    while they are 1, or 0.
+    All but `heartbeat` is in the unit of the value.
     """
 
-    precision: int | None = None
+    precision: Annotated[int | None, Between(0, MOST_DIGITS)] = None
+    """Digits behind the point that people are shown. Nothing else is rounded."""
     bits: Mapping[str, int] = field(default_factory=dict)
+    """Names of the word's bits, 0 the lowest, each a point of its own: `bits = { READY = 0, FAULT = 3 }`."""
     labels: Mapping[int, str] = field(default_factory=dict)
-    deadband: float | None = None
-    heartbeat: float | None = None
+    """Names of whole numbers: `labels = { 0 = "off", 1 = "run" }`."""
+    deadband: Annotated[float | None, Between(0, self_checked=True)] = None
+    """Outputs are told a value only where it is further than this from what they were told; 0: each change."""
+    heartbeat: Annotated[float | None, Between(unit="s")] = None
+    """Outputs are told a value at the latest after so long, which is more than 0."""
     low: float | None = None
+    """A value below it begins an alarm."""
     high: float | None = None
+    """A value above it begins an alarm."""
     hysteresis: float | None = None
+    """How far a value must be back for its alarm to end. By default a hundredth of what is between `low` and `high`, or
+    of the one that there is."""
     alarm_if_set: tuple[str, ...] = ()
+    """Bits that begin an alarm while they are 1, by their names in `bits`: `alarm_if_set = ["FAULT"]`."""
     alarm_if_clear: tuple[str, ...] = ()
+    """Bits that begin an alarm while they are 0, likewise."""
 
     def __post_init__(self) -> None:
         for name, fault in self.faults():

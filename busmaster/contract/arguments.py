@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import difflib
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from math import inf, nan
 from numbers import Real
-from typing import NamedTuple, SupportsIndex
+from typing import Any, NamedTuple, SupportsIndex
 
 from busmaster.errors import InvalidCommand
 
@@ -20,10 +20,29 @@ LONGEST_NUMBER = 20
 
 
 class Between(NamedTuple):
-    """Minimum and maximum of a number, inclusive: used with its type in `Annotated`."""
+    """The least and the most that a number may be, bounds included, and its unit: beside its type, in `Annotated`.
 
-    least: float
+    The reader of a file rejects other numbers. If `self_checked`, the class that has the number does so itself, and its
+    message says more.
+    """
+
+    least: float = -inf
     most: float = inf
+    unit: str = ""
+    self_checked: bool = False
+
+
+class Parsed(NamedTuple):
+    """How the value of an attribute is made of what a file has for it: beside the attribute's type, in `Annotated`.
+
+    `parse` gets a value of the type `given`, by default that of the attribute, and raises InvalidCommand for one that
+    it rejects. `shown` is what the reference calls that type. `written` returns what a file would have for a value.
+    """
+
+    parse: Callable[[Any], Any]
+    given: Any = None
+    shown: str = ""
+    written: Callable[[Any], object] | None = None
 
 
 def whole_number(value: SupportsIndex, lowest: int, highest: int, what: str) -> int:
@@ -100,6 +119,7 @@ def meant(name: str, known: Iterable[str]) -> str:
 
 __all__ = [
     "Between",
+    "Parsed",
     "guess",
     "is_decimal",
     "meant",

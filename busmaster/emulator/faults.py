@@ -16,9 +16,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
-from busmaster.contract.arguments import guess
+from busmaster.contract.arguments import Between, guess
 from busmaster.errors import InvalidCommand
 
 FORGED = b"\x06\x15\x04"
@@ -35,6 +35,9 @@ BEYOND = frozenset({"repeated", "duplicate", "forged", "unseen"})
 WITHIN = frozenset({*HEARING, *SPEAKING}) - BEYOND
 SECONDS = ("late_by", "away_for")
 
+Rate: TypeAlias = Annotated[float, Between(0, 1, self_checked=True)]
+Seconds: TypeAlias = Annotated[float, Between(0, unit="s", self_checked=True)]
+
 
 @dataclass(slots=True)
 class Faults:
@@ -43,49 +46,49 @@ class Faults:
     Raises InvalidCommand, on setting too, for a probability that is none.
     """
 
-    lost: float = 0.0
+    lost: Rate = 0.0
     """Not transmitted."""
-    late: float = 0.0
+    late: Rate = 0.0
     """Transmitted up to `late_by` seconds later than usual."""
-    flip: float = 0.0
+    flip: Rate = 0.0
     """One bit flipped."""
-    unseen: float = 0.0
+    unseen: Rate = 0.0
     """The same bit flipped in two bytes: an exclusive-or of all bytes cannot see it."""
-    truncated: float = 0.0
+    truncated: Rate = 0.0
     """Cut at a random place."""
-    doubled: float = 0.0
+    doubled: Rate = 0.0
     """Transmitted twice, the second time directly after the first."""
-    repeated: float = 0.0
+    repeated: Rate = 0.0
     """Transmitted twice, up to 300 ms apart."""
-    wrong: float = 0.0
+    wrong: Rate = 0.0
     """For another element, parameter or unit than requested, with a correct checksum."""
-    duplicate: float = 0.0
+    duplicate: Rate = 0.0
     """A second device with the same address replies too, after its own delay."""
-    leading: float = 0.0
+    leading: Rate = 0.0
     """A few noise bytes before it (a driver switched on): never an ACK, NAK, EOT or BS."""
-    trailing: float = 0.0
+    trailing: Rate = 0.0
     """A few noise bytes glued to its end: never an ACK, NAK, EOT or BS."""
-    forged: float = 0.0
+    forged: Rate = 0.0
     """An unexpected ACK, NAK or EOT in front of it."""
-    babble: float = 0.0
+    babble: Rate = 0.0
     """A burst of up to 60 noise bytes at some moment of the next 100 ms."""
-    split: float = 0.0
+    split: Rate = 0.0
     """Delivered to the host in chunks of 1 to 4 bytes."""
-    deaf: float = 0.0
+    deaf: Rate = 0.0
     """A request is not received."""
-    nak: float = 0.0
+    nak: Rate = 0.0
     """A request is refused without being processed; 1 is a storm of refusals."""
-    flapping: float = 0.0
+    flapping: Rate = 0.0
     """It goes away for up to `away_for` seconds when a request comes."""
-    restart: float = 0.0
+    restart: Rate = 0.0
     """It goes away as by `flapping`, and what was in its RAM is lost."""
-    dead: float = 0.0
+    dead: Rate = 0.0
     """Above 0: it does not receive or transmit."""
-    drop: float = 0.0
+    drop: Rate = 0.0
     """What it receives while it still has something to transmit is lost. At 0 a UART's queue keeps it."""
-    late_by: float = 0.1
+    late_by: Seconds = 0.1
     """The most seconds by which `late` delays a reply."""
-    away_for: float = 5.0
+    away_for: Seconds = 5.0
     """The most seconds for which `flapping` and `restart` keep it away."""
     hearing: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)
     """The faults in use that concern what a device hears. Kept up to date by itself; so is `speaking`."""

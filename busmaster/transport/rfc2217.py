@@ -9,9 +9,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 from busmaster.arbiter.counters import DriverErrors, Mark
+from busmaster.contract.arguments import Between
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import telnet
@@ -38,19 +39,25 @@ AGREEMENT = "options"
 class Rfc2217Port(TcpPort):
     """A serial line behind a serial server that takes its settings by RFC 2217.
 
-    The server must confirm rate and framing when the port is opened, otherwise the opening fails. `rtscts`: the server
-    holds back what is sent while CTS is off. `dtr`, `rts`: set these lines on or off; None leaves them to the server.
-    `receive_latency`, `echo` and `paced` are as for a TcpPort. Raises InvalidCommand for values out of range.
+    The server must confirm rate and framing when the port is opened, otherwise the opening fails. `receive_latency`,
+    `echo` and `paced` are as for a TcpPort. Raises InvalidCommand for values out of range.
     """
 
     _: KW_ONLY
-    baudrate: int
-    bytesize: int = 8
+    baudrate: Annotated[int, Between(1, self_checked=True)]
+    """In LINE.toml the protocol's by default, where all nodes are meant for one."""
+    bytesize: Annotated[int, Between(5, 8, self_checked=True)] = 8
+    """Bits of a byte. In LINE.toml the protocol's by default."""
     parity: str = "N"
+    """N, E, O, M or S. In LINE.toml the protocol's by default."""
     stopbits: float = 1
+    """1, 1.5 or 2. In LINE.toml the protocol's by default."""
     rtscts: bool = False
+    """Whether the server sends only while CTS of the remote port is on."""
     dtr: bool | None = None
+    """Sets (true) or clears (false) the line DTR of the remote port. By default the server decides."""
     rts: bool | None = None
+    """The same for RTS."""
 
     def __post_init__(self) -> None:
         TcpPort.__post_init__(self)  # super() does not work in a dataclass with slots

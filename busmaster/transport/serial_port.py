@@ -23,11 +23,12 @@ import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import serial
 from serial.rs485 import RS485Settings
 
+from busmaster.contract.arguments import Between
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import holders, identity
@@ -75,28 +76,36 @@ pool. A larger buffer costs a malloc, and a second one to shrink it."""
 class SerialPort:
     """A serial port of this machine, or a pty. Raises InvalidCommand for invalid values.
 
-    `path`: the device or a symbolic link to it; or "usb:SERIAL" for the USB adapter with this serial number,
-    "usb:SERIAL:INTERFACE" if it has several ports. `rs485`: the kernel drives the transmitter (RTS high while sending);
-    True, or pyserial's `RS485Settings` for other polarities and delays. `echo`: the port receives its own
-    transmissions. `low_latency`: set (True) or clear (False) the driver's flag; None leaves it unchanged.
-    `receive_latency`: seconds for which the adapter can hold bytes (FTDI: its latency timer). `exclusive`: no other
-    program may open the port. `paced`: bytes leave at the baud rate; None decides by the device number (a pty is not
-    paced).
+    `path` is that of the device or of a symbolic link to it; or "usb:SERIAL", the USB adapter with this serial number
+    whatever its name is, or "usb:SERIAL:INTERFACE" where it has several ports.
     """
 
     path: str
+    """The device, a link to it, or `usb:SERIAL`."""
     _: KW_ONLY
-    baudrate: int
-    bytesize: int = 8
+    baudrate: Annotated[int, Between(1, self_checked=True)]
+    """In LINE.toml the protocol's by default, where all nodes are meant for one."""
+    bytesize: Annotated[int, Between(5, 8, self_checked=True)] = 8
+    """Bits of a byte. In LINE.toml the protocol's by default."""
     parity: str = "N"
+    """N, E, O, M or S. In LINE.toml the protocol's by default."""
     stopbits: float = 1
+    """1, 1.5 or 2. In LINE.toml the protocol's by default."""
     rtscts: bool = False
+    """Whether RTS and CTS hold up what is sent."""
     rs485: RS485Settings | bool | None = None
+    """Whether the driver is to switch the transmitter (RTS high while sending). In Python also pyserial's
+    `RS485Settings`, for other polarities and delays."""
     echo: bool = False
+    """Whether what is sent is received too, as on some two-wire adapters. It is compared byte for byte."""
     low_latency: bool | None = None
-    receive_latency: float = 0.0
+    """Sets or clears the driver's flag of that name. Left alone by default."""
+    receive_latency: Annotated[float, Between(0, unit="s", self_checked=True)] = 0.0
+    """How long the adapter may hold bytes back: FTDI's latency timer, for example."""
     exclusive: bool = True
+    """Whether no other program may open the port meanwhile."""
     paced: bool | None = None
+    """Whether bytes leave at the baud rate. By default so for a serial device, and not for a pseudo-terminal."""
 
     def __post_init__(self) -> None:
         if not self.path:

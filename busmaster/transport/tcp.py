@@ -9,7 +9,9 @@ import os
 import socket
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from typing import Annotated
 
+from busmaster.contract.arguments import Between
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport.identity import Identity
@@ -25,18 +27,22 @@ KEEP_ALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3, "TCP_USER
 class TcpPort:
     """A serial line behind a serial server that passes raw bytes (ser2net, Moxa and similar).
 
-    `baudrate`: the server's. With it, reply windows start at the end of the request on the wire; without it, at the
-    write. `receive_latency`: seconds for which the server can hold bytes (ser2net: 0.0033 unless `chardelay: false`).
-    `paced`: the server never replies earlier than the baud rate allows. Raises InvalidCommand for values out of range.
+    Raises InvalidCommand for values out of range.
     """
 
     host: str
-    port: int
+    """The name or address of the serial server."""
+    port: Annotated[int, Between(1, 65535, self_checked=True)]
+    """Its TCP port, on which it passes raw bytes."""
     _: KW_ONLY
-    baudrate: int | None = None
-    receive_latency: float = 0.0
+    baudrate: Annotated[int | None, Between(1, self_checked=True)] = None
+    """The baud rate behind it: reply windows then run from the end of the request on the wire, else from the write."""
+    receive_latency: Annotated[float, Between(0, unit="s", self_checked=True)] = 0.0
+    """How long the server may hold bytes back (ser2net: 0.0033 unless `chardelay: false`)."""
     echo: bool = False
+    """Whether what is sent is received too, as on some two-wire adapters. It is compared byte for byte."""
     paced: bool = False
+    """Whether the server replies no sooner than the baud rate allows."""
 
     def __post_init__(self) -> None:
         if not self.host:

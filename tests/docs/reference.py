@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import ast
-import math
+import json
 import re
 import tomllib
 from collections.abc import Iterator
@@ -15,26 +15,10 @@ from itertools import pairwise
 
 import busmaster
 import busmaster.bounds
-from busmaster.app.config.keys import REQUIRED, Key
-from busmaster.app.config.schema import tables
+from busmaster.app.config.keys import MILLION, Key
+from busmaster.app.config.schema import json_schema, tables
 from tests.docs.command_line import manual, page
 from tests.docs.pages import ROOT
-
-KINDS = {
-    "text": "text",
-    "flag": "true or false",
-    "whole": "whole number",
-    "number": "number",
-    "seconds": "number",
-    "texts": "text, or list of texts",
-    "wholes": "list of whole numbers",
-    "table": "table",
-    "mode": "text, octal",
-    "delay": "number, or list of two",
-    "address": "whole number, or range as text",
-    "timing": "table or text",
-    "port": "text or table",
-}
 
 
 def line_toml() -> str:
@@ -56,7 +40,7 @@ All times are in seconds. A key without a default may be left out; its meaning s
         yield f"## {_titled(table.header)}\n\n{table.about}\n"
         yield "| key | type | default | meaning |\n|---|---|---|---|"
         for key in table.keys:
-            yield f"| `{key.name}` | {_type(key)} | {_default(key)} | {key.about} |"
+            yield f"| `{key.name}` | {key.form.shown} | {_default(key)} | {key.about} |"
         yield ""
 
 
@@ -66,24 +50,17 @@ def _titled(header: str) -> str:
     return f"`{code}]`{rest}" if closing else f"`{header}`" if "=" in header else header
 
 
-def _type(key: Key) -> str:
-    text = " or ".join(f'`"{choice}"`' for choice in key.choices) or KINDS[key.kind]
-    if key.unit:
-        text += f", {key.unit}"
-    if key.least > -math.inf and key.most < math.inf:
-        most = f"{key.most:g}" if key.most < 1e6 else f"{int(key.most):_d}"
-        text += f", {key.least:g} to {most}"
-    elif key.least > -math.inf:
-        text += f", {key.least:g} or more"
-    elif key.most < math.inf:
-        text += f", at most {key.most:g}"
-    return text
-
-
 def _default(key: Key) -> str:
-    if key.default == REQUIRED:
+    if key.required:
         return "must be there"
-    return f"`{key.default}`" if key.default else ""
+    match key.default:
+        case None | "":
+            return ""
+        case bool():
+            return f"`{str(key.default).lower()}`"
+        case float() | int():
+            return f"`{key.default:_}`" if key.default >= MILLION else f"`{key.default:g}`"
+    return f'`"{key.default}"`'
 
 
 def bounds() -> str:
@@ -150,6 +127,7 @@ def files() -> dict[str, str]:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     return {
         "docs/reference/line-toml.md": line_toml(),
+        "docs/line.schema.json": json.dumps(json_schema(), indent=1) + "\n",
         "docs/reference/command-line.md": page(),
         "docs/reference/bounds.md": bounds() + "\n",
         "docs/reference/api.md": api(),

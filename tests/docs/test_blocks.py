@@ -17,8 +17,10 @@ from typing import Any
 
 import click
 import pytest
+from jsonschema import Draft202012Validator
 
 from busmaster.app.cli.app import cli
+from busmaster.app.config.schema import json_schema
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
@@ -89,6 +91,7 @@ class Page:
             self._whole = data
         source.data = merged(self._whole, data)
         ConfiguredLine(read(source), outputs=False)
+        Draft202012Validator(json_schema()).validate(source.data)
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

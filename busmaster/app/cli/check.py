@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import click
 
 from busmaster.app.cli.app import FAILED, OK
@@ -12,9 +14,26 @@ from busmaster.app.config import FileError
 from busmaster.app.line import Report, check
 
 
+def print_schema(context: click.Context, option: click.Parameter, wanted: bool) -> None:
+    """Print the JSON Schema of LINE.toml and end the command, which then needs no file."""
+    from busmaster.app.config.schema import json_schema  # it reads sources, which no other command needs
+
+    if wanted and not context.resilient_parsing:
+        emit(*json.dumps(json_schema(), indent=1).splitlines())
+        context.exit(OK)
+
+
 @click.command(short_help="Check a file without opening its port.")
 @file_argument()
 @json_option
+@click.option(
+    "--schema",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=print_schema,
+    help="Print the JSON Schema of LINE.toml, for editors, and exit: with the options of every protocol installed.",
+)
 def command(path: str, as_json: bool) -> int:
     """Check LINE.toml. Everything for which `run` would refuse the file is reported, each problem with its line and its
     key. No port and no output is opened. Files that LINE.toml names are read too: templates, symbols, tokens and

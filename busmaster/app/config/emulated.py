@@ -49,7 +49,7 @@ def _device(file: LineFile, name: str) -> Device:
     # said of the node or of its device, an option is one and the same
     options = {key: value for key, value in node.options.items() if key in emulated} | dict(section.options)
     with (section.table or node.table).at():
-        device = make_device(node.protocol, node.address, delay=section.delay, lively=section.lively, **options)
+        device = make_device(node.protocol, node.address, delay=section.reply_delay, lively=section.lively, **options)
     device.faults = section.faults
     for key, (table, values) in section.values.items():
         with table.at(key):

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import partial
+from typing import Annotated, Any, Literal
 
+from busmaster.app.config.keys import Form, Key, form_of, names_of, read_keys
 from busmaster.app.config.names import expanded
 from busmaster.app.config.table import Table
 from busmaster.emulator import Delay
 from busmaster.errors import InvalidCommand
-from busmaster.ext import read_file
+from busmaster.ext import Between, read_file
 from busmaster.registry import NodeKind, Option, kinds
 
 HIGHEST_ADDRESS = 0xFFFF_FFFF
+ADDRESS_SCHEMA = {"type": "integer", "minimum": 0, "maximum": HIGHEST_ADDRESS}
+
+
+def keys_of_options(options: Sequence[Option]) -> tuple[Key, ...]:
+    """Return options as keys."""
+    return tuple(Key(one.name, _form(one), one.about or f"{one.help[:1].upper()}{one.help[1:]}.") for one in options)
 
 
 def check_keys(
@@ -28,41 +36,33 @@ def check_keys(
 
 def read_options(table: Table, known: Sequence[Option]) -> dict[str, Any]:
     """Return those of the options that the table says, each as the argument that it is."""
-    return {option.name: _option(table, option) for option in known if option.name in table}
+    return read_keys(table, keys_of_options(known))
 
 
-def _option(table: Table, option: Option) -> Any:
-    name = option.name
+def _form(option: Option) -> Form:
     match option.kind:
-        case "flag":
-            return table.flag(name, False)
-        case "whole":
-            return table.whole(name, least=1)
-        case "number":
-            return table.number(name)
-        case "positive":
-            return table.positive(name)
-        case "share":
-            return table.share(name)
-        case "delay":
-            return read_delay(table, name)
         case "text":
-            return table.choice(name, option.choices) if option.choices else table.text(name)
-        case "numbers":
-            return frozenset(table.wholes(name, most=HIGHEST_ADDRESS))
+            return form_of(Literal[option.choices] if option.choices else str)
         case "addresses":
-            return _addresses(table, option)
+            schema: Mapping[str, Any] = {"type": "object", "additionalProperties": ADDRESS_SCHEMA}
+            if option.reader is not None:
+                schema = {"anyOf": [{"type": "string"}, schema]}
+            return Form("table", schema, partial(_read_addresses, option))
         case "tables":
-            return {each: fields for one in table.tables(name) for each, fields in _named(one, option.fields)}
+            fields = {key.name: {"description": key.about, **key.form.schema} for key in keys_of_options(option.fields)}
+            each = {"type": "object", "properties": fields, "additionalProperties": False}
+            return Form("table", {"type": "object", "additionalProperties": each}, partial(_read_tables, option.fields))
+        case kind:
+            return FORMS[kind]
 
 
-def _addresses(table: Table, option: Option) -> Mapping[str, int]:
+def _read_addresses(option: Option, table: Table, key: str) -> Mapping[str, int]:
     """Read `symbols = { count = 2008 }`, or `symbols = "press.lst"` where the protocol can read such a file."""
-    if option.reader is None or not isinstance(table.data[option.name], str):
-        named = table.table(option.name)
-        return {key: named.whole(key, most=HIGHEST_ADDRESS) for key in named.data}
-    path = table.source.beside(table.text(option.name))
-    with table.at(option.name):
+    if option.reader is None or not isinstance(table.data[key], str):
+        named = table.table(key)
+        return {name: named.whole(name, most=HIGHEST_ADDRESS) for name in named.data}
+    path = table.source.beside(table.text(key))
+    with table.at(key):
         try:
             text = read_file(path).decode("latin-1")  # from a computer of then: any byte is some character
         except OSError as error:
@@ -73,19 +73,52 @@ def _addresses(table: Table, option: Option) -> Mapping[str, int]:
             raise InvalidCommand(f"{path}: {error}") from None
 
 
-def _named(table: Table, fields: Sequence[Option]) -> list[tuple[str, dict[str, Any]]]:
-    """Return what a table of `fields` says, under each name that its own stands for."""
-    table.only(*(field.name for field in fields))
-    said = read_options(table, fields)
-    with table.at():
-        return [(name, said) for name in expanded(table.name)]
+def _read_tables(fields: Sequence[Option], table: Table, key: str) -> dict[str, dict[str, Any]]:
+    """Return what each table says, under each name that its own stands for."""
+    found: dict[str, dict[str, Any]] = {}
+    keys = keys_of_options(fields)
+    for one in table.tables(key):
+        one.only(*names_of(keys))
+        values = read_keys(one, keys)
+        with one.at():
+            found |= dict.fromkeys(expanded(one.name), values)
+    return found
 
 
-def read_delay(table: Table, key: str) -> Delay:
-    """Return `reply_delay = 0.002`, or `reply_delay = [0.001, 0.004]`, as the delay that it is."""
+def _read_positive(table: Table, key: str) -> float:
+    value = table.number(key)
+    if value <= 0:
+        raise table.error(f"must be above 0, not {value}", key)
+    return value
+
+
+def _read_delay(table: Table, key: str) -> Delay:
+    """Read `reply_delay = 0.002`, or `reply_delay = [0.001, 0.004]`."""
     value = table.data[key]
     bounds = value if isinstance(value, list) else [value]
     if len(bounds) not in (1, 2) or not all(type(bound) in (int, float) for bound in bounds):
         raise table.error("must be a number of seconds, or two of them: [0.001, 0.004]", key)
     with table.at(key):
         return Delay(*bounds)
+
+
+DELAY = Form(
+    "number, or list of two, s",
+    {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}, "minItems": 1, "maxItems": 2}]},
+    _read_delay,
+    written=lambda delay: delay.low,
+)
+FORMS: Mapping[str, Form] = {
+    "flag": form_of(bool),
+    "whole": form_of(Annotated[int, Between(1)]),
+    "number": form_of(float),
+    "positive": Form("number, more than 0", {"type": "number", "exclusiveMinimum": 0}, _read_positive),
+    "share": form_of(Annotated[float, Between(0, 1)]),
+    "delay": DELAY,
+    "numbers": Form(
+        "list of whole numbers",
+        {"type": "array", "items": ADDRESS_SCHEMA},
+        lambda table, key: frozenset(table.wholes(key, most=HIGHEST_ADDRESS)),
+    ),
+}
+"""The forms of the kinds of options that need nothing else."""

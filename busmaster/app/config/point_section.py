@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Annotated, Any
 
 from busmaster import Meaning, Point
+from busmaster.app.config.keys import Internal, keys_of, names_of, read_keys
 from busmaster.app.config.names import POINT_NAME
-from busmaster.app.config.table import Readers, Table, shown
+from busmaster.app.config.table import Table
 from busmaster.errors import BusError
-from busmaster.ext import MOST_DIGITS, OF_QUANTITIES, Between, MeansNothing, Placed, is_decimal
+from busmaster.ext import OF_QUANTITIES, Between, MeansNothing, Placed
 from busmaster.registry import NodeKind
 
 WIDEST = 64
@@ -27,20 +28,30 @@ class PointSection:
     `template`: the name of the template that says something of it, "" where the node's own section says all.
     """
 
-    name: str
-    item: str
+    name: Internal[str]
+    item: str = ""
+    """The ITEM that it is, as on the command line. The point's own name by default."""
     unit: str = ""
+    """The unit of its value: a name, which nothing is calculated with."""
     factor: float = 1
+    """value = number on the line x factor + offset."""
     offset: float = 0
+    """See `factor`."""
     decimals: Annotated[int, Between(0, 9)] = 0
+    """How many of the number's last digits are decimals, where the line carries no point."""
     minimum: float | None = None
+    """The least that may be written, in its unit, by whatever name and whoever writes."""
     maximum: float | None = None
+    """The most that may be written, likewise."""
     max_step: float | None = None
+    """How far a write may be from the last value that was confirmed; more than 0."""
     writable: bool = True
+    """Whether it may be written at all."""
     read_after_write: bool = False
-    meaning: Meaning
-    template: str = field(default="", compare=False)
-    table: Table = field(compare=False, repr=False)
+    """Whether a polled point is read as soon as a write to it is confirmed, ahead of its next poll."""
+    meaning: Internal[Meaning]
+    template: Internal[str] = field(default="", compare=False)
+    table: Internal[Table] = field(compare=False, repr=False)
 
     @property
     def limited(self) -> bool:
@@ -48,10 +59,8 @@ class PointSection:
         return not self.writable or any(getattr(self, limit) is not None for limit in LIMITS)
 
 
-NOT_SAID = ("name", "meaning", "template", "table")
-"""Fields of a section that are no keys of the file."""
-MEANINGS = tuple(part.name for part in fields(Meaning))
-POINT_KEYS = (*(part.name for part in fields(PointSection) if part.name not in NOT_SAID), *MEANINGS)
+MEANINGS = names_of(keys_of(Meaning))
+POINT_KEYS = (*names_of(keys_of(PointSection)), *MEANINGS)
 """All that a file can say of a point."""
 
 
@@ -62,15 +71,13 @@ def read_point(table: Table, kind: NodeKind, template: str = "") -> PointSection
     """
     if not POINT_NAME.fullmatch(table.name):
         raise table.error(f"a point's name has no spaces, commas or slashes: {table.name!r} has")
-    said = table.typed(PointSection, *MEANINGS, without=NOT_SAID, optional=("item",))
-    meant = table.typed(Meaning, *POINT_KEYS, readers=READERS, optional=("bits", "labels"))
+    table.only(*POINT_KEYS)
+    values = {"item": table.name, **read_keys(table, keys_of(PointSection))}
     try:
-        meaning = Meaning(**meant)
+        meaning = Meaning(**read_keys(table, keys_of(Meaning)))
     except MeansNothing as error:
         raise table.error(error.fault, error.field) from None
-    section = PointSection(
-        **{"item": table.name, **said}, name=table.name, meaning=meaning, template=template, table=table
-    )
+    section = PointSection(**values, name=table.name, meaning=meaning, template=template, table=table)
     if not section.factor:
         raise table.error("a factor of 0 makes every value the same", "factor")
     if section.decimals and not kind.takes_decimals:
@@ -80,39 +87,6 @@ def read_point(table: Table, kind: NodeKind, template: str = "") -> PointSection
             "decimals",
         )
     return section
-
-
-def _bits(table: Table, key: str) -> Mapping[str, int]:
-    """Read `{ READY = 0, FAULT = 3 }`."""
-    named = _named(table, key, "READY = 0")
-    return {name: named.whole(name) for name in named.data}
-
-
-def _labels(table: Table, key: str) -> Mapping[int, str]:
-    """Read `{ 0 = "off", 1 = "on" }`."""
-    named = _named(table, key, '0 = "off"')
-    for number in named.data:
-        if not is_decimal(number.removeprefix("-")):
-            raise named.error(f'labels are of whole numbers: {{ 0 = "off" }}, not of {number!r}', number)
-    labels = {int(number): named.text(number) for number in named.data}
-    if len(labels) < len(named.data):
-        raise table.error("say twice what a number is called", key)
-    return labels
-
-
-def _named(table: Table, key: str, example: str) -> Table:
-    given = table.data[key]
-    if not isinstance(given, dict) or not given:
-        what = "an empty table" if given == {} else shown(given)
-        raise table.error(f"must be a table of names: {{ {example} }}, not {what}", key)
-    return table.table(key)
-
-
-READERS: Readers = {
-    "bits": _bits,
-    "labels": _labels,
-    "precision": lambda table, key: table.whole(key, most=MOST_DIGITS),
-}
 
 
 def check_suits(section: PointSection, point: Point[Any], kind: NodeKind) -> None:

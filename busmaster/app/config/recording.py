@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from functools import partial
 from typing import TypeAlias
 
-from busmaster.app.config.table import Readers, Table
+from busmaster.app.config.keys import keys_of, names_of, read_keys
+from busmaster.app.config.table import Table
 from busmaster.app.outputs.kinds import OWN, find, names
 from busmaster.app.outputs.settings import Settings
 from busmaster.ext import meant
@@ -40,11 +40,13 @@ def _enabled(outer: Table, groups: Collection[str]) -> Iterator[tuple[str, Setti
         with table.part():
             with table.at():
                 kind = find(table.name)
-            readers: Readers = {**READERS, "groups": partial(_groups, known=groups)}
-            said = table.typed(kind.settings, "enabled", readers=readers, without=kind.without)
+            keys = [key for key in keys_of(kind.settings) if key.name not in kind.without]
+            table.only(*names_of(keys))
+            values = read_keys(table, keys)
+            _check_groups(table, values.get("groups", ()), groups)
             with table.at():
-                settings = kind.settings(**said)
-            if table.flag("enabled", True):
+                settings = kind.settings(**values)
+            if settings.enabled:
                 yield table.name, settings
 
 
@@ -55,41 +57,7 @@ def check_takes(table: Table, kind: str, settings: Settings, group: str, points:
         raise table.error(unsuitable.why, *([unsuitable.key] if unsuitable.key else []))
 
 
-def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
-    chosen = table.texts(key, ())
+def _check_groups(table: Table, chosen: Collection[str], known: Collection[str]) -> None:
     for number, name in enumerate(chosen):
         if name not in known:
-            raise table.error(f"no such group {name!r}; {meant(name, known)}", key, number)
-    return chosen
-
-
-def read_mode(table: Table, key: str) -> int:
-    """Read who may read and write a new file, as chmod takes it in octal."""
-    text = table.text(key)
-    if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
-        raise table.error('a mode is octal, as chmod takes it: mode = "0640"', key)
-    return int(text, 8)
-
-
-def _limit(table: Table, key: str) -> float:
-    """Read how much is kept, where not everything is."""
-    limit = table.number(key)
-    if limit <= 0:
-        raise table.error(f"must be more than 0, not {limit}; leave it out to keep all", key)
-    return limit
-
-
-def _topic(table: Table, key: str) -> str:
-    topic = table.text(key)
-    if not topic or set(topic) & set("+#") or topic.startswith("/") or topic.endswith("/") or not topic.isprintable():
-        raise table.error("a topic has neither + nor # nor control characters, nor a slash at an end", key)
-    return topic
-
-
-READERS: Readers = {
-    "mode": read_mode,
-    "keep_days": _limit,
-    "keep_mb": _limit,
-    "prefix": _topic,
-}
-"""What is more than its type."""
+            raise table.error(f"no such group {name!r}; {meant(name, known)}", "groups", number)

@@ -13,66 +13,54 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from busmaster.app.config.keys import Key, names_of
+from busmaster.app.config.keys import Form, Internal, read_section
 from busmaster.app.config.table import Table
 from busmaster.bounds import LONGEST_SAFE_STATE
-
-WITHIN = 2.0
-KEYS = (
-    Key(
-        "writes",
-        "table",
-        'The value that each point is left at, in its unit: `writes = { "winder/setpoint" = 0 }`, in this order. '
-        "One that may not be repeated, or cannot be read back, is refused when the file is read.",
-    ),
-    Key(
-        "within",
-        "number",
-        "The time for all of it, more than 0. What is not confirmed by then is named, and the exit status is 1.",
-        f"{WITHIN:g}",
-        "s",
-        least=0,
-        most=LONGEST_SAFE_STATE,
-    ),
-    Key(
-        "repeatable",
-        "texts",
-        "Points whose write the protocol does not know to be repeatable, and of which only you know that writing them "
-        "twice harms nobody.",
-    ),
-)
-"""Of `[safe]`."""
+from busmaster.errors import InvalidCommand
+from busmaster.ext import Between, Parsed
 
 
-@dataclass(frozen=True, slots=True)
+def _check_within(seconds: float) -> float:
+    if not 0 < seconds <= LONGEST_SAFE_STATE:
+        raise InvalidCommand(f"must be more than 0 and at most {LONGEST_SAFE_STATE:g} seconds, not {seconds}")
+    return seconds
+
+
+def _read_writes(table: Table, key: str) -> Mapping[str, float]:
+    values = table.table(key)
+    writes: dict[str, float] = {}
+    for name in values.data:
+        with values.part():
+            numbers = values.numbers(name)
+            if len(numbers) != 1:
+                raise values.error("is one value: write the others as points of their own", name)
+            writes[name] = numbers[0]
+    return writes
+
+
+WRITES = Form("table", {"type": "object", "additionalProperties": {"$ref": "#/$defs/values"}}, _read_writes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SafeSection:
     """What `[safe]` says: values by point, in their order. Without writes there is no safe state."""
 
-    within: float
-    repeatable: tuple[str, ...]
-    writes: Mapping[str, float]
-    table: Table = field(compare=False, repr=False)
+    writes: Annotated[Mapping[str, float], WRITES] = field(default_factory=dict)
+    """The value that each point is left at, in its unit: `writes = { "winder/setpoint" = 0 }`, in this order. One that
+    may not be repeated, or cannot be read back, is refused when the file is read."""
+    within: Annotated[float, Between(0, LONGEST_SAFE_STATE, "s", self_checked=True), Parsed(_check_within)] = 2.0
+    """The time for all of it, more than 0. What is not confirmed by then is named, and the exit status is 1."""
+    repeatable: tuple[str, ...] = ()
+    """Points whose write the protocol does not know to be repeatable, and of which only you know that writing them
+    twice harms nobody."""
+    table: Internal[Table] = field(compare=False, repr=False)
 
 
 def read_safe(table: Table) -> SafeSection:
     """Read `[safe]`. Raises FileError, naming line and key, for what is wrong in it."""
-    table.only(*names_of(KEYS))
-    within = table.number("within", WITHIN)
-    if not 0 < within <= LONGEST_SAFE_STATE:
-        raise table.error(f"must be more than 0 and at most {LONGEST_SAFE_STATE:g} seconds, not {within}", "within")
-    values = table.table("writes")
-    writes: dict[str, float] = {}
-    for name in values.data:
-        with values.part():
-            writes[name] = _one(values, name)
-    if table.data and not values.data:
+    section = SafeSection(**read_section(table, SafeSection), table=table)
+    if table.data and not table.table("writes").data:
         raise table.error('a safe state is of writes: writes = { "NODE/ITEM" = VALUE }')
-    return SafeSection(within, table.texts("repeatable", ()), writes, table)
-
-
-def _one(table: Table, name: str) -> float:
-    numbers = table.numbers(name)
-    if len(numbers) != 1:
-        raise table.error("is one value: write the others as points of their own", name)
-    return numbers[0]
+    return section

@@ -6,101 +6,73 @@ import grp
 import os
 import pwd
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Annotated, TypeVar
 
-from busmaster.app.config.keys import REQUIRED, Key, names_of
+from busmaster.app.config.keys import Form, Internal, read_section, tables_of
 from busmaster.app.config.names import NODE_NAME
-from busmaster.app.config.recording import read_mode
 from busmaster.app.config.table import Table
+from busmaster.app.outputs.settings import FileMode
 from busmaster.app.service.permission import digest_of
 from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.app.service.tcp import check_listening
 from busmaster.bounds import LONGEST_FILE, SHORTEST_TOKEN
 from busmaster.errors import InvalidCommand
-from busmaster.ext import LEAST_SHARE, MOST_SHARE, check_regular, host_and_port
+from busmaster.ext import LEAST_SHARE, MOST_SHARE, Between, Parsed, check_regular, host_and_port
 
 K = TypeVar("K")
 
 MODE = 0o600
-ROLES = tuple(role.value for role in Role)
-KEYS = (
-    Key("enabled", "flag", "Whether other programs may come at all.", "true"),
-    Key("group", "text", "The group of this machine whose members may come to the socket, beside this user."),
-    Key(
-        "mode",
-        "mode",
-        "The mode of the socket: 0660 where there is a `group`.",
-        f'"{MODE:04o}"',
-    ),
-    Key(
-        "share",
-        "number",
-        "The share of line time of each program, where the owner's is 1, as long as both wait.",
-        "1",
-        least=LEAST_SHARE,
-        most=MOST_SHARE,
-    ),
-    Key(
-        "listen",
-        "text",
-        "Where programs may come by TCP too, as HOST:PORT; beyond this machine only with `token_file`.",
-    ),
-    Key("token_file", "text", "The file of the tokens that who comes by TCP shows: a name and its token a line."),
-    Key("users", "table", "A table for each user of this machine that has a role: `[service.users.NAME]`."),
-    Key("groups", "table", "A table for each group of this machine that has a role: `[service.groups.NAME]`."),
-    Key("tokens", "table", "A table for each token that has a role: `[service.tokens.NAME]`."),
-)
-"""Of `[service]`."""
-ROLE_KEYS = (
-    Key(
-        "role",
-        "text",
-        "What a program may do: `write` may read too, and `admin` may use line time as the owner does.",
-        REQUIRED,
-        choices=ROLES,
-    ),
-    Key(
-        "allow_writes",
-        "texts",
-        "The points that a writer may write, as groups name points; `*` is any part of a node's name, and behind the "
-        "slash all of the node. Left out: all of the line.",
-    ),
-)
-"""Of each of its users, groups and tokens."""
+GROUP_MODE = 0o660
+"""Of the socket where there is a `group`."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoleSection:
-    """What a user, a group or a token may do. `only`: the points that may be written, as the file has them, if not all
-    may.
-    """
+    """What a user, a group or a token may do."""
 
-    who: str
+    who: Internal[str]
     role: Role
-    only: tuple[str, ...] | None
-    table: Table = field(compare=False, repr=False)
+    """What a program may do: `write` may read too, and `admin` may use line time as the owner does."""
+    allow_writes: tuple[str, ...] | None = None
+    """The points that a writer may write, as groups name points; `*` is any part of a node's name, and behind the slash
+    all of the node. Left out: all of the line."""
+    table: Internal[Table] = field(compare=False, repr=False)
 
 
-@dataclass(frozen=True, slots=True)
+def _group_number(group: str) -> int:
+    try:
+        return grp.getgrnam(group).gr_gid
+    except KeyError:
+        raise InvalidCommand(f"there is no group {group!r} on this machine") from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSection:
-    """What `[service]` says: whether a socket is served, its mode, and the number of its group, if it is given one.
+    """What `[service]` says: whether a socket is served, to whom, and what each client may do.
 
-    `listen` is where programs may come by TCP, None for nowhere; the tokens that they show are in `token_file`. Roles
-    are by the numbers of users and groups, and by the names of tokens; they may change while the line runs.
-    `share` weighs the line time of each program, where the owner's is 1.
+    Roles are by the numbers of users and groups, and by the names of tokens; they may change while the line runs.
     """
 
-    enabled: bool
-    mode: int
-    group: int | None
-    share: float
-    listen: tuple[str, int] | None
-    token_file: str | None
-    users: Mapping[int, RoleSection] = field(compare=False)
-    groups: Mapping[int, RoleSection] = field(compare=False)
-    tokens: Mapping[str, RoleSection] = field(compare=False)
-    table: Table = field(compare=False, repr=False)
+    enabled: bool = True
+    """Whether other programs may come at all."""
+    group: Annotated[int | None, Parsed(_group_number, str)] = None
+    """The group of this machine whose members may come to the socket, beside this user."""
+    mode: FileMode = MODE
+    """The mode of the socket: 0660 where there is a `group`."""
+    share: Annotated[float, Between(LEAST_SHARE, MOST_SHARE)] = 1.0
+    """The share of line time of each program, where the owner's is 1, as long as both wait."""
+    listen: Annotated[tuple[str, int] | None, Form("text", {"type": "string"})] = None
+    """Where programs may come by TCP too, as HOST:PORT; beyond this machine only with `token_file`."""
+    token_file: str | None = None
+    """The file of the tokens that who comes by TCP shows: a name and its token a line."""
+    users: Annotated[Mapping[int, RoleSection], tables_of("role")] = field(default_factory=dict, compare=False)
+    """A table for each user of this machine that has a role: `[service.users.NAME]`."""
+    groups: Annotated[Mapping[int, RoleSection], tables_of("role")] = field(default_factory=dict, compare=False)
+    """A table for each group of this machine that has a role: `[service.groups.NAME]`."""
+    tokens: Annotated[Mapping[str, RoleSection], tables_of("role")] = field(default_factory=dict, compare=False)
+    """A table for each token that has a role: `[service.tokens.NAME]`."""
+    table: Internal[Table] = field(compare=False, repr=False)
 
     def secrets(self) -> dict[str, bytes]:
         """Read the tokens, and return the digest of each by its name.
@@ -120,10 +92,21 @@ class ServiceSection:
 
 def read_service(table: Table) -> ServiceSection:
     """Read `[service]`. Raises FileError, naming line and key, for what is wrong in it."""
-    table.only(*names_of(KEYS))
-    group = table.text("group", None)
-    mode = read_mode(table, "mode") if "mode" in table else MODE if group is None else 0o660
-    token_file = table.text("token_file", None)
+    values = read_section(table, ServiceSection)
+    if "group" in values:
+        values.setdefault("mode", GROUP_MODE)
+    bare = ServiceSection(**values, table=table)
+    return replace(
+        bare,
+        listen=_listen(table, bare.token_file),
+        users=_roles(table, "users", lambda each: (_user(each), _role(each, "user"))),
+        groups=_roles(table, "groups", lambda each: (_group(each), _of_group(each, bare.mode))),
+        tokens=_roles(table, "tokens", lambda each: (_token(each, bare.token_file), _role(each, "token"))),
+    )
+
+
+def _listen(table: Table, token_file: str | None) -> tuple[str, int] | None:
+    """Read where programs may come by TCP."""
     listen = None
     with table.part():
         if "listen" in table:
@@ -132,21 +115,7 @@ def read_service(table: Table) -> ServiceSection:
                 check_listening(listen, tokens=token_file is not None)
         elif token_file is not None:
             raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
-    share = table.number("share", 1.0)
-    if not LEAST_SHARE <= share <= MOST_SHARE:
-        raise table.error(f"must be {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share:g}", "share")
-    return ServiceSection(
-        enabled=table.flag("enabled", True),
-        mode=mode,
-        group=None if group is None else _group(table, "group", group),
-        share=share,
-        listen=listen,
-        token_file=token_file,
-        users=_roles(table, "users", lambda each: (_user(each), _role(each, "user"))),
-        groups=_roles(table, "groups", lambda each: (_group(each, None, each.name), _of_group(each, mode))),
-        tokens=_roles(table, "tokens", lambda each: (_token(each, token_file), _role(each, "token"))),
-        table=table,
-    )
+    return listen
 
 
 def _roles(table: Table, key: str, read: Callable[[Table], tuple[K, RoleSection]]) -> dict[K, RoleSection]:
@@ -159,14 +128,12 @@ def _roles(table: Table, key: str, read: Callable[[Table], tuple[K, RoleSection]
 
 
 def _role(table: Table, kind: str) -> RoleSection:
-    table.only(*names_of(ROLE_KEYS))
-    role = Role(table.choice("role", ROLES))
-    only = table.texts("allow_writes", None)
-    if only is not None and not (RIGHTS[role].writes and only):
+    section = RoleSection(**read_section(table, RoleSection), who=f"{kind} {table.name}", table=table)
+    if section.allow_writes is not None and not (RIGHTS[section.role].writes and section.allow_writes):
         raise table.error(
             'names what a role = "write" or "admin" may write: leave it out for all of the line', "allow_writes"
         )
-    return RoleSection(f"{kind} {table.name}", role, only, table)
+    return section
 
 
 def _of_group(table: Table, mode: int) -> RoleSection:
@@ -182,12 +149,9 @@ def _user(table: Table) -> int:
         raise table.error(f"there is no user {table.name!r} on this machine") from None
 
 
-def _group(table: Table, key: str | None, group: str) -> int:
-    try:
-        return grp.getgrnam(group).gr_gid
-    except KeyError:
-        way = () if key is None else (key,)
-        raise table.error(f"there is no group {group!r} on this machine", *way) from None
+def _group(table: Table) -> int:
+    with table.at():
+        return _group_number(table.name)
 
 
 def _token(table: Table, token_file: str | None) -> str:

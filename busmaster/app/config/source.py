@@ -67,8 +67,8 @@ class Source:
             line = (found and found[1]) or len(text.splitlines())  # "at end of document" has no number
             what = AT.sub("", str(error))
             raise FileError(name, int(line), "", f"this is no TOML: {what[:1].lower()}{what[1:]}") from None
-        self.problems: dict[Key, list[FileError]] | None = None
-        """Where this is a dict, problems are collected in it, by the part of the file that has them; see `keep`."""
+        self.problems: dict[tuple[str, str], FileError] | None = None
+        """Where this is a dict, problems are collected in it, one for each key of a file; see `keep`."""
         self.unread: set[Key] = set()
         """The parts that could not be read to their end, where problems are collected."""
         self._places = places(text.replace("\r\n", "\n"))  # as tomllib itself reads it
@@ -98,16 +98,14 @@ class Source:
         shown = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
         return FileError(self.name, self.line(key) if key else 0, shown, text, key)
 
-    def keep(self, part: Key, error: FileError) -> None:
-        """Collect a problem of one part of the file, and return; raise it where problems are not collected.
+    def keep(self, error: FileError) -> None:
+        """Collect a problem, and return; raise it where problems are not collected.
 
         `load` and `open_line` stop at the first problem. `busmaster check` reads on, and reports all of them.
         """
         if self.problems is None:
             raise error
-        known = self.problems.setdefault(part, [])
-        if all((error.file, error.key or error.what) != (one.file, one.key or one.what) for one in known):
-            known.append(error)
+        self.problems.setdefault((error.file, error.key or error.what), error)
 
 
 def check_bounds(name: str, text: str) -> None:

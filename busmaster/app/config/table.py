@@ -1,12 +1,11 @@
-"""One table of the file, read key by key: what is wrong with a value is said with its place and its nearest name."""
+"""One table of the file, read key by key. Errors name file, line and key, and the nearest name that there is."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar
 
 from busmaster.app.config.source import FileError, Key, Source
 from busmaster.bounds import LARGEST_WHOLE
@@ -14,19 +13,10 @@ from busmaster.errors import InvalidCommand
 from busmaster.ext import meant, now_called
 
 T = TypeVar("T")
-Readers: TypeAlias = Mapping[str, "Callable[[Table, str], Any]"]
-"""How keys are read, by name, whose values are more than their type."""
-
-
-class _Required:
-    """Stands for a default where there is none."""
-
-
-REQUIRED: Final = _Required()
 
 
 class Table:
-    """Every reading raises FileError for a value of another kind, and for one that is missing without a default."""
+    """Every method that reads a value raises FileError for one of another type, and for one that is missing."""
 
     def __init__(self, source: Source, key: Key = (), data: dict[str, Any] | None = None) -> None:
         self.source = source
@@ -44,7 +34,7 @@ class Table:
         """Refuse other keys. Raises FileError for a key that is none of these."""
         for key in self.data:
             if key not in known:
-                self.source.keep(self.key, self.error(f"no such key; {self._meant(key, known)}", key))
+                self.source.keep(self.error(f"no such key; {self._meant(key, known)}", key))
 
     def _meant(self, key: str, known: tuple[str, ...]) -> str:
         new = now_called(key, known)
@@ -65,7 +55,7 @@ class Table:
         try:
             yield
         except FileError as error:
-            self.source.keep(self.key, error)
+            self.source.keep(error)
             self.source.unread.add(self.key)
 
     @contextmanager
@@ -80,76 +70,54 @@ class Table:
 
     # values
 
-    def text(self, key: str, default: T | _Required = REQUIRED) -> str | T:
+    def text(self, key: str) -> str:
         """Read a text."""
-        value: str | T = self._take(key, str, default, "a text in quotes")
-        return value
+        return str(self._take(key, str, "a text in quotes"))
 
-    def flag(self, key: str, default: bool) -> bool:
+    def flag(self, key: str) -> bool:
         """Read true or false."""
-        value: bool = self._take(key, bool, default, "true or false")
-        return value
+        return bool(self._take(key, bool, "true or false"))
 
-    def whole(
-        self, key: str, default: T | _Required = REQUIRED, *, least: int = 0, most: int = LARGEST_WHOLE
-    ) -> int | T:
+    def whole(self, key: str, *, least: int = 0, most: int = LARGEST_WHOLE) -> int:
         """Read a whole number, `least` to `most`."""
-        value: int | T = self._take(key, int, default, "a whole number")
-        if key in self.data and isinstance(value, int) and not least <= value <= most:
+        value: int = self._take(key, int, "a whole number")
+        if not least <= value <= most:
             raise self.error(f"must be {least} to {most}, not {value}", key)
         return value
 
-    def number(self, key: str, default: T | _Required = REQUIRED) -> float | T:
+    def number(self, key: str) -> float:
         """Read a finite number."""
-        value: float | T = self._take(key, (int, float), default, "a number")
-        if isinstance(value, float) and not math.isfinite(value):  # TOML has inf and nan
+        value: float = self._take(key, (int, float), "a number")
+        if not -math.inf < value < math.inf:  # TOML has inf and nan
             raise self.error(f"must be finite, not {value}", key)
         return value
 
-    def seconds(self, key: str, default: T | _Required = REQUIRED, *, most: float) -> float | T:
-        """Read a number of seconds, 0 to `most`."""
-        value: float | T = self._take(key, (int, float), default, "a number of seconds")
-        if isinstance(value, int | float) and not 0 <= value <= most:
-            raise self.error(f"must be a number of seconds, 0 to {most:g}, not {value}", key)
+    def seconds(self, key: str, *, least: float = 0, most: float) -> float:
+        """Read a number of seconds, `least` to `most`."""
+        value: float = self._take(key, (int, float), "a number of seconds")
+        if not least <= value <= most:
+            raise self.error(f"must be a number of seconds, {least:g} to {most:g}, not {value}", key)
         return value
 
-    def positive(self, key: str) -> float:
-        """Read a number above 0."""
-        value = self.number(key)
-        if value <= 0:
-            raise self.error(f"must be above 0, not {value}", key)
-        return value
-
-    def share(self, key: str) -> float:
-        """Read a number from 0 to 1."""
-        value = self.number(key)
-        if not 0 <= value <= 1:
-            raise self.error(f"must be 0 to 1, not {value}", key)
-        return value
-
-    def choice(self, key: str, known: Iterable[str], default: T | _Required = REQUIRED) -> str | T:
+    def choice(self, key: str, known: Iterable[str]) -> str:
         """Read a text that is one of `known`."""
-        known = tuple(known)
-        value = self.text(key, default)
-        if key in self.data and value not in known:
-            raise self.error(f"no such {key} {value!r}; {meant(str(value), known)}", key)
+        known, value = tuple(known), self.text(key)
+        if value not in known:
+            raise self.error(f"no such {key} {value!r}; {meant(value, known)}", key)
         return value
 
-    def texts(self, key: str, default: T | _Required = REQUIRED) -> tuple[str, ...] | T:
+    def texts(self, key: str) -> tuple[str, ...]:
         """Read one text or several."""
-        if key in self.data and isinstance(self.data[key], str):
-            return (self.data[key],)
-        values: list[Any] | T = self._take(key, list, default, "a list of texts")
-        if not isinstance(values, list):
-            return values
+        given = self.data.get(key)
+        values = [given] if isinstance(given, str) else self._take(key, list, "a list of texts")
         for number, value in enumerate(values):
             if not isinstance(value, str):
                 raise self.error(f"must be a text in quotes, not {value!r}", key, number)
         return tuple(values)
 
-    def wholes(self, key: str, *, most: int = LARGEST_WHOLE) -> tuple[int, ...]:
+    def wholes(self, key: str, *, most: int) -> tuple[int, ...]:
         """Read a list of whole numbers, 0 to `most`."""
-        values = self._take(key, list, REQUIRED, "a list of whole numbers")
+        values = self._take(key, list, "a list of whole numbers")
         for number, value in enumerate(values):
             if type(value) is not int or not 0 <= value <= most:
                 raise self.error(f"must be a whole number, 0 to {most}, not {shown(value)}", key, number)
@@ -165,53 +133,13 @@ class Table:
                 raise self.error(f"must be a number, true or false, or a list of them, not {shown(value)}", *way)
         return tuple(values)
 
-    def typed(
-        self,
-        kind: type,
-        *others: str,
-        readers: Readers | None = None,
-        without: Container[str] = (),
-        optional: Container[str] = (),
-    ) -> dict[str, Any]:
-        """Return what the table says of a dataclass's fields, each read as its type wants it, or by its reader.
-
-        The fields `without` cannot be said; those that are `optional` may be missing though they have no default.
-        Raises FileError for a key that is neither a field nor one of `others`, and for a field that is missing.
-        """
-        hints = get_type_hints(kind, include_extras=True)
-        parts = [part for part in dataclasses.fields(kind) if part.name not in without]
-        self.only(*others, *(part.name for part in parts))
-        said: dict[str, Any] = {}
-        for part in parts:
-            if part.name not in self and (part.default is not dataclasses.MISSING or part.name in optional):
-                continue
-            own = (readers or {}).get(part.name)
-            said[part.name] = own(self, part.name) if own else self._typed(part.name, hints[part.name])
-        return said
-
-    def _typed(self, key: str, hint: Any) -> Any:
-        if get_origin(hint) is Annotated:
-            bare, bounds = get_args(hint)
-            if bare is int:
-                return self.whole(key, least=int(bounds.least), most=bounds.most)
-            value = self._typed(key, bare)
-            if not bounds.least <= value <= bounds.most:
-                most = " or more" if bounds.most == math.inf else f" to {bounds.most}"
-                raise self.error(f"must be {bounds.least}{most}, not {value}", key)
-            return value
-        if get_origin(hint) is Literal:
-            return self.choice(key, get_args(hint))
-        kinds = get_args(hint) or (hint,)  # of a union the one that a file can say
-        for kind, read in ((bool, lambda name: self.flag(name, False)), (int, self.whole), (float, self.number)):
-            if kind in kinds:
-                return read(key)
-        return self.texts(key) if get_origin(hint) is tuple else self.text(key)
-
     # tables
 
     def table(self, key: str) -> Table:
         """Return the table under this key, an empty one where there is none."""
-        return Table(self.source, (*self.key, key), self._take(key, dict, {}, f"a table: [{self._path(key)}]"))
+        path = ".".join(map(str, (*self.key, key)))
+        data = self._take(key, dict, f"a table: [{path}]") if key in self.data else {}
+        return Table(self.source, (*self.key, key), data)
 
     def tables(self, key: str) -> Iterator[Table]:
         """Return each of the tables in it: `[nodes.winder]`, `[nodes.press]`."""
@@ -235,14 +163,9 @@ class Table:
                 found.append(read(table))
         return found[0] if found else read(Table(self.source, (*self.key, key), {}))
 
-    def _path(self, key: str) -> str:
-        return ".".join(str(part) for part in (*self.key, key))
-
-    def _take(self, key: str, kind: type | tuple[type, ...], default: Any, meant: str) -> Any:
+    def _take(self, key: str, kind: type | tuple[type, ...], meant: str) -> Any:
         if key not in self.data:
-            if default is REQUIRED:
-                raise self.error(f"{key!r} is missing: {meant}")
-            return default
+            raise self.error(f"{key!r} is missing: {meant}")
         value = self.data[key]
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):  # True is an int to Python
             raise self.error(f"must be {meant}, not {shown(value)}", key)

@@ -17,8 +17,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Annotated
 
-from busmaster.app.config.keys import REQUIRED, Key, names_of
+from busmaster.app.config.keys import Internal, read_section, tables_of
 from busmaster.app.config.point_section import PointSection, read_point
 from busmaster.app.config.source import FileError, Source
 from busmaster.app.config.table import Table
@@ -27,20 +28,19 @@ from busmaster.registry import NodeKind, kinds
 
 FOLDERS = Path(__file__).parents[2] / "protocols"
 SUFFIX = ".toml"
-KEYS = (
-    Key("title", "text", "What it is a template of, for people."),
-    Key("protocol", "texts", "The protocol of the nodes that it is for, or several.", REQUIRED),
-    Key("points", "table", "A table for each point, as `[nodes.NAME.points]` has them."),
-)
-"""Of a template's file."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Template:
     """What a template says of each of its points. Without a name it is none."""
 
-    name: str
-    points: Mapping[str, Table]
+    name: Internal[str] = ""
+    protocol: tuple[str, ...]
+    """The protocol of the nodes that it is for, or several."""
+    title: str = ""
+    """What it is a template of, for people."""
+    points: Annotated[Mapping[str, Table], tables_of("point")]
+    """A table for each point, as `[nodes.NAME.points]` has them."""
 
 
 @cache
@@ -65,17 +65,16 @@ def read_template(node: Table, kind: NodeKind) -> Template:
     Raises FileError, naming the file and the line, for a template that there is not, is for others, or is wrong.
     """
     if "template" not in node:
-        return Template("", {})
+        return Template(protocol=(), points={})
     name = node.text("template")
     top = Table(_source(node, name))
-    top.only(*names_of(KEYS))
-    protocols = top.texts("protocol")
-    for protocol in protocols:
+    values = read_section(top, Template)
+    for protocol in values["protocol"]:
         if protocol not in kinds():
             raise top.error(f"no such protocol {protocol!r}{guess(protocol, kinds())}", "protocol")
-    if kind.name not in protocols:
-        raise node.error(f"{name} is for nodes of {' and '.join(protocols)}, not of {kind.name}", "template")
-    template = Template(name, {point.name: point for point in top.tables("points")})
+    template = Template(**values, name=name, points={point.name: point for point in top.tables("points")})
+    if kind.name not in template.protocol:
+        raise node.error(f"{name} is for nodes of {' and '.join(template.protocol)}, not of {kind.name}", "template")
     for point in template.points.values():
         read_point(point, kind)  # what is wrong in the template is said with its own line
     return template

@@ -8,46 +8,65 @@ timing = "learned"                                 # from the replies; { learned
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, TypeAlias
 
 from busmaster import ReplyTiming, Timings
-from busmaster.app.config.keys import Key, names_of
+from busmaster.app.config.keys import Form, keys_of, names_of, number, read_keys, read_section, table_of
 from busmaster.app.config.table import Table
 from busmaster.bounds import LONGEST_TIMING
+from busmaster.ext import Between
 
 LEARNED_WORD = "learned"
+TIMING = Form("table or text", {"anyOf": [{"enum": [LEARNED_WORD]}, {"$ref": "#/$defs/timing"}]}, name="timing")
+"""Of a node's reply times."""
 
 
-def _time(name: str, about: str) -> Key:
-    return Key(name, "seconds", f"{about} The protocol's by default.", unit="s", least=0, most=LONGEST_TIMING)
+def _read_time(table: Table, key: str) -> float:
+    time = table.seconds(key, most=math.inf)
+    if time > LONGEST_TIMING:
+        raise table.error(
+            f"times are in seconds, {LONGEST_TIMING:g} at most: for {time:g} ms write {time / 1000:g}", key
+        )
+    return time
 
 
-TIME_KEYS = (
-    _time("late_after", "A reply that begins by then is on time; a later one is counted late."),
-    _time(
-        "window", "A reply that begins by then is as expected; a later one, until `max_reply_delay`, is delivered late."
-    ),
-    _time(
-        "max_reply_delay", "What has not begun by then never comes: on this it rests that no value is another's (R3)."
-    ),
-    _time("inter_byte_timeout", "The longest pause between two bytes of one reply."),
-    _time("driver_release_time", "How long the node's driver holds the line after its reply."),
-)
-KEYS = (
-    *TIME_KEYS,
-    Key("read", "table", "The same times, of reads alone."),
-    Key("write", "table", "The same times, of writes alone."),
-    Key("packet", "table", "The same times, of a packet that follows an acknowledgement, where there are such."),
-    Key(
-        LEARNED_WORD,
-        "flag",
-        'Whether windows are learned from the replies; `timing = "learned"` is short for it. The others are then those '
-        "to begin with.",
-        "false",
-    ),
-)
-"""Of `timing`."""
-TIMES = names_of(TIME_KEYS)
+Time: TypeAlias = Annotated[float | None, replace(number(Between(0, LONGEST_TIMING, "s")), read=_read_time)]
+Times: TypeAlias = Annotated[Mapping[str, Any] | None, table_of("times")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimesSection:
+    """The reply times of requests of one kind; those that are left out are the protocol's."""
+
+    late_after: Time = None
+    """A reply that begins by then is on time; a later one is counted late. The protocol's by default."""
+    window: Time = None
+    """A reply that begins by then is as expected; a later one, until `max_reply_delay`, is delivered late. The
+    protocol's by default."""
+    max_reply_delay: Time = None
+    """Longest time after a request at which its reply can begin. It must exceed the slowest reply, or replies can be
+    attributed to the wrong request (R3). The protocol's by default."""
+    inter_byte_timeout: Time = None
+    """The longest pause between two bytes of one reply. The protocol's by default."""
+    driver_release_time: Time = None
+    """How long the node's driver holds the line after its reply. The protocol's by default."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimingSection(TimesSection):
+    """The reply times of a node."""
+
+    read: Times = None
+    """The same times, of reads alone."""
+    write: Times = None
+    """The same times, of writes alone."""
+    packet: Times = None
+    """The same times, of a packet that follows an acknowledgement, where there are such."""
+    learned: bool = False
+    """Whether windows are learned from the replies; `timing = "learned"` is short for it. The others are then those to
+    begin with."""
 
 
 def read_timings(table: Table, base: Timings) -> Timings:
@@ -59,12 +78,13 @@ def read_timings(table: Table, base: Timings) -> Timings:
         table.choice("timing", (LEARNED_WORD,))
         return base
     timing = table.table("timing")
-    timing.only(*names_of(KEYS))
-    read, write = _changed(timing, base.read), _changed(timing, base.write)
+    timing.only(*names_of(keys_of(TimingSection)))
+    both = read_keys(timing, keys_of(TimesSection))
+    read, write = _changed(timing, base.read, both), _changed(timing, base.write, both)
     return Timings(
-        read=_changed(timing.table("read"), read, step=True),
-        write=_changed(timing.table("write"), write, step=True),
-        packet=_changed(timing.table("packet"), base.packet, step=True),
+        read=_step(timing, read, "read"),
+        write=_step(timing, write, "write"),
+        packet=_step(timing, base.packet, "packet"),
     )
 
 
@@ -73,18 +93,16 @@ def reads_learned(table: Table, base: bool) -> bool:
     timing = table.data.get("timing")
     if isinstance(timing, str):
         return timing == LEARNED_WORD
-    return table.table("timing").flag(LEARNED_WORD, base)
+    table = table.table("timing")
+    return table.flag("learned") if "learned" in table else base
 
 
-def _changed(table: Table, timing: ReplyTiming, step: bool = False) -> ReplyTiming:
-    if step:
-        table.only(*TIMES)
-    given = {name: table.seconds(name, most=math.inf) for name in TIMES if name in table}
-    for name, time in given.items():
-        if time > LONGEST_TIMING:
-            raise table.error(
-                f"times are in seconds, {LONGEST_TIMING:g} at most: for {time:g} ms write {time / 1000:g}", name
-            )
+def _step(timing: Table, base: ReplyTiming, name: str) -> ReplyTiming:
+    table = timing.table(name)
+    return _changed(table, base, read_section(table, TimesSection))
+
+
+def _changed(table: Table, timing: ReplyTiming, given: Mapping[str, float]) -> ReplyTiming:
     window = given.get("window", timing.window)
     moved = {"late_after": min(timing.late_after, window), "max_reply_delay": max(timing.max_reply_delay, window)}
     with table.at():

@@ -37,10 +37,10 @@ def access_of(section: ServiceSection, names: Names, secrets: Mapping[str, bytes
 
 
 def _permission(role: RoleSection, names: Names) -> Permission:
-    if role.only is None:
+    if role.allow_writes is None:
         return Permission(role.who, role.role)
     only: dict[tuple[str, int], frozenset[Hashable] | None] = {}
-    for number, text in enumerate(role.only):
+    for number, text in enumerate(role.allow_writes):
         with role.table.part(), role.table.at("allow_writes", number):
             for (protocol, address), places in _places(text, names):
                 before = only.get((protocol, address), frozenset())

@@ -66,7 +66,7 @@ def _made(source: Source) -> tuple[LineFile | None, ConfiguredLine | None]:
             table = file.table.table("outputs").table(kind)
             settings.check_files(partial(_part_at, table))
     except FileError as error:  # one that leaves nothing to read on with
-        source.keep((), error)
+        source.keep(error)
         return None, None
     return file, line
 
@@ -82,8 +82,7 @@ def _told(source: Source, line: ConfiguredLine | None) -> Iterator[FileError]:
     """Yield the problems that do not only follow from others, by their place in the file."""
     assert source.problems is not None
     unknown = _unread_nodes(source, line)
-    found = [error for part in source.problems for error in source.problems[part]]
-    for error in sorted(found, key=lambda error: (error.file != source.name, error.line)):
+    for error in sorted(source.problems.values(), key=lambda error: (error.file != source.name, error.line)):
         if not any(_names(text, unknown) for text in _texts(source, error.way)):
             yield error
 

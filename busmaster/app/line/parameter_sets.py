@@ -113,14 +113,18 @@ def _read(table: Table) -> tuple[NodeKind, ParameterSet]:
     wanted = ParameterSet(
         protocol=kind.name,
         address=address,
-        label=drive.text("label", ""),
-        line=drive.text("line", ""),
+        label=_text(drive, "label"),
+        line=_text(drive, "line"),
         saved=_time(saved),
-        by=saved.text("by", ""),
+        by=_text(saved, "by"),
         identity={item: _value(identity, item) for item in identity.data},
         entries={entry.item: Entry(entry, value) for entry, value in _entries(parameters, kind)},
     )
     return kind, wanted
+
+
+def _text(table: Table, key: str) -> str:
+    return table.text(key) if key in table else ""
 
 
 def _time(table: Table) -> datetime:
@@ -136,14 +140,14 @@ def _entries(table: Table, kind: NodeKind) -> Iterator[tuple[Parameter, Value]]:
         entry.only(*ENTRY_KEYS)
         parameter = Parameter(
             item=item,
-            name=entry.text("name", ""),
-            unit=entry.text("unit", ""),
-            access="read" if entry.choice("access", ["read"], "") else "",
-            decimals=entry.whole("decimals", 0, most=MOST_DECIMALS),
-            factor=entry.number("factor", 1),
-            offset=entry.number("offset", 0),
-            minimum=entry.number("minimum", None),
-            maximum=entry.number("maximum", None),
+            name=_text(entry, "name"),
+            unit=_text(entry, "unit"),
+            access=entry.choice("access", ["read"]) if "access" in entry else "",
+            decimals=entry.whole("decimals", most=MOST_DECIMALS) if "decimals" in entry else 0,
+            factor=entry.number("factor") if "factor" in entry else 1,
+            offset=entry.number("offset") if "offset" in entry else 0,
+            minimum=entry.number("minimum") if "minimum" in entry else None,
+            maximum=entry.number("maximum") if "maximum" in entry else None,
         )
         value = _value(entry, "value")
         with entry.at():

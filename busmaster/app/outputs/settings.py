@@ -1,4 +1,4 @@
-"""What each output is told, as data."""
+"""The settings of each output. A field is a key of its table in LINE.toml: see docs/adding-a-key.md."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias
 
 from busmaster.bounds import MOST_BUFFERED, MOST_SPILLED
 from busmaster.errors import InvalidCommand
-from busmaster.ext import MODE, Between, read_file
+from busmaster.ext import MODE, Between, Parsed, read_file
 
 if TYPE_CHECKING:
     import ssl
@@ -25,12 +25,38 @@ DATE_FIELDS = frozenset("YCyGgmbBhdejaAuwUWVHIklMSspPFTRrXzZ")
 AuditMode: TypeAlias = Literal["batched", "strict"]
 
 
+def file_mode(text: str) -> int:
+    """Return the mode of a file that chmod takes in octal. Raises InvalidCommand."""
+    if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
+        raise InvalidCommand('a mode is octal, as chmod takes it: mode = "0640"')
+    return int(text, 8)
+
+
+FileMode: TypeAlias = Annotated[int, Parsed(file_mode, str, "text, octal", "{:04o}".format)]
+
+
+def _limit(value: float) -> float:
+    if value <= 0:
+        raise InvalidCommand(f"must be more than 0, not {value}; leave it out to keep all")
+    return value
+
+
+def _topic(topic: str) -> str:
+    if not topic or set(topic) & set("+#") or topic.startswith("/") or topic.endswith("/") or not topic.isprintable():
+        raise InvalidCommand("a topic has neither + nor # nor control characters, nor a slash at an end")
+    return topic
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """`groups`: the poll groups whose values it gets, all if there are none. `buffer`: values that may wait for it."""
+    """What every output can be told."""
 
+    enabled: bool = True
+    """Whether it is used. What is said of one that is not must be right, too."""
     groups: tuple[str, ...] = ()
+    """The poll groups whose values it gets. All by default; of metrics none."""
     buffer: Annotated[int, Between(1, MOST_BUFFERED)] = BUFFER
+    """Values that may wait for it; the oldest are dropped, and counted."""
 
     def __post_init__(self) -> None:
         if self.buffer < 1:
@@ -56,27 +82,26 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpillingSettings(Settings):
-    """`spill` is a file for what waits while the output is down, which then survives a restart: `spill_values` at most.
+    """What can be told an output that writes files, or has one for values that wait."""
 
-    It is best on another disk than what it stands in for. `mode` is what new files may be used for and by whom,
-    narrowed by the process's umask.
-    """
-
-    mode: int = MODE
+    mode: FileMode = MODE
+    """Who may read and write the files that it makes, as chmod takes it, narrowed by the umask."""
     spill: str | None = None
+    """The file for what waits while the output is down, and over a restart. Best on another disk."""
     spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
+    """The most values that wait in that file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileSettings(SpillingSettings):
-    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes; %% is a %.
-
-    `sync_every`: after so many seconds at most what was written survives a loss of power too; 0 for after each batch.
-    """
+    """An output to a file of lines. A new file begins when the name that `path` has at this time changes."""
 
     path: str
-    sync_every: Annotated[float, Between(0)] = 10.0
+    """The file. Fields of a date make new ones: `line-%Y-%m-%d.csv`; %% is a %."""
+    sync_every: Annotated[float, Between(0, unit="s")] = 10.0
+    """After so long at most what was written survives a loss of power, too; 0: after each batch."""
     audit: AuditMode = "batched"
+    """`strict`: a write is acknowledged to its client only after its audit entry is on the disk."""
 
     @property
     def destination(self) -> str:
@@ -94,12 +119,16 @@ class FileSettings(SpillingSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SqliteSettings(SpillingSettings):
-    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all."""
+    """An output to a database."""
 
     path: str
+    """The database."""
     audit: AuditMode = "batched"
-    keep_days: float | None = None
-    keep_mb: float | None = None
+    """`strict`: a write is acknowledged to its client only after its audit entry is on the disk."""
+    keep_days: Annotated[float | None, Between(unit="days"), Parsed(_limit)] = None
+    """What is older is deleted. More than 0; all is kept by default."""
+    keep_mb: Annotated[float | None, Between(unit="MB"), Parsed(_limit)] = None
+    """The oldest is deleted where the database is larger. More than 0; all is kept by default."""
 
     @property
     def destination(self) -> str:
@@ -115,22 +144,30 @@ class SqliteSettings(SpillingSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MqttSettings(SpillingSettings):
-    """`messages`: one for each "point", or one for each "cycle". `qos` 0 may lose values unseen, 1 does not.
-
-    `allow_commands` names the points ("winder/1") that commands may write; without any, no command is listened to.
-    """
+    """An output to an MQTT broker."""
 
     host: str = "127.0.0.1"
+    """The broker."""
     port: Annotated[int, Between(1, 65535)] = 1883
-    prefix: str = "busmaster"
+    """The TCP port there."""
+    prefix: Annotated[str, Parsed(_topic)] = "busmaster"
+    """What all topics begin with."""
     messages: Literal["point", "cycle"] = "point"
+    """One message for each point, or one for each cycle of a group."""
     qos: Annotated[int, Between(0, 1)] = 1
+    """0: values may be lost unseen; 1: they are not."""
     retain: bool = True
+    """Whether the broker keeps the last value of each point."""
     username: str | None = None
+    """The user to be at the broker."""
     password_file: str | None = None
+    """The file with that user's password."""
     tls: bool = False
+    """Whether the connection is encrypted."""
     ca_file: str | None = None
+    """The certificates that are trusted; the system's by default."""
     allow_commands: tuple[str, ...] = ()
+    """The points that messages may write. None by default, and then no command is listened to."""
 
     @property
     def destination(self) -> str:
@@ -180,10 +217,12 @@ class MqttSettings(SpillingSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MetricsSettings(Settings):
-    """Where it is served: only there. The values of `groups` are served too; without any, only counts are."""
+    """An output that Prometheus reads. The values of `groups` are served too; without any, only counts are."""
 
     host: str = "127.0.0.1"
+    """Where they are served: only there."""
     port: Annotated[int, Between(0, 65535)] = 9464
+    """The TCP port there."""
 
     @property
     def destination(self) -> str:

@@ -44,6 +44,12 @@ def test_problems_are_a_line_each_and_end_with_1(busmaster: Command, path: Path)
     assert verdict == f"{path}: 2 problems"
 
 
+def test_schema_option_prints_the_published_json_schema_and_needs_no_file(busmaster: Command) -> None:
+    printed = busmaster("check", "--schema")
+    assert (printed.status, printed.err) == (0, "")
+    assert printed.out == (Path(__file__).parents[3] / "docs" / "line.schema.json").read_text()
+
+
 def test_warnings_go_to_standard_error_and_are_no_problems(busmaster: Command, path: Path) -> None:
     path.write_text(GOOD.partition("[groups")[0])
     checked = busmaster("check", str(path))

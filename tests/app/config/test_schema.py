@@ -1,20 +1,24 @@
-"""What the reference says of LINE.toml's keys is what reading does: names, kinds, bounds, defaults."""
+"""The keys of LINE.toml as they are declared: read, bounded, and described in the reference and the JSON Schema."""
 
 from __future__ import annotations
 
-import math
 import re
+import tomllib
 from collections.abc import Iterator
+from datetime import date
+from pathlib import Path
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
 
-from busmaster.app.config.keys import REQUIRED, Key, TableKeys
-from busmaster.app.config.schema import tables
-from busmaster.app.config.sections import LineFile, read
+from busmaster.app.config.keys import Key
+from busmaster.app.config.schema import TableKeys, json_schema, tables
+from busmaster.app.config.sections import read
 from busmaster.app.config.source import FileError, Source
 from busmaster.registry import Option, kinds
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 BASE: dict[str, Any] = {
     "port": {"path": "/dev/ttyUSB0"},
     "nodes": {"n": {"protocol": "hcp2", "address": 1, "points": {"p": {"item": "10"}}}},
@@ -47,12 +51,29 @@ PLACES: dict[str, tuple[str, ...]] = {
     "faults = {}": ("emulator", "faults"),
 }
 """Where each table of the reference stands in it. Those of one protocol's nodes have files of their own."""
-WRONG: dict[str, Any] = {
-    **dict.fromkeys(("text", "mode", "texts"), 7),
-    **dict.fromkeys(("flag", "whole", "number", "seconds", "wholes", "table", "delay"), "no"),
-    **dict.fromkeys(("address", "timing", "port"), True),
-}
-"""For each kind of key a value of another."""
+VALUES: tuple[Any, ...] = (
+    *(
+        "none-of-them",
+        0,
+        1,
+        7,
+        -7,
+        1.5,
+        True,
+        [],
+        ["x"],
+        [7],
+        {},
+        {"a": 1},
+        {"a": "x"},
+        {"a": [7]},
+        [{}],
+        date(2026, 1, 1),
+    ),
+)
+"""Values of every type that TOML has."""
+SCHEMA = json_schema()
+WHOLE = Draft202012Validator(SCHEMA)
 
 
 def placed(table: TableKeys) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -68,13 +89,8 @@ def placed(table: TableKeys) -> tuple[dict[str, Any], tuple[str, ...]]:
     return {"port": {"path": "/dev/ttyUSB0"}, "nodes": {"n": {"protocol": kind} | address}}, PLACES[header]
 
 
-def said(data: dict[str, Any], place: tuple[str, ...], key: str, *value: Any) -> LineFile:
+def source_with(data: dict[str, Any], place: tuple[str, ...], key: str, *value: Any) -> Source:
     """The file with this value there, or without that key."""
-    if not place:
-        changed = {name: old for name, old in data.items() if name != key} | ({key: value[0]} if value else {})
-        source = Source("line.toml", "")
-        source.data = changed
-        return read(source)
     copy: dict[str, Any] = {**data}
     inner = copy
     for name in place:
@@ -85,47 +101,108 @@ def said(data: dict[str, Any], place: tuple[str, ...], key: str, *value: Any) ->
         inner[key] = value[0]
     source = Source("line.toml", "")
     source.data = copy
-    return read(source)
+    return source
+
+
+def problem_of(data: dict[str, Any], place: tuple[str, ...], key: str, *value: Any) -> str:
+    """What is wrong with that file, "" if nothing is."""
+    try:
+        read(source_with(data, place, key, *value))
+    except FileError as error:
+        return str(error)
+    return ""
+
+
+def allows(key: Key, value: Any) -> bool:
+    """Whether the JSON Schema allows a value of the key."""
+    return bool(WHOLE.evolve(schema=dict(key.form.schema)).is_valid(value))
 
 
 KEYS = [(table, key) for table in tables() if table.header != "A template" for key in table.keys if "." not in key.name]
-each_key = pytest.mark.parametrize(("table", "key"), KEYS, ids=[f"{table.header} {key.name}" for table, key in KEYS])
 
 
-@each_key
-def test_a_key_of_the_reference_is_known_and_takes_no_other_kind_of_value(table: TableKeys, key: Key) -> None:
-    with pytest.raises(FileError) as caught:
-        said(*placed(table), key.name, WRONG[key.kind])
-    assert "no such key" not in str(caught.value)
+def test_json_schema_is_of_draft_2020_12() -> None:
+    Draft202012Validator.check_schema(SCHEMA)
 
 
-@each_key
-def test_a_value_beyond_the_bounds_of_the_reference_is_refused(table: TableKeys, key: Key) -> None:
-    beyond = [bound for bound in (key.least - 1, key.most + 1) if math.isfinite(bound)]
-    whole = key.kind == "whole"
-    for value in beyond:
-        with pytest.raises(FileError):
-            said(*placed(table), key.name, int(value) if whole else float(value))
-    if key.choices:
-        with pytest.raises(FileError, match=f"{re.escape(key.choices[0])}"):
-            said(*placed(table), key.name, "none-of-them")
-
-
-@each_key
-def test_left_out_a_key_is_as_its_default_says(table: TableKeys, key: Key) -> None:
-    data, place = placed(table)
-    if key.default == REQUIRED:
-        with pytest.raises(FileError):
-            said(data, place, key.name)
-    elif key.default:
-        source = Source("default", f"value = {key.default}")
-        assert said(data, place, key.name) == said(data, place, key.name, source.data["value"])
-
-
-def test_the_bounds_themselves_are_taken() -> None:
+def test_json_schema_allows_what_the_program_reads_and_rejects_other_types() -> None:
+    wrong = []
     for table, key in KEYS:
-        if key.kind == "whole" and math.isfinite(key.most) and table.header.startswith("[outputs"):
-            said(*placed(table), key.name, int(key.most))
+        data, place = placed(table)
+        allowed = [value for value in VALUES if allows(key, value)]
+        for value in VALUES:
+            problem = problem_of(data, place, key.name, value)
+            if not problem and value not in allowed:
+                wrong.append(f"{table.header} {key.name} = {value!r}: the program reads it, the schema rejects it")
+            if "no such key; " in problem.partition(f".{key.name}.")[0] and not isinstance(value, dict):
+                wrong.append(f"{table.header} {key.name}: {problem}")
+        if len(allowed) > len(VALUES) // 2:
+            wrong.append(f"{table.header} {key.name}: the schema allows {allowed}")
+    assert wrong == []
+
+
+def test_a_value_beyond_its_bounds_is_rejected_by_the_program_and_by_the_json_schema() -> None:
+    bounded = 0
+    for table, key in KEYS:
+        data, place = placed(table)
+        schema = key.form.schema
+        least, most = schema.get("minimum"), schema.get("maximum")
+        for bound, beyond in ((least, -1), (most, 1)):
+            if bound is None:
+                continue
+            bounded += 1
+            assert allows(key, bound), key
+            assert not allows(key, bound + beyond), key
+            assert problem_of(data, place, key.name, bound + beyond), f"{table.header} {key.name} = {bound + beyond}"
+        if "enum" in schema:
+            assert str(schema["enum"][0]) in problem_of(data, place, key.name, "none-of-them"), key
+    assert bounded > 100
+
+
+def test_a_key_that_is_left_out_has_its_default() -> None:
+    for table, key in KEYS:
+        data, place = placed(table)
+        if key.required:
+            assert problem_of(data, place, key.name), key
+        elif key.default not in (None, ""):
+            assert read(source_with(data, place, key.name)) == read(source_with(data, place, key.name, key.default)), (
+                key
+            )
+
+
+def test_an_unknown_key_of_any_table_is_rejected_by_the_program_and_by_the_json_schema() -> None:
+    for table in tables():
+        if table.header == "A template":
+            continue
+        data, place = placed(table)
+        assert WHOLE.is_valid(source_with(data, place, "unknown").data), table.header
+        source = source_with(data, place, "unknown", 1)
+        assert not WHOLE.is_valid(source.data), table.header
+        with pytest.raises(FileError, match="no such key"):
+            read(source)
+
+
+def test_json_schema_allows_the_options_of_a_node_s_own_protocol_alone() -> None:
+    node = {"protocol": "dc104", "maximum": 30}
+    assert WHOLE.is_valid(BASE | {"nodes": {"n": node}})
+    for wrong in (node | {"protocol": "hcp2"}, node | {"maximum": "30"}, node | {"maximum": 0}, {"maximum": 30}):
+        assert not WHOLE.is_valid(BASE | {"nodes": {"n": wrong}}), wrong
+    assert WHOLE.is_valid(BASE | {"protocols": {"dc104": {"maximum": 30}}})
+    assert not WHOLE.is_valid(BASE | {"protocols": {"hcp2": {"maximum": 30}}})
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.name)
+def test_json_schema_allows_every_example(path: Path) -> None:
+    WHOLE.validate(tomllib.loads(path.read_text()))
+
+
+def test_json_schema_describes_every_key() -> None:
+    """Editors show the descriptions."""
+    assert "description" in SCHEMA["properties"]["port"]
+    for name, definition in SCHEMA["$defs"].items():
+        for key, schema in definition.get("properties", {}).items():
+            told = schema.get("description") or all(one.get("description") for one in schema.get("anyOf", [{}]))
+            assert told or name in ("protocols", "outputs"), f"{name}.{key}"
 
 
 def options() -> Iterator[Option]:
