@@ -35,6 +35,25 @@ is not here is an error, with its line in the file and the nearest key that ther
 [examples/line.toml](../../examples/line.toml) is a whole file with remarks.
 
 All times are in seconds. A key without a default may be left out; its meaning says what holds then.
+
+## In an editor
+
+Editors that know JSON Schema complete keys, show these texts, and mark what is wrong while you type. In Visual Studio
+Code install the extension "Even Better TOML" and write the schema into a file:
+
+```sh
+busmaster check --schema > line.schema.json
+```
+
+Then begin LINE.toml with the place of that file, from the folder of LINE.toml:
+
+```toml
+#:schema ./line.schema.json
+```
+
+The schema has the options of every protocol that is installed. That of busmaster alone is
+[docs/line.schema.json](../line.schema.json). It knows single values: what depends on several of them, or on other
+files, only `busmaster check` finds.
 """
     for table in tables():
         yield f"## {_titled(table.header)}\n\n{table.about}\n"

@@ -119,6 +119,29 @@ PROBLEMS = [
 of an output that could not be made."""
 
 
+SEVERAL = """port = "/dev/nothing-is-there?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 5
+retries = -1
+reply_time = "slow"
+colour = 3
+[groups.axes]
+points = ["winder/1"]
+period = 1
+phase = "x"
+priority = "high"
+"""
+
+
+def test_every_wrong_value_of_a_table_is_reported(tmp_path: Path) -> None:
+    found = [f"{error.line}: {error.key}" for error in problems(tmp_path, SEVERAL)]
+    assert found == [
+        *("5: nodes.winder.retries", "6: nodes.winder.reply_time", "7: nodes.winder.colour"),
+        *("11: groups.axes.phase", "12: groups.axes.priority"),
+    ]
+
+
 def written(folder: Path, text: str) -> Path:
     path = folder / "line.toml"
     path.write_text(text)
