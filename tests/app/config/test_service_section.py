@@ -72,6 +72,13 @@ tokens.hmi = {{ role = "write", allow_writes = "winder/force" }}
     assert file.service.secrets() == {"hmi": digest_of("a-token-of-the-hmi-0001")}
 
 
+@pytest.mark.parametrize(
+    ("said", "mode"), [("", 0o600), (f'group = "{GROUP}"', 0o660), (f'group = "{GROUP}"\nmode = "0640"', 0o640)]
+)
+def test_socket_is_open_to_its_group_unless_the_file_has_another_mode(said: str, mode: int) -> None:
+    assert parse(f"{TEXT}[service]\n{said}\n").service.mode == mode
+
+
 def test_what_may_be_written_is_a_quantity_whatever_names_it() -> None:
     assert only("winder/force") == only("winder/force_fine") == only("winder/10") == {("hcp2", 5): frozenset({10})}
 
