@@ -62,15 +62,15 @@ class Meaning:
     """
 
     precision: Annotated[int | None, Between(0, MOST_DIGITS)] = None
-    """Digits behind the point that people are shown. Nothing else is rounded."""
+    """How many decimals are displayed. Stored values are not rounded."""
     bits: Mapping[str, int] = field(default_factory=dict)
     """Names of the word's bits, 0 the lowest, each a point of its own: `bits = { READY = 0, FAULT = 3 }`."""
     labels: Mapping[int, str] = field(default_factory=dict)
     """Names of whole numbers: `labels = { 0 = "off", 1 = "run" }`."""
     deadband: Annotated[float | None, Between(0, self_checked=True)] = None
-    """Outputs are told a value only where it is further than this from what they were told; 0: each change."""
+    """Outputs get a value only if it differs by more than this from the last one that they got; 0: every change."""
     heartbeat: Annotated[float | None, Between(unit="s")] = None
-    """Outputs are told a value at the latest after so long, which is more than 0."""
+    """Longest time after which outputs get a value even if it has not changed; more than 0."""
     low: float | None = None
     """A value below it begins an alarm."""
     high: float | None = None

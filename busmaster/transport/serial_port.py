@@ -84,7 +84,7 @@ class SerialPort:
     """The device, a link to it, or `usb:SERIAL`."""
     _: KW_ONLY
     baudrate: Annotated[int, Between(1, self_checked=True)]
-    """In LINE.toml the protocol's by default, where all nodes are meant for one."""
+    """Baud rate. In LINE.toml the protocol's by default, if all nodes need the same."""
     bytesize: Annotated[int, Between(5, 8, self_checked=True)] = 8
     """Bits of a byte. In LINE.toml the protocol's by default."""
     parity: str = "N"
@@ -92,9 +92,9 @@ class SerialPort:
     stopbits: float = 1
     """1, 1.5 or 2. In LINE.toml the protocol's by default."""
     rtscts: bool = False
-    """Whether RTS and CTS hold up what is sent."""
+    """Whether RTS and CTS control the flow of what is sent."""
     rs485: RS485Settings | bool | None = None
-    """Whether the driver is to switch the transmitter (RTS high while sending). In Python also pyserial's
+    """Whether the driver switches the transmitter (RTS high while sending). In Python also pyserial's
     `RS485Settings`, for other polarities and delays."""
     echo: bool = False
     """Whether what is sent is received too, as on some two-wire adapters. It is compared byte for byte."""
@@ -103,9 +103,9 @@ class SerialPort:
     receive_latency: Annotated[float, Between(0, unit="s", self_checked=True)] = 0.0
     """How long the adapter may hold bytes back: FTDI's latency timer, for example."""
     exclusive: bool = True
-    """Whether no other program may open the port meanwhile."""
+    """Whether other programs are kept from opening the port."""
     paced: bool | None = None
-    """Whether bytes leave at the baud rate. By default so for a serial device, and not for a pseudo-terminal."""
+    """Whether bytes leave at the baud rate. By default they do for a serial device, and not for a pseudo-terminal."""
 
     def __post_init__(self) -> None:
         if not self.path:

@@ -22,11 +22,11 @@ class SharedEmulated:
     """The keys of `[emulator]` and of its nodes."""
 
     lively: bool = True
-    """Whether things move by themselves, but for what `values` give."""
+    """Whether values change by themselves, except those in `values`."""
     reply_delay: Annotated[Delay, DELAY] = Delay()  # noqa: RUF009  # it is frozen
     """From the end of a request to the reply: one time, or the bounds of one, `[0.001, 0.004]`."""
     faults: Annotated[Faults, table_of("faults")] = field(default_factory=Faults)
-    """What goes wrong, and how often: `faults = { lost = 0.01 }`."""
+    """Faults and their probabilities: `faults = { lost = 0.01 }`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +38,7 @@ class EmulatedSection(SharedEmulated):
     """
 
     values: Annotated[Mapping[str, tuple[Table, tuple[float, ...]]], VALUES] = field(default_factory=dict)
-    """What it holds from the start, by point, item or symbol: one value or several."""
+    """Initial values by point, item or symbol: one value or several."""
     options: Internal[Mapping[str, Any]] = field(default_factory=dict)
     table: Internal[Table | None] = field(default=None, compare=False, repr=False)
 
@@ -48,9 +48,9 @@ class EmulatorSection(SharedEmulated):
     """How the line is emulated, and each of its nodes by name."""
 
     paced: bool = True
-    """Whether bytes take their time on the wire."""
+    """Whether bytes take as long as at the baud rate."""
     seed: int = 1
-    """The seed of all that is random."""
+    """The seed of the random numbers."""
     nodes: Annotated[Mapping[str, EmulatedSection], tables_of("emulated_node")]
     """A table for each node, or range of nodes, that differs: `[emulator.nodes.NAME]`."""
 

@@ -48,13 +48,13 @@ class SafeSection:
     """What `[safe]` says: values by point, in their order. Without writes there is no safe state."""
 
     writes: Annotated[Mapping[str, float], WRITES] = field(default_factory=dict)
-    """The value that each point is left at, in its unit: `writes = { "winder/setpoint" = 0 }`, in this order. One that
-    may not be repeated, or cannot be read back, is refused when the file is read."""
+    """The value to write to each point, in its unit and in this order: `writes = { "winder/setpoint" = 0 }`. One that
+    must not be repeated, or cannot be read back, is rejected when the file is read."""
     within: Annotated[float, Between(0, LONGEST_SAFE_STATE, "s", self_checked=True), Parsed(_check_within)] = 2.0
-    """The time for all of it, more than 0. What is not confirmed by then is named, and the exit status is 1."""
+    """The time for all writes, more than 0. Writes that are not confirmed by then are reported, and the exit status is
+    1."""
     repeatable: tuple[str, ...] = ()
-    """Points whose write the protocol does not know to be repeatable, and of which only you know that writing them
-    twice harms nobody."""
+    """Points that can be written twice without harm although the protocol does not say so."""
     table: Internal[Table] = field(compare=False, repr=False)
 
 

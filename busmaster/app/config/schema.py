@@ -60,8 +60,8 @@ def tables() -> Iterator[TableKeys]:
     for kind in output_kinds():
         keys = tuple(key for key in described(kind.settings) if key.name not in kind.without)
         yield TableKeys(f"[outputs.{kind.name}]", kind.about, _required_first(keys), f"output_{kind.name}")
-    yield _table("[safe]", "What is written, urgently, when the line is left.", SafeSection, "safe")
-    yield _table("[service]", "Who may use the line beside its owner, and how they come.", ServiceSection, "service")
+    yield _table("[safe]", "Writes that are sent at once when the line is left.", SafeSection, "safe")
+    yield _table("[service]", "Which other programs can use the line, and how they connect.", ServiceSection, "service")
     roles = "A role; so too [service.groups.NAME], [service.tokens.NAME]."
     yield _table("[service.users.NAME]", roles, RoleSection, "role")
     yield _table("[emulator]", "How the line is emulated.", EmulatorSection, "emulator")

@@ -60,9 +60,9 @@ class ProtocolSection:
     timings: Annotated[Timings | Learned | None, TIMING]
     """Its reply times: a table, or `"learned"`. The protocol's by default."""
     retries: Annotated[int | None, Between(0, MOST_RETRIES)] = None
-    """How often a read that failed is tried again."""
+    """How often a failed read is repeated."""
     reply_time: Annotated[float | None, Between(0, LONGEST_TIMING, "s")] = None
-    """From a request to its reply, where it is known, for `plan`."""
+    """Time from a request to its reply, if it is known; `plan` uses it."""
     probe: str | None = None
     """The item that is read to find out whether a node replies. The protocol's by default."""
     sync_reads: tuple[str, ...] = ()
@@ -76,9 +76,9 @@ class NodeSection(ProtocolSection):
 
     name: Internal[str]
     protocol: Annotated[str, PROTOCOL]
-    """What it speaks."""
+    """The protocol of the node."""
     address: Annotated[int, ADDRESS]
-    """Its address; `"4-7"` where NAME is a range too. Left out where the protocol has none."""
+    """Its address; `"4-7"` where NAME is a range too. Not allowed for a protocol without addresses."""
     template: str | None = None
     """The template of its points: one that is shipped, or a file, from the folder of this one."""
     points: Annotated[Mapping[str, PointSection], tables_of("point")]
@@ -127,9 +127,9 @@ class GroupSection:
     points: tuple[str, ...]
     """What is read: `"drive4-7/speed_measured,current"` is eight points."""
     phase: Annotated[float | None, Between(0, LONGEST_PERIOD, "s")] = None
-    """When in its period, and before its end, it begins. By itself it keeps out of the others' way."""
+    """Start of each cycle within the period. By default the group avoids the cycles of the others."""
     priority: Annotated[Priority, PRIORITY] = Priority.POLL
-    """`background`: only in what time the others leave."""
+    """`background`: only in the time that the other groups leave."""
     table: Internal[Table] = field(compare=False, repr=False)
 
 
@@ -139,11 +139,11 @@ class LineFile:
 
     path: Internal[str]
     title: Annotated[str, Parsed(_check_title)] = ""
-    """What the line is called: in lists, views and pages. The file's name by default."""
+    """The name of the line in lists, views and pages. By default the file's name."""
     port: Annotated[SerialPort | TcpPort, PORT]
     """The PORT, as on the command line: a device path, `usb:SERIAL`, or `socket://HOST:PORT`; or a table: `[port]`."""
     strict: bool = False
-    """Whether an answer that could be another request's is held until it is certain (R15)."""
+    """Whether a reply that could belong to another request is held until it is certain (R15)."""
     timing: Literal["learned"] | None = None
     """The windows of all nodes are learned from their replies, except where a read request carries no checksum."""
     learned: str | None = None
@@ -157,9 +157,9 @@ class LineFile:
     outputs: Annotated[Outputs, table_of("outputs")]
     """A table for each output: `[outputs.csv]` and others."""
     safe: Annotated[SafeSection, table_of("safe")]
-    """What the line is left at: `[safe]`."""
+    """The safe state, written when the line is left: `[safe]`."""
     service: Annotated[ServiceSection, table_of("service")]
-    """Who may use the line beside its owner: `[service]`."""
+    """Other programs that can use the line: `[service]`."""
     emulator: Annotated[EmulatorSection, table_of("emulator")]
     """What `busmaster emulate` makes of the nodes: `[emulator]`."""
     table: Internal[Table] = field(compare=False, repr=False)

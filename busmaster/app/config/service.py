@@ -55,17 +55,17 @@ class ServiceSection:
     """
 
     enabled: bool = True
-    """Whether other programs may come at all."""
+    """Whether other programs can use the line."""
     group: Annotated[int | None, Parsed(_group_number, str)] = None
-    """The group of this machine whose members may come to the socket, beside this user."""
+    """The group of this machine whose members can open the socket, beside this user."""
     mode: FileMode = MODE
-    """The mode of the socket: 0660 where there is a `group`."""
+    """The mode of the socket; 0660 if there is a `group`."""
     share: Annotated[float, Between(LEAST_SHARE, MOST_SHARE)] = 1.0
-    """The share of line time of each program, where the owner's is 1, as long as both wait."""
+    """The share of line time of each program, where the owner's is 1, while both have requests waiting."""
     listen: Annotated[tuple[str, int] | None, Form("text", {"type": "string"})] = None
-    """Where programs may come by TCP too, as HOST:PORT; beyond this machine only with `token_file`."""
+    """Address for programs that connect by TCP, as HOST:PORT. An address beyond this machine needs `token_file`."""
     token_file: str | None = None
-    """The file of the tokens that who comes by TCP shows: a name and its token a line."""
+    """The file of the tokens for programs that connect by TCP: a name and its token on each line."""
     users: Annotated[Mapping[int, RoleSection], tables_of("role")] = field(default_factory=dict, compare=False)
     """A table for each user of this machine that has a role: `[service.users.NAME]`."""
     groups: Annotated[Mapping[int, RoleSection], tables_of("role")] = field(default_factory=dict, compare=False)

@@ -49,14 +49,14 @@ def _topic(topic: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What every output can be told."""
+    """The keys of every output."""
 
     enabled: bool = True
-    """Whether it is used. What is said of one that is not must be right, too."""
+    """Whether the output is used. The keys of a disabled output are checked too."""
     groups: tuple[str, ...] = ()
-    """The poll groups whose values it gets. All by default; of metrics none."""
+    """The poll groups whose values it gets. By default all of them; for metrics none."""
     buffer: Annotated[int, Between(1, MOST_BUFFERED)] = BUFFER
-    """Values that may wait for it; the oldest are dropped, and counted."""
+    """How many values can wait for the output. Beyond it the oldest is dropped and counted."""
 
     def __post_init__(self) -> None:
         if self.buffer < 1:
@@ -82,14 +82,14 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpillingSettings(Settings):
-    """What can be told an output that writes files, or has one for values that wait."""
+    """The keys of an output that writes files, or has one for values that wait."""
 
     mode: FileMode = MODE
-    """Who may read and write the files that it makes, as chmod takes it, narrowed by the umask."""
+    """The mode of the files that it creates, as in chmod; the umask applies."""
     spill: str | None = None
-    """The file for what waits while the output is down, and over a restart. Best on another disk."""
+    """The file for values that wait while the output is down; it survives a restart. Use another disk if possible."""
     spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
-    """The most values that wait in that file."""
+    """How many values can wait in that file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +99,7 @@ class FileSettings(SpillingSettings):
     path: str
     """The file. Fields of a date make new ones: `line-%Y-%m-%d.csv`; %% is a %."""
     sync_every: Annotated[float, Between(0, unit="s")] = 10.0
-    """After so long at most what was written survives a loss of power, too; 0: after each batch."""
+    """Longest time until written values survive a loss of power; 0: after each batch."""
     audit: AuditMode = "batched"
     """`strict`: a write is acknowledged to its client only after its audit entry is on the disk."""
 
@@ -126,9 +126,9 @@ class SqliteSettings(SpillingSettings):
     audit: AuditMode = "batched"
     """`strict`: a write is acknowledged to its client only after its audit entry is on the disk."""
     keep_days: Annotated[float | None, Between(unit="days"), Parsed(_limit)] = None
-    """What is older is deleted. More than 0; all is kept by default."""
+    """Older values are deleted. Must be more than 0; by default all are kept."""
     keep_mb: Annotated[float | None, Between(unit="MB"), Parsed(_limit)] = None
-    """The oldest is deleted where the database is larger. More than 0; all is kept by default."""
+    """If the database is larger, the oldest values are deleted. Must be more than 0; by default all are kept."""
 
     @property
     def destination(self) -> str:
@@ -151,7 +151,7 @@ class MqttSettings(SpillingSettings):
     port: Annotated[int, Between(1, 65535)] = 1883
     """The TCP port there."""
     prefix: Annotated[str, Parsed(_topic)] = "busmaster"
-    """What all topics begin with."""
+    """The first part of all topics."""
     messages: Literal["point", "cycle"] = "point"
     """One message for each point, or one for each cycle of a group."""
     qos: Annotated[int, Between(0, 1)] = 1
@@ -159,7 +159,7 @@ class MqttSettings(SpillingSettings):
     retain: bool = True
     """Whether the broker keeps the last value of each point."""
     username: str | None = None
-    """The user to be at the broker."""
+    """The user name for the broker."""
     password_file: str | None = None
     """The file with that user's password."""
     tls: bool = False
@@ -167,7 +167,7 @@ class MqttSettings(SpillingSettings):
     ca_file: str | None = None
     """The certificates that are trusted; the system's by default."""
     allow_commands: tuple[str, ...] = ()
-    """The points that messages may write. None by default, and then no command is listened to."""
+    """The points that MQTT commands may write. By default none: commands are then ignored."""
 
     @property
     def destination(self) -> str:
@@ -220,7 +220,7 @@ class MetricsSettings(Settings):
     """An output that Prometheus reads. The values of `groups` are served too; without any, only counts are."""
 
     host: str = "127.0.0.1"
-    """Where they are served: only there."""
+    """The address on which the metrics are served."""
     port: Annotated[int, Between(0, 65535)] = 9464
     """The TCP port there."""
 
