@@ -24,7 +24,7 @@ PROMISED = {
     "emulate": "[LINE.toml] [--protocol P] [--nodes N-M,K] [--pty [LINK]] [--tcp HOST:PORT] [--baud N] [--paced]"
     " [--reply-delay MS[-MS]] [--fault NAME=VALUE] [--seed N] [--seconds S]",
     "run": "LINE.toml [--seconds S] [--plain] [--json] [--read-only]",
-    "check": "LINE.toml [--json]",
+    "check": "LINE.toml [--json] [--schema]",
     "migrate": "LINE.toml [--write]",
     "plan": "LINE.toml [--json]",
     "monitor": "PORT|LINE.toml [--protocol P] [--json]",
