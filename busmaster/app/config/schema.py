@@ -88,7 +88,7 @@ def described(section: type) -> tuple[Key, ...]:
 def _described(keys: Iterable[Key], *sections: type) -> tuple[Key, ...]:
     classes = [kind for section in sections for kind in reversed(section.__mro__[:-1])]
     about = {name: text for kind in classes for name, text in attribute_docs(kind).items()}
-    return tuple(replace(key, about=about[key.field]) for key in keys)
+    return tuple(replace(key, about=about.get(key.field, "")) for key in keys)
 
 
 def attribute_docs(kind: type) -> dict[str, str]:

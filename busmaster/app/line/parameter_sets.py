@@ -142,7 +142,7 @@ def _entries(table: Table, kind: NodeKind) -> Iterator[tuple[Parameter, Value]]:
             item=item,
             name=_text(entry, "name"),
             unit=_text(entry, "unit"),
-            access=entry.choice("access", ["read"]) if "access" in entry else "",
+            access="read" if "access" in entry and entry.choice("access", ["read"]) else "",
             decimals=entry.whole("decimals", most=MOST_DECIMALS) if "decimals" in entry else 0,
             factor=entry.number("factor") if "factor" in entry else 1,
             offset=entry.number("offset") if "offset" in entry else 0,

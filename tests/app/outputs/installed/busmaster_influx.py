@@ -17,7 +17,9 @@ class InfluxSettings(Settings):
     """The keys of `[outputs.influx]`, beside `enabled`, `groups` and `buffer`."""
 
     host: str = "127.0.0.1"
+    """The host of Telegraf."""
     port: Annotated[int, Between(1, 65535)] = 8094
+    """Its UDP port."""
 
     @property
     def destination(self) -> str:
