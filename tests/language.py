@@ -18,7 +18,8 @@ CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busm
 CLEAN = [  # files and folders
     *("README.md", "CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md", "benchmarks/README.md", "docs/README.md"),
     *("docs/tutorial.md", "docs/questions.md", "docs/howto", "docs/explanation/words.md", "docs/public-api.md"),
-    *("docs/upgrading.md", "docs/adding-a-protocol.md", "docs/protocols"),
+    *("docs/upgrading.md", "docs/adding-a-protocol.md", "docs/adding-an-output.md", "docs/adding-an-interface.md"),
+    "docs/protocols",
 ]
 LONGEST = 30
 RULES = {  # name: what to look for, in any case
