@@ -17,9 +17,12 @@ ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
 CLEAN = [  # files and folders
     *("README.md", "CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md", "benchmarks/README.md", "docs/README.md"),
-    *("docs/tutorial.md", "docs/questions.md", "docs/howto", "docs/explanation/words.md", "docs/public-api.md"),
-    *("docs/upgrading.md", "docs/adding-a-protocol.md", "docs/adding-an-output.md", "docs/adding-an-interface.md"),
-    "docs/protocols",
+    *(f"docs/{name}.md" for name in ("tutorial", "questions", "public-api", "upgrading", "explanation/words")),
+    *(
+        "docs/howto",
+        "docs/protocols",
+        *(f"docs/adding-a{name}.md" for name in ("-protocol", "n-output", "n-interface")),
+    ),
 ]
 LONGEST = 30
 RULES = {  # name: what to look for, in any case
