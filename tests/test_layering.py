@@ -6,10 +6,12 @@ A package that is drawn apart so that it can be read apart is so for its types t
 from __future__ import annotations
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-PACKAGE = Path(__file__).parent.parent / "busmaster"
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "busmaster"
 BASE = {"contract", "errors", "bounds", "renames"}
 """What a protocol and the arbiter agree on: every room may use it."""
 LIBRARY_OF_THE_APPLICATION = {
@@ -30,6 +32,14 @@ APPLICATION: dict[str, set[str]] = {
     },
 }
 """The rooms of the application, and which others of them each may import."""
+INTERFACES = {
+    entry.partition(":")[0].removeprefix("busmaster.")
+    for entry in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][
+        "busmaster.interfaces"
+    ].values()
+}
+"""Interfaces that are one module with their command. They import what one of another package imports."""
+OF_AN_INTERFACE = {"app.cli.ending", "app.cli.interfaces", "app.cli.output"}
 DEMO = {"app.cli.demo_line"}
 """The demo shows certain drives, so it imports them."""
 ON_DEMAND = {"app.line.configured_line", "app.service.remote", "app.service.service"}
@@ -64,6 +74,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "app": {"app"},
     "config": set(),
     **{room: {room, *others, *LIBRARY_OF_THE_APPLICATION - {""}} for room, others in APPLICATION.items()},
+    **{
+        module: {"app.interfaces", "app.service", *OF_AN_INTERFACE, *LIBRARY_OF_THE_APPLICATION - {""}}
+        for module in INTERFACES
+    },
     **{module: {"app.cli", "protocols", *LIBRARY_OF_THE_APPLICATION - {""}} for module in DEMO},
 }
 OPEN: dict[str, set[str]] = {
@@ -92,7 +106,7 @@ OPEN: dict[str, set[str]] = {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "rfc2217", "serial_port", "tcp"),
     },
     "wire": {"characters", "checks", "numbers", "readers"},
-    "app.cli": {""},
+    "app.cli": {"", "ending", "interfaces", "output"},
     "app.config": {
         *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "schema", "sections"),
         *("service", "source", "table", "templates"),

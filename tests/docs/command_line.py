@@ -78,7 +78,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("params save line.toml winder -o winder.toml", DRIVES),
     ),
 }
-"""Of each command, and how a test takes it: run to its end, or until Ctrl-C, or not at all."""
+"""Of each command, and how a test takes it: run to its end, or until Ctrl-C, or not at all. Those of an interface that
+is found by an entry point are in the `epilog` of its command: "Example: busmaster NAME ..."."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +90,7 @@ class Described:
     usage: str
     paragraphs: tuple[str, ...]
     options: tuple[tuple[str, str], ...]
-
-    @property
-    def examples(self) -> tuple[tuple[str, str], ...]:
-        return EXAMPLES[self.name]  # of a group those of its commands: it has none itself
+    examples: tuple[tuple[str, str], ...]
 
 
 def described(command: click.Command, name: str = "") -> Described:
@@ -108,7 +106,14 @@ def described(command: click.Command, name: str = "") -> Described:
         f"busmaster {name} {usage}".replace("  ", " "),
         tuple(" ".join(paragraph.split()) for paragraph in text.split("\n\n")),
         tuple((_named(option), _said(option, context)) for option in options),
+        EXAMPLES.get(name) or _own_examples(command),
     )
+
+
+def _own_examples(command: click.Command) -> tuple[tuple[str, str], ...]:
+    """The example of an interface, which goes on until Ctrl-C."""
+    _, _, example = (command.epilog or "").partition("Example: busmaster ")
+    return ((example, CTRL_C),) if example else ()
 
 
 def _named(option: click.Option) -> str:

@@ -15,6 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkdtemp
 
+import click
+
+from busmaster.app.cli.app import cli
 from tests.docs.pages import ROOT, Block
 from tests.patience import PATIENCE
 from tests.ports import free_port
@@ -23,7 +26,13 @@ from tests.printed import Printed
 ADDRESS = re.compile(r"\b(127\.0\.0\.1|localhost):(\d{4,5})\b")
 PORT_KEY = re.compile(r"^(port = )(\d{4,5})$", re.MULTILINE)
 NUMBER = r"(?<![\d.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
-OWN_BINDS = {"web": "127.0.0.1:8420", "opcua": "127.0.0.1:4840"}
+OWN_BINDS = {
+    name: str(option.default)
+    for name in cli.list_commands(click.Context(cli))
+    if (command := cli.get_command(click.Context(cli), name)) is not None
+    for option in command.params
+    if option.name == "bind"
+}
 """Where interfaces listen that are not told: another program of this machine may be there."""
 CTRL_C = "^C"
 

@@ -1,0 +1,716 @@
+"""`busmaster modbus-tcp`: its frames and its map alone, its server by sockets, and the whole by pymodbus's clients."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymodbus.client import ModbusTcpClient
+
+from busmaster.app.interfaces import modbus_tcp
+from busmaster.app.interfaces.modbus_tcp import (
+    UNIT_REFUSED,
+    BadFrame,
+    Entry,
+    ExceptionReply,
+    ModbusTcpServer,
+    ReadRequest,
+    RegisterMap,
+    Rules,
+    WriteRequest,
+    automatic_map,
+    code_of,
+    length_of,
+    read_map,
+    read_reply,
+    request_of,
+)
+from busmaster.emulator.serve import TcpServer
+from busmaster.errors import InvalidCommand, NodeDown, NoReply, NotStarted, Refused, WriteUnconfirmed
+from busmaster.protocols.modbus.codec import EXCEPTIONS
+from tests.app.cli.conftest import Command, busmaster, owner, serve, started
+from tests.patience import PATIENCE
+
+__all__ = ["busmaster"]
+
+# frames
+
+
+def frame(pdu: bytes, *, transaction: int = 1, unit: int = 1, protocol: int = 0, length: int | None = None) -> bytes:
+    return struct.pack(">HHHB", transaction, protocol, len(pdu) + 1 if length is None else length, unit) + pdu
+
+
+READ = bytes.fromhex("03 0000 0001")
+
+
+@pytest.mark.parametrize(
+    ("pdu", "request_"),
+    [
+        ("01 0000 07d0", ReadRequest("coil", 0, 2000)),
+        ("02 ffff 0001", ReadRequest("discrete", 65535, 1)),
+        ("03 0010 007d", ReadRequest("holding", 16, 125)),
+        ("04 0010 0002", ReadRequest("input", 16, 2)),
+        ("05 0003 ff00", WriteRequest("coil", 3, (1,))),
+        ("05 0003 0000", WriteRequest("coil", 3, (0,))),
+        ("06 0003 1234", WriteRequest("holding", 3, (0x1234,))),
+        ("0f 0003 000a 02 0502", WriteRequest("coil", 3, (1, 0, 1, 0, 0, 0, 0, 0, 0, 1))),
+        ("10 0003 0002 04 0001 fffe", WriteRequest("holding", 3, (1, 0xFFFE))),
+    ],
+)
+def test_a_request_is_decoded(pdu: str, request_: ReadRequest | WriteRequest) -> None:
+    assert request_of(bytes.fromhex(pdu)) == request_
+
+
+@pytest.mark.parametrize(
+    ("pdu", "code"),
+    [
+        ("00", 1),
+        ("16 0004 00f2 0025", 1),
+        ("17 0000 0001 0000 0001 02 0001", 1),
+        ("2b 0e 01 00", 1),
+        ("83 0000 0001", 1),
+        ("01 0000 07d1", 3),
+        ("03 0000 007e", 3),
+        ("03 0000 0000", 3),
+        ("03 0000 00", 3),
+        ("03 0000 0001 00", 3),
+        ("03 ffff 0002", 2),
+        ("05 0000 0001", 3),
+        ("06 0000", 3),
+        ("0f 0000 07b1 f7" + 247 * "00", 3),
+        ("0f 0000 0009 01 01", 3),
+        ("0f 0000 0009", 3),
+        ("10 0000 007c f8" + 248 * "00", 3),
+        ("10 0000 0002 04 0001", 3),
+        ("10 0000 0001 04 0001 0002", 3),
+        ("10 ffff 0002 04 0001 0002", 2),
+    ],
+)
+def test_a_malformed_request_has_an_exception_code(pdu: str, code: int) -> None:
+    with pytest.raises(ExceptionReply) as raised:
+        request_of(bytes.fromhex(pdu))
+    assert raised.value.code == code
+
+
+@pytest.mark.parametrize("header", ["0001 0001 0006 01", "0001 0000 0001 01", "0001 0000 00ff 01", "0001 0000 ffff 01"])
+def test_a_header_of_another_protocol_or_length_is_a_bad_frame(header: str) -> None:
+    with pytest.raises(BadFrame):
+        length_of(bytes.fromhex(header))
+
+
+def test_replies_to_reads_are_encoded() -> None:
+    assert length_of(bytes.fromhex("0001 0000 00fe 01")) == 253
+    assert read_reply(1, [1, 0, 0, 0, 0, 0, 0, 0, 1]) == bytes.fromhex("01 02 01 01")
+    assert read_reply(3, [1, 0xFFFE]) == bytes.fromhex("03 04 0001 fffe")
+
+
+def test_exceptions_of_units_keep_their_code_and_others_say_what_happened_to_the_request() -> None:
+    for code, name in EXCEPTIONS.items():
+        assert code_of(Refused(f"refused: {name}")) == code
+        assert UNIT_REFUSED[name] == code
+    assert code_of(Refused("refused: exception 9")) == 9
+    assert code_of(Refused("refused")) == 4
+    assert code_of(NotStarted("busy")) == 6  # nothing was sent
+    assert [code_of(kind("x")) for kind in (NoReply, NodeDown, WriteUnconfirmed)] == [11, 11, 11]
+    assert code_of(InvalidCommand("too high")) == 3
+
+
+# the map
+
+
+@pytest.mark.parametrize(
+    ("options", "value", "registers"),
+    [
+        ({"type": "int16"}, -2, [0xFFFE]),
+        ({"type": "uint16"}, 65535, [0xFFFF]),
+        ({"type": "int16", "scale": 0.1}, 12.3, [123]),
+        ({"type": "int32"}, -2, [0xFFFF, 0xFFFE]),
+        ({"type": "uint32", "word_order": "little"}, 0x12345678, [0x5678, 0x1234]),
+        ({"type": "uint32", "byte_order": "little"}, 0x12345678, [0x3412, 0x7856]),
+        ({"type": "uint32", "byte_order": "little", "word_order": "little"}, 0x12345678, [0x7856, 0x3412]),
+        ({"type": "int64"}, -(2**63), [0x8000, 0, 0, 0]),
+        ({"type": "uint64", "word_order": "little"}, 1, [1, 0, 0, 0]),
+        ({"type": "float32"}, 12.3, [0x4144, 0xCCCD]),
+        ({"type": "float64"}, 12.3, [0x4028, 0x9999, 0x9999, 0x999A]),
+        ({"type": "bit", "table": "coil"}, 1, [1]),
+    ],
+)
+def test_values_are_encoded_and_decoded(options: dict[str, Any], value: float, registers: list[int]) -> None:
+    entry = Entry("winder/force", 0, **options)
+    assert entry.size == len(registers)
+    assert entry.registers(value) == registers
+    assert entry.value(registers) == value
+
+
+@pytest.mark.parametrize(
+    ("options", "value"),
+    [
+        ({"type": "int16"}, 32768),
+        ({"type": "int16"}, 32767.5),
+        ({"type": "uint16"}, -1),
+        ({"type": "int16", "scale": 0.1}, 3276.8),
+        ({"type": "uint32"}, 2**32),
+        ({"type": "int64"}, 1e19),
+        ({"type": "float32"}, 16777217),  # it would be sent as 16777216
+        ({"type": "float32"}, 1e39),
+        ({"type": "float64"}, float("inf")),
+        ({"type": "float64"}, "running"),
+        ({"type": "float64"}, (1, 2)),
+        ({"type": "bit", "table": "coil"}, 2),
+    ],
+)
+def test_a_value_that_does_not_fit_is_an_error(options: dict[str, Any], value: Any) -> None:
+    with pytest.raises(ValueError, match="not"):
+        Entry("winder/force", 0, **options).registers(value)
+
+
+def test_a_written_number_that_is_none_is_an_error() -> None:
+    with pytest.raises(ValueError, match="nan"):
+        Entry("winder/force", 0).value([0x7FC0, 0])
+
+
+MAP = """
+[[registers]]
+point = "a/x"
+address = 0
+type = "int32"
+status = 2
+[[registers]]
+point = "a/on"
+table = "coil"
+address = 0
+"""
+
+
+def written(folder: Path, text: str) -> str:
+    path = folder / "map.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_map_file_is_read(tmp_path: Path) -> None:
+    shown = read_map(written(tmp_path, MAP))
+    assert shown.entries == (Entry("a/x", 0, type="int32", status=2), Entry("a/on", 0, table="coil", type="bit"))
+    assert shown.whole("holding", 0, 3) == [(shown.entries[0], False), (shown.entries[0], True)]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("registers = [", "map.toml: "),
+        ("", "there is no [[registers]]"),
+        ("registers = 3", "there is no [[registers]]"),
+        ("stale = 'no'\n" + MAP, "stale is"),
+        ("stale = 'last'\n" + MAP, "a/on: status is missing"),
+        ("points = 3\n" + MAP, "there is no key 'points'"),
+        (MAP + "adress = 3", "entry 2: there is no key 'adress'"),
+        (MAP.replace("point = ", "item = "), "entry 1: there is no key 'item'"),
+        (MAP.replace('point = "a/x"', ""), "entry 1: point is missing"),
+        (MAP + "type = 'int16'", "entry 2: type is bit"),
+        (MAP + "scale = 2", "entry 2: a bit has no scale"),
+        (MAP.replace('"int32"', '"int24"'), "entry 1: type is int16"),
+        (MAP.replace('"int32"', "true"), "entry 1: type is not a text"),
+        (MAP.replace("address = 0", "address = '0'"), "entry 1: address is not a number"),
+        (MAP.replace("address = 0", "address = true"), "entry 1: address is not a number"),
+        (MAP.replace("address = 0", "address = 0.5"), "entry 1: address is not a number"),
+        (MAP.replace("address = 0", "address = -1"), "not within 0 to 65535"),
+        (MAP.replace("address = 0", "address = 65535"), "not within 0 to 65535"),
+        (MAP.replace("status = 2", "status = 65536"), "not within 0 to 65535"),
+        (MAP.replace("status = 2", "status = 1"), "a/x: holding 1 is in use by a/x"),
+        (MAP.replace("status = 2", "word_order = 'middle'"), "word_order is big, little"),
+        (MAP.replace("status = 2", "byte_order = 'middle'"), "byte_order is big, little"),
+        (MAP.replace("status = 2", "scale = 0"), "scale is a number that is not 0"),
+        (MAP.replace("status = 2", "scale = nan"), "scale is a number that is not 0"),
+        (MAP.replace("coil", "coils"), "entry 2: table is holding, input, coil, discrete"),
+        (MAP + "[[registers]]\npoint = 'a/y'\naddress = 1", "a/y: holding 1 is in use by a/x"),
+    ],
+)
+def test_a_wrong_map_file_names_the_file_the_entry_and_the_key(tmp_path: Path, text: str, complaint: str) -> None:
+    with pytest.raises(InvalidCommand) as raised:
+        read_map(written(tmp_path, text))
+    assert "map.toml" in str(raised.value)
+    assert complaint in str(raised.value)
+
+
+@pytest.mark.parametrize(("first", "count", "code"), [(0, 1, 3), (1, 1, 3), (1, 2, 3), (0, 4, 2), (3, 1, 2), (2, 2, 2)])
+def test_a_part_of_a_value_and_an_address_without_one_are_refused(
+    tmp_path: Path, first: int, count: int, code: int
+) -> None:
+    with pytest.raises(ExceptionReply) as raised:
+        read_map(written(tmp_path, MAP)).whole("holding", first, count)
+    assert raised.value.code == code
+
+
+def test_the_automatic_map_keeps_its_addresses_when_points_are_added_behind() -> None:
+    before, after = automatic_map(["a", "b"], "float32", False), automatic_map(["a", "b", "c"], "float32", False)
+    assert after.entries[:2] == before.entries
+    assert [entry.address for entry in after.entries] == [0, 2, 4]
+    with_status = automatic_map(["a", "b"], "float32", True)
+    assert [(entry.address, entry.status) for entry in with_status.entries] == [(0, 2), (3, 5)]
+    full = automatic_map((str(number) for number in range(20_000)), "float64", False)
+    assert len(full.entries) == 16384
+
+
+def test_only_listed_addresses_are_writers() -> None:
+    rules = Rules(peers=(ipaddress.ip_network("10.0.0.0/24"), ipaddress.ip_network("fe80::/64")))
+    assert [rules.is_writer(peer) for peer in ("10.0.0.7", "::ffff:10.0.0.7", "fe80::1%eth0")] == [True, True, True]
+    assert [rules.is_writer(peer) for peer in ("10.0.1.7", "127.0.0.1", "unknown")] == [False, False, False]
+
+
+# the server
+
+
+class Echo:
+    """Replies to each request at once, and counts those of each unit."""
+
+    def __init__(self) -> None:
+        self.counts = {1: 0, 2: 0}
+
+    async def reply(self, _peer: str, unit: int, pdu: bytes) -> bytes:
+        self.counts[unit] += 1
+        return pdu
+
+
+Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
+
+
+def with_server(story: Callable[[Connect, Echo, list[str]], Awaitable[None]], **options: Any) -> None:
+    async def run() -> None:
+        echo, reports, opened = Echo(), list[str](), list[asyncio.StreamWriter]()
+        served = ModbusTcpServer(echo, reports.append, **options)  # type: ignore[arg-type]
+
+        async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+            reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+            opened.append(writer)
+            return reader, writer
+
+        async with (
+            asyncio.timeout(PATIENCE),
+            await asyncio.start_server(served.accept, "127.0.0.1", 0, limit=modbus_tcp.UNREAD) as server,
+        ):
+            await story(connect, echo, reports)
+            for writer in opened:
+                writer.transport.abort()
+            while served._open:  # noqa: ASYNC110  nothing reports that the last connection has ended
+                await asyncio.sleep(0.001)
+
+    asyncio.run(run())
+
+
+async def is_closed(reader: asyncio.StreamReader) -> bool:
+    try:
+        return await reader.read(1) == b""
+    except ConnectionError:
+        return True
+
+
+def test_requests_of_one_segment_are_all_replied_to_in_their_order() -> None:
+    async def story(connect: Connect, _echo: Echo, _reports: list[str]) -> None:
+        reader, writer = await connect()
+        sent = b"".join(frame(READ, transaction=number) for number in range(300))
+        for byte in sent[:20]:  # in pieces, too
+            writer.write(bytes((byte,)))
+            await writer.drain()
+        writer.write(sent[20:])
+        assert await reader.readexactly(len(sent)) == sent
+
+    with_server(story)
+
+
+def test_a_client_that_floods_is_served_in_turn_with_the_others() -> None:
+    async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
+        (_, flooder), (reader, writer) = await connect(), await connect()
+        flooder.write(600 * frame(READ, unit=1))
+        for _ in range(5):
+            writer.write(frame(READ, unit=2))
+            await reader.readexactly(len(frame(READ)))
+        assert echo.counts[2] == 5
+        assert echo.counts[1] < 600
+
+    with_server(story)
+
+
+@pytest.mark.parametrize(
+    "sent", [frame(READ, protocol=1), frame(READ, length=1), frame(READ, length=255), b"GET / HTTP"]
+)
+def test_a_bad_frame_closes_the_connection_and_is_counted(sent: bytes) -> None:
+    async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        for _ in range(2):
+            reader, writer = await connect()
+            writer.write(sent)
+            assert await is_closed(reader)
+        assert reports == ["Modbus TCP connections closed: 1 (not Modbus TCP)"]  # the second is counted for a minute
+
+    with_server(story)
+
+
+def test_an_idle_client_and_half_a_request_are_closed() -> None:
+    async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        (silent, _), (half, writer) = await connect(), await connect()
+        writer.write(frame(READ)[:9])
+        assert await is_closed(silent)
+        assert await is_closed(half)
+        assert "no whole request for 0.05 s" in reports[0]
+
+    with_server(story, idle=0.05)
+
+
+def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "SEND_WITHIN", 0.05)
+
+    async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        _, writer = await connect()
+        with contextlib.suppress(ConnectionError):
+            while not reports:
+                writer.write(1000 * frame(READ))
+                await writer.drain()
+        assert "replies not read" in reports[0]
+
+    with_server(story)
+
+
+def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_PER_PEER", 3)
+
+    async def per_peer(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        opened = [await connect() for _ in range(4)]
+        assert await is_closed(opened[3][0])
+        opened[0][1].write(frame(READ))
+        assert await opened[0][0].readexactly(len(frame(READ))) == frame(READ)
+        assert "beyond 3 of one address" in reports[0]
+
+    with_server(per_peer)
+    monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 2)
+
+    async def total(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        (first, writer), (second, _) = await connect(), await connect()
+        writer.write(frame(READ))
+        await first.readexactly(len(frame(READ)))
+        await connect()
+        assert await is_closed(second)  # the first has sent a request since
+        assert "idle for the longest time" in reports[0]
+
+    with_server(total)
+
+
+# the command, beside an owner, by real clients
+
+TEXT = """
+title = "Ovens"
+port = "PORT?baudrate=115200"
+[nodes.oven]
+protocol = "modbus"
+address = 11
+points.setpoint = { item = "holding:0", maximum = 50 }
+points.speed = { item = "holding:1", maximum = 50 }
+points.temperature = { item = "holding:2" }
+points.fan = { item = "coil:2" }
+[nodes.kiln]
+protocol = "modbus"
+address = 12
+points.setpoint = { item = "holding:0" }
+[groups.fast]
+period = 0.02
+points = ["oven/setpoint,speed,temperature,fan", "kiln/setpoint"]
+"""
+REGISTERS = """
+[[registers]]
+point = "oven/setpoint"
+address = 0
+type = "int16"
+[[registers]]
+point = "oven/speed"
+address = 1
+type = "int16"
+[[registers]]
+point = "oven/temperature"
+address = 2
+type = "int32"
+[[registers]]
+point = "kiln/setpoint"
+address = 10
+type = "int16"
+scale = 0.1
+[[registers]]
+point = "oven/missing"
+address = 20
+[[registers]]
+point = "oven/fan"
+table = "coil"
+address = 0
+"""
+
+
+@pytest.fixture
+def units() -> Iterator[TcpServer]:
+    with serve("modbus", 11, 12) as server:
+        yield server
+
+
+@pytest.fixture
+def file(tmp_path: Path, units: TcpServer) -> Path:
+    path = tmp_path / "ovens.toml"
+    path.write_text(TEXT.replace("PORT", units.path))
+    (tmp_path / "map.toml").write_text(REGISTERS)
+    return path
+
+
+class Interface:
+    """An interface as a process, and its port. Its standard error is collected by a thread."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.text = ""
+        self.process: subprocess.Popen[str] = started("modbus-tcp", *arguments, "--bind", "127.0.0.1:0").__enter__()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+        self.port = int(self.await_text(r"find it at 127\.0\.0\.1:(\d+)")[1])
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.text += line
+
+    def await_text(self, pattern: str) -> re.Match[str]:
+        end = time.monotonic() + PATIENCE
+        while not (found := re.search(pattern, self.text)):
+            assert time.monotonic() < end, self.text
+            assert self.process.poll() is None, self.text
+            time.sleep(0.01)
+        return found
+
+    def close(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.wait(PATIENCE) == 143, self.text
+        self._reader.join(PATIENCE)
+        self.process.__exit__(None, None, None)
+
+
+@contextlib.contextmanager
+def interface(*arguments: str) -> Iterator[Interface]:
+    opened = Interface(*arguments)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+@contextlib.contextmanager
+def client_of(opened: Interface) -> Iterator[Any]:
+    client: Any = ModbusTcpClient("127.0.0.1", port=opened.port, timeout=PATIENCE, retries=0)
+    assert client.connect()
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def code(reply: Any) -> int:
+    """The exception code of a reply, 0 for none."""
+    return int(reply.exception_code) if reply.isError() else 0
+
+
+def eventually(request: Callable[[], Any], wanted: Callable[[Any], bool], allowed: tuple[int, ...] = (11,)) -> Any:
+    """The reply to a request that is as wanted; before it there may be these exceptions, but no other value."""
+    end = time.monotonic() + PATIENCE
+    while not wanted(reply := request()):
+        assert code(reply) in allowed, reply
+        assert time.monotonic() < end, reply
+        time.sleep(0.01)
+    return reply
+
+
+def test_points_are_read_and_written_as_the_map_says(file: Path) -> None:
+    options = ("--map", str(file.parent / "map.toml"), "--allow", "oven/*", "--allow", "kiln/*")
+    with owner("serve", str(file)), interface(str(file), *options) as opened, client_of(opened) as client:
+        opened.await_text("the map has 'oven/missing', which is not a point of this line")
+        first = eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
+        assert first.registers == [0, 0, 0, 0]
+        # a write is confirmed, and the value before it is never read again
+        for number in range(1, 20):
+            assert code(client.write_register(0, number)) == 0
+            eventually(
+                lambda: client.read_holding_registers(0, count=1),
+                lambda reply, number=number: not code(reply) and reply.registers == [number],  # type: ignore[misc]
+            )
+        assert code(client.write_register(10, 1230)) == 0
+        eventually(
+            lambda: client.read_holding_registers(10), lambda reply: not code(reply) and reply.registers == [1230]
+        )
+        assert code(client.write_registers(2, [0, 1234])) == 0
+        assert code(client.write_coil(0, True)) == 0
+        eventually(lambda: client.read_coils(0), lambda reply: not code(reply) and reply.bits[0])
+        assert code(client.write_coils(0, [False])) == 0
+        # what is refused, and why
+        assert code(client.write_register(2, 5)) == 3  # a part of a value
+        assert code(client.write_registers(2, [1, 0])) == 3  # 65536 is more than the unit's register holds
+        assert code(client.write_register(0, 51)) == 3  # beyond the limit
+        opened.await_text(r"oven/setpoint = 51: .*above its maximum of 50")
+        assert code(client.write_registers(0, [10, 51])) == 3
+        opened.await_text("of this request 1 of 2 points were written")
+        eventually(lambda: client.read_holding_registers(0), lambda reply: not code(reply) and reply.registers == [10])
+        assert code(client.read_holding_registers(2, count=1)) == 3
+        assert code(client.read_holding_registers(4)) == 2
+        assert code(client.read_input_registers(0)) == 2
+        assert code(client.read_holding_registers(20, count=2)) == 10
+        assert code(client.read_coils(1)) == 2
+        assert code(client.readwrite_registers(read_address=0, read_count=1, address=0, values=[1])) == 1
+
+
+def test_without_allow_nothing_is_written_and_only_what_it_names_otherwise(file: Path) -> None:
+    with owner("serve", str(file)):
+        with interface(str(file)) as opened, client_of(opened) as client:
+            eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
+            assert code(client.write_registers(0, [0, 0, 0, 0])) == 1
+            opened.await_text("1 write requests of Modbus TCP were refused")
+        options = ("--map", str(file.parent / "map.toml"), "--allow", "oven/setpoint")
+        with interface(str(file), *options) as opened, client_of(opened) as client:
+            eventually(lambda: client.read_holding_registers(0), lambda reply: not code(reply))
+            assert code(client.write_register(1, 7)) == 3
+            assert code(client.write_registers(0, [7, 7])) == 3  # and not the first of them either
+            assert client.read_holding_registers(0).registers == [0]
+            assert code(client.write_register(0, 7)) == 0
+        elsewhere = ("--allow-from", "10.0.0.0/24")
+        with interface(str(file), *options, *elsewhere) as opened, client_of(opened) as client:
+            eventually(lambda: client.read_holding_registers(0), lambda reply: not code(reply))
+            assert code(client.write_register(0, 8)) == 1
+
+
+def test_a_value_is_not_sent_when_the_owner_stands_still_or_is_gone(file: Path) -> None:
+    with interface(str(file), "--type", "float32", "--last") as opened, client_of(opened) as client:
+        assert code(client.read_holding_registers(0, count=3)) == 11
+        with interface(str(file)) as plain, client_of(plain) as other:
+            with owner("serve", str(file)) as (process, _):
+                eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
+                eventually(
+                    lambda: client.read_holding_registers(0, count=3),
+                    lambda reply: not code(reply) and reply.registers == [0, 0, 0],
+                )
+                os.kill(process.pid, signal.SIGSTOP)
+                try:
+                    eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: code(reply) == 11, (0,))
+                    eventually(
+                        lambda: client.read_holding_registers(0, count=3), lambda reply: reply.registers[2] == 1, (0,)
+                    )
+                finally:
+                    os.kill(process.pid, signal.SIGCONT)
+                eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
+            eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: code(reply) == 11, (0,))
+            eventually(lambda: client.read_holding_registers(2, count=1), lambda reply: reply.registers == [3], (0,))
+            with owner("serve", str(file)):
+                eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
+
+
+def test_a_value_of_a_lost_line_is_not_sent(file: Path, units: TcpServer) -> None:
+    with owner("serve", str(file)), interface(str(file)) as opened, client_of(opened) as client:
+        eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
+        units.close()
+        eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: code(reply) == 11, (0,))
+
+
+def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_replies(file: Path) -> None:
+    with (
+        owner("serve", str(file)),
+        interface(str(file), "--pass-through", "--allow-unit", "11") as opened,
+        client_of(opened) as client,
+    ):
+        allowed = (10, 11)  # the nodes of the line are not known yet
+        eventually(
+            lambda: client.read_holding_registers(100, count=9, device_id=11), lambda one: not code(one), allowed
+        )
+        assert code(client.write_registers(100, list(range(100, 125)), device_id=11)) == 0
+        assert code(client.write_register(125, 125, device_id=11)) == 0
+        assert code(client.write_coils(10, [True, False, True], device_id=11)) == 0
+        assert client.read_coils(10, count=3, device_id=11).bits[:3] == [True, False, True]
+        assert client.read_discrete_inputs(0, count=3, device_id=11).bits[:3] == [False, False, False]
+        assert client.read_input_registers(0, count=2, device_id=12).registers == [0, 0]
+        assert code(client.read_holding_registers(999, count=2, device_id=11)) == 2  # of the unit
+        assert code(client.write_register(100, 1, device_id=12)) == 3
+        assert code(client.read_holding_registers(0, device_id=13)) == 10
+        # the points: what was written to the unit has made them stale
+        eventually(lambda: client.read_holding_registers(0, count=4, device_id=255), lambda one: not code(one))
+        opened.await_text(r"unit 11, 25 from holding 100: written")
+        wrong: list[Any] = []
+
+        def read(offset: int) -> None:
+            with client_of(opened) as own:
+                for number in range(100):
+                    first = 100 + (number * 7 + offset) % 20
+                    reply = own.read_holding_registers(first, count=4, device_id=11)
+                    if code(reply) or reply.registers != list(range(first, first + 4)):
+                        wrong.append((first, reply))
+
+        threads = [threading.Thread(target=read, args=(offset,)) for offset in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(PATIENCE)
+        assert wrong == []
+
+
+def test_a_unit_that_does_not_reply_is_exception_11(file: Path) -> None:
+    text = file.read_text().replace("address = 12", "address = 13")
+    file.write_text(text)
+    with owner("serve", str(file)), interface(str(file), "--pass-through") as opened, client_of(opened) as client:
+        eventually(lambda: client.read_holding_registers(0, device_id=11), lambda one: not code(one), (10, 11))
+        assert code(client.read_holding_registers(0, device_id=13)) == 11
+
+
+def test_hostile_bytes_do_not_disturb_another_client(file: Path) -> None:
+    with owner("serve", str(file)), interface(str(file)) as opened, client_of(opened) as client:
+        eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
+        for number in range(200):
+            with socket.create_connection(("127.0.0.1", opened.port), timeout=PATIENCE) as hostile:
+                hostile.sendall(bytes((number * 7 + place * 13) % 256 for place in range(number)))
+        assert code(client.read_holding_registers(0, count=4)) == 0
+        assert opened.process.poll() is None
+
+
+def test_the_map_is_printed_as_csv(file: Path, busmaster: Command) -> None:
+    with owner("serve", str(file)):
+        printed = busmaster("modbus-tcp", str(file), "--print-map", "--allow", "oven/s*")
+    assert printed.status == 0, printed.err
+    assert printed.lines[:3] == [
+        "table,address,registers,type,word_order,byte_order,scale,status,point,unit,write",
+        "holding,0,4,float64,big,big,1,,oven/setpoint,,yes",
+        "holding,4,4,float64,big,big,1,,oven/speed,,yes",
+    ]
+    assert printed.lines[5] == "holding,16,4,float64,big,big,1,,kiln/setpoint,,no"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--read-only", "--allow", "*"), "--read-only says that nothing may"),
+        (("--bind", "0.0.0.0:0", "--allow", "*"), "needs --allow-from"),
+        (("--bind", "0.0.0.0:0", "--pass-through", "--allow-unit", "3"), "needs --allow-from"),
+        (("--allow-unit", "3"), "needs --pass-through"),
+        (("--allow", "*", "--allow-from", "here"), "--allow-from: 'here'"),
+        (("--allow-from", "10.0.0.1"), "nothing may be written"),
+        (("--map", "absent.toml"), "absent.toml"),
+        (("--map", __file__), "test_modbus_tcp.py: "),
+        (("--map", __file__, "--last"), "--type and --last are for the automatic map"),
+        (("--bind", "here"), "--bind: a TCP address is written HOST:PORT"),
+    ],
+)
+def test_wrong_usage_is_an_error(busmaster: Command, arguments: tuple[str, ...], complaint: str) -> None:
+    ran = busmaster("modbus-tcp", "ovens", *arguments)
+    assert ran.status in (1, 2)
+    assert complaint in ran.err
+
+
+def test_a_map_without_points_has_no_addresses() -> None:
+    with pytest.raises(ExceptionReply):
+        RegisterMap().whole("holding", 0, 1)
