@@ -25,7 +25,7 @@ from typing import Any, TypeAlias
 
 import click
 
-from busmaster import Quality
+from busmaster import Priority, Quality
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.interfaces import following, interface_options, place_of
 from busmaster.app.cli.output import Level, note
@@ -701,7 +701,9 @@ class Answers:
 
     async def _read_unit(self, unit: int, request: ReadRequest) -> list[int]:
         kind = "read_bits" if request.table in BIT_TABLES else "read_registers"
-        return [int(one) for one in await self._run(unit, kind, request.first, request.count, request.table)]
+        # Clients poll. As commands, reads of four clients took 28 % of the cycles from a group of the owner.
+        values = await self._run(unit, Priority.POLL, kind, request.first, request.count, request.table)
+        return [int(one) for one in values]
 
     async def _write_unit(self, peer: str, unit: int, request: WriteRequest) -> None:
         self._check_writer(peer, bool(self._rules.units))
@@ -710,13 +712,13 @@ class Answers:
         kind = "write_coils" if request.table == "coil" else "write_registers"
         what = f"client {peer}: unit {unit}, {len(request.values)} from {request.table} {request.first}"
         try:
-            await self._run(unit, kind, request.first, request.values)
+            await self._run(unit, Priority.COMMAND, kind, request.first, request.values)
         except ExceptionReply as refused:
             self._tell(f"{what}: {cut(str(refused))}")
             raise
         self._tell(f"{what}: written")
 
-    async def _run(self, unit: int, kind: str, *arguments: Any) -> Any:
+    async def _run(self, unit: int, priority: Priority, kind: str, *arguments: Any) -> Any:
         line = self._values.line
         if not line.is_connected:
             raise ExceptionReply(NO_REPLY, "the line's owner is away")
@@ -724,7 +726,8 @@ class Answers:
             raise ExceptionReply(NO_PATH, f"the line has no Modbus RTU unit {unit}")
         try:
             command = _modbus_commands()[kind](*arguments)
-            return await line.remote.find("modbus", unit).request(command, finish_within=FINISH_WITHIN)
+            node = line.remote.find("modbus", unit)
+            return await node.request(command, priority=priority, finish_within=FINISH_WITHIN)
         except (BusError, InvalidCommand) as error:
             raise ExceptionReply(code_of(error), str(error)) from None
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import ipaddress
 import os
+import random
 import re
 import signal
 import socket
@@ -15,14 +16,17 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from pymodbus.client import ModbusTcpClient
 
+from busmaster import Priority
 from busmaster.app.interfaces import modbus_tcp
 from busmaster.app.interfaces.modbus_tcp import (
     UNIT_REFUSED,
+    Answers,
     BadFrame,
     Entry,
     ExceptionReply,
@@ -30,6 +34,7 @@ from busmaster.app.interfaces.modbus_tcp import (
     ReadRequest,
     RegisterMap,
     Rules,
+    Values,
     WriteRequest,
     automatic_map,
     code_of,
@@ -38,9 +43,12 @@ from busmaster.app.interfaces.modbus_tcp import (
     read_reply,
     request_of,
 )
-from busmaster.emulator.serve import TcpServer
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Line
+from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.errors import InvalidCommand, NodeDown, NoReply, NotStarted, Refused, WriteUnconfirmed
 from busmaster.protocols.modbus.codec import EXCEPTIONS
+from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Command, busmaster, owner, serve, started
 from tests.patience import PATIENCE
 
@@ -618,6 +626,45 @@ def test_a_value_of_a_lost_line_is_not_sent(file: Path, units: TcpServer) -> Non
         eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
         units.close()
         eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: code(reply) == 11, (0,))
+
+
+def test_a_value_of_a_unit_that_has_fallen_silent_is_not_sent(tmp_path: Path) -> None:
+    devices = [make_device("modbus", address) for address in (11, 12)]
+    line = Line(find("modbus").profile.line, devices, chance=random.Random(1), paced=False)
+    path = tmp_path / "ovens.toml"
+    with serve_tcp(line) as server:
+        path.write_text(TEXT.replace("PORT", server.path))
+        with owner("serve", str(path)), interface(str(path)) as opened, client_of(opened) as client:
+            eventually(lambda: client.read_holding_registers(16, count=4), lambda reply: not code(reply))
+            devices[1].faults = Faults(lost=1.0)
+            eventually(lambda: client.read_holding_registers(16, count=4), lambda reply: code(reply) == 11, (0,))
+            eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
+            assert code(client.read_holding_registers(0, count=20)) == 11  # one of them is
+
+
+def test_units_are_read_with_the_priority_of_polls_and_written_as_commands() -> None:
+    sent: list[tuple[str, Priority]] = []
+
+    class Unit:
+        async def request(self, command: Any, *, priority: Priority, finish_within: float) -> Any:
+            sent.append((str(command), priority))
+            return (7,)
+
+    line: Any = SimpleNamespace(
+        is_connected=True,
+        read_only=False,
+        picture=SimpleNamespace(nodes={("modbus", 3): None}),
+        remote=SimpleNamespace(find=lambda _protocol, _unit: Unit()),
+    )
+
+    async def run() -> None:
+        rules = Rules(units=frozenset((3,)), pass_through=True)
+        answers = Answers(Values(line), rules, lambda _: None)
+        assert await answers.reply("127.0.0.1", 3, READ) == bytes.fromhex("03 02 0007")
+        assert await answers.reply("127.0.0.1", 3, bytes.fromhex("06 0000 0007")) == bytes.fromhex("06 0000 0007")
+
+    asyncio.run(run())
+    assert sent == [("read holding 0", Priority.POLL), ("write holding 0 = 7", Priority.COMMAND)]
 
 
 def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_replies(file: Path) -> None:
