@@ -115,12 +115,12 @@ class Owner:
 
         holds: list[float] = []
         self._watch.each = holds
-        before = self._bus.statistics().exchanges
+        before = (await self._bus.statistics()).exchanges
         begun = time.monotonic()
         await asyncio.gather(*(ask() for _ in range(CALLERS)))
         took = time.monotonic() - begun
         self._watch.each = None
-        return {"rate": (self._bus.statistics().exchanges - before) / took, "holds": holds}
+        return {"rate": ((await self._bus.statistics()).exchanges - before) / took, "holds": holds}
 
 
 async def serve(watch: Watch) -> int:

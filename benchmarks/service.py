@@ -229,7 +229,7 @@ async def _reader(address: str) -> AsyncIterator[list[int]]:
     """Have a program read the group; yield the numbers of the cycles that came to it."""
     heard: list[int] = []
     async with connect(address) as bus:
-        group = await bus.group(GROUP)
+        group = bus.group(GROUP)
 
         async def hear() -> None:
             heard.extend([snapshot.cycle async for snapshot in group])

@@ -9,6 +9,7 @@ from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.bus import Bus
+from busmaster.bus.bus_like import BusLike
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -60,6 +61,7 @@ __all__ = [
     "Bus",
     "BusClosed",
     "BusError",
+    "BusLike",
     "CtAnsiDrive",
     "Dc104Drive",
     "Endpoint",

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, Unpack
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE, Hold, LineClient
-from busmaster.arbiter.counters import Mark, RecentUtilisation
+from busmaster.arbiter.counters import LineStatistics, Mark, RecentUtilisation
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.learned import LearnedTimes, window_of
 from busmaster.arbiter.on_wire import Echo
@@ -17,6 +17,7 @@ from busmaster.arbiter.tap import Attempt, Tap, Verdict
 from busmaster.arbiter.transaction import BACKGROUND, COMMAND, POLL, URGENT, Poll, Transaction
 from busmaster.arbiter.unexpected import QUIET
 from busmaster.bus.bus import Bus
+from busmaster.bus.bus_like import find_group
 from busmaster.bus.exclusive import HeldNode, checked_hold
 from busmaster.bus.handle import Handle, Send
 from busmaster.bus.limits import Limit
@@ -171,6 +172,7 @@ __all__ = [
     "clock_of",
     "documented",
     "empty_set",
+    "find_group",
     "give_back",
     "give_up",
     "guess",
@@ -188,6 +190,7 @@ __all__ = [
     "lend_node",
     "line_of",
     "listed_parameters",
+    "line_statistics",
     "lost_seconds",
     "meant",
     "names_of_items",
@@ -265,6 +268,11 @@ def lost_seconds(bus: Bus) -> float:
 def reads_after_writes(bus: Bus) -> ReadsAfterWrites:
     """Return the counters of the reads of points with `read_after_write`."""
     return bus._reads_after_writes
+
+
+def line_statistics(bus: Bus) -> LineStatistics:
+    """Return what `Bus.statistics` does, where nothing can be awaited."""
+    return bus._statistics()
 
 
 async def plan_in_steps(bus: Bus, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:

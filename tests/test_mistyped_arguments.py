@@ -99,7 +99,7 @@ def test_a_mistyped_request_is_refused_before_anything_is_sent(
         async with bus_of() as bus:
             with pytest.raises(InvalidCommand):
                 await ask(Hcp2Controller(bus, 1))
-            assert bus.statistics().exchanges == 0
+            assert (await bus.statistics()).exchanges == 0
 
     run_in_virtual_time(main())
 
@@ -135,7 +135,7 @@ def test_a_mistyped_argument_of_a_bus_or_a_handle_is_refused(mistake: Callable[[
         async with bus_of() as bus:
             with pytest.raises(InvalidCommand):
                 mistake(bus)
-            assert bus.statistics().exchanges == 0
+            assert (await bus.statistics()).exchanges == 0
 
     run_in_virtual_time(main())
 
@@ -173,7 +173,7 @@ def test_what_is_no_number_and_no_item_is_refused_in_words_by_every_handle(proto
             for mistyped in (MANY, f"1.{MANY}", f"1.17:{MANY}", f"holding:{MANY}", f"coil:1:{MANY}", "", "\u0661"):
                 with pytest.raises(InvalidCommand):
                     handle.point(mistyped)
-            assert bus.statistics().exchanges == 0
+            assert (await bus.statistics()).exchanges == 0
 
     run_in_virtual_time(main())
 

@@ -180,8 +180,8 @@ def test_protocols_and_examples_use_only_what_is_public(path: Path) -> None:
 
 
 SHOWN = {
-    "bus": """alarms as_of_now condition endpoint events groups latest node nodes now plan poll_group reset_statistics
-        running state statistics wall_time worst_case_wait""",
+    "bus": """alarms as_of_now condition endpoint events group groups latest node nodes now plan poll_group
+        reset_statistics running state statistics wall_time worst_case_wait""",
     "node": """address check exclusive health label latest lift limit limits line merge_reads note_stop now of on_return
         planned probe profile request statistics stops suspend suspended timed_request timings use_sync_reads""",
     "handle": """bus differences exclusive in_operation items node parameters point prepare_load profile read

@@ -21,6 +21,7 @@ from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
+from busmaster.bus.bus_like import find_group
 from busmaster.bus.condition import LineCondition
 from busmaster.bus.node import Node
 from busmaster.bus.outlook import Outlook
@@ -290,6 +291,10 @@ class Bus:
         """Return the poll groups, including paused ones, in the order in which they were made."""
         return tuple(self._groups.values())
 
+    def group(self, name: str) -> PollGroup:
+        """Return a poll group by its name. Raises InvalidCommand, with the names that exist, for another one."""
+        return find_group(self.groups, name)
+
     def poll_group(
         self,
         name: str,
@@ -334,6 +339,7 @@ class Bus:
         # After all checks: an error must not leave a partly created group behind.
         self._arbiter.add_poll(group.poll, self.now())
         self._groups[name] = group
+        self._groups_changed()
         self._pump.turn()
         return group
 
@@ -385,8 +391,14 @@ class Bus:
         """
         return self._line.as_of_now(point, sample)
 
-    def statistics(self) -> LineStatistics:
-        """Return an immutable snapshot of the line's counters since it was opened or they were reset."""
+    async def statistics(self) -> LineStatistics:
+        """Return an immutable snapshot of the line's counters since it was opened or they were reset.
+
+        A coroutine, as on a `RemoteBus`, which has to request them. On a `Bus` it never waits.
+        """
+        return self._statistics()
+
+    def _statistics(self) -> LineStatistics:
         self._check_loop()
         return replace(self._arbiter.statistics(self.now()), driver=self._pump.driver_errors())
 
@@ -465,6 +477,11 @@ class Bus:
     def _forget(self, group: PollGroup) -> None:
         if self._groups.get(group.name) is group:
             del self._groups[group.name]
+            self._groups_changed()
+
+    def _groups_changed(self) -> None:
+        for told in self._line.on_groups:
+            told()
 
     def _on_written(self, write: Transaction, when: float) -> None:
         self._line.touched(write, when)

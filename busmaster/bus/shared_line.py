@@ -55,6 +55,8 @@ class SharedLine:
         self.loop_runs: Callable[[], bool] = lambda: False
         self.on_stop: list[Callable[[NodeRecord], None]] = []
         """Called immediately when a node is stopped."""
+        self.on_groups: list[Callable[[], None]] = []
+        """Called when a poll group was added or has ended."""
         self.on_touched: list[Callable[[NodeRecord, float], None]] = []
         """Called immediately when a write has ended, with the node and the time."""
         self.latest_of: dict[str, Snapshot] = {}

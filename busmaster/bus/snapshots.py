@@ -161,6 +161,8 @@ class Stream(Generic[T]):
         self._items: deque[T] = deque(maxlen=whole_number(buffer, 1, sys.maxsize, "a buffer"))
         self._arrived = anyio.Event()
         self._closed = False
+        self._cause: Exception | None = None
+        """Why it ended, where that is an error."""
         self.dropped = 0
         listeners.append(self)
 
@@ -170,7 +172,7 @@ class Stream(Generic[T]):
     async def __anext__(self) -> T:
         while not self._items:
             if self._closed:
-                raise StopAsyncIteration
+                raise StopAsyncIteration if self._cause is None else self._cause
             # A new event only after the old one was set, shared until then: otherwise one of two tasks that wait on the
             # same stream could wait on an event that is never set.
             if self._arrived.is_set():
@@ -178,8 +180,10 @@ class Stream(Generic[T]):
             await self._arrived.wait()
         return self._items.popleft()
 
-    def close(self) -> None:
-        """Add no further items. Items in the buffer can still be read."""
+    def close(self, cause: Exception | None = None) -> None:
+        """Add no further items. Items in the buffer can still be read; then iteration ends, or raises the cause."""
+        if not self._closed:
+            self._cause = cause
         self._closed = True
         if self in self._listeners:
             self._listeners.remove(self)
@@ -203,6 +207,8 @@ class Cycles:
         self._consumers: list[Stream[Snapshot]] = []
         self._consumers_of_changes: list[Stream[Snapshot]] = []
         self._over = False
+        self._cause: Exception | None = None
+        """Why it ended, where that is an error."""
 
     def subscribe(self, buffer: int = 16, *, changes: bool = False) -> Stream[Snapshot]:
         """Return a consumer that buffers this many snapshots. Close it when it is no longer used.
@@ -210,6 +216,8 @@ class Cycles:
         With `changes` it also gets the changes between two cycles, each as a snapshot of the changed values: `Outdated`
         and `ReadAfterWrite`.
         """
+        if self._cause is not None:
+            raise self._cause
         if self._over:
             raise BusClosed(f"poll group {self.name!r} is closed")
         return Stream(self._consumers_of_changes if changes else self._consumers, buffer)
@@ -232,8 +240,10 @@ class Cycles:
         for consumer in self._consumers_of_changes:
             consumer.put(snapshot)
 
-    def _end(self) -> None:
-        """End all consumers after the snapshots in their buffers."""
+    def _end(self, cause: Exception | None = None) -> None:
+        """End all consumers after the snapshots in their buffers, with the cause if it is an error."""
+        if not self._over:
+            self._cause = cause
         self._over = True
         for consumer in (*self._consumers, *self._consumers_of_changes):
-            consumer.close()
+            consumer.close(cause)

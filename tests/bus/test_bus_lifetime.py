@@ -215,7 +215,7 @@ def test_without_any_loop_it_says_so_too_and_what_it_advises_works() -> None:
 
             def other_thread() -> float:
                 with pytest.raises(InvalidCommand, match=threading.current_thread().name):
-                    bus.statistics()
+                    bus.statistics().send(None)
                 with pytest.raises(InvalidCommand, match="run_coroutine_threadsafe"):
                     axis.read(1).send(None)
                 return asyncio.run_coroutine_threadsafe(axis.read(1), loop).result(10.0)

@@ -168,9 +168,9 @@ def test_groups_closed_while_they_are_placed_leave_nothing() -> None:
             group.close()
         del group, groups
         assert bus.groups == (stays,)
-        asked = bus.statistics().exchanges
+        asked = (await bus.statistics()).exchanges
         seen = await cycles(stays, 4)
-        assert bus.statistics().exchanges == asked + 4
+        assert (await bus.statistics()).exchanges == asked + 4
         assert [snapshot.missed for snapshot in seen] == [0] * 4
         gc.collect()
         assert not any(ref() for ref in kept)

@@ -57,9 +57,9 @@ def test_a_dead_node_that_was_given_back_is_probed_no_more() -> None:
             assert probed > 1
             bus._give_back(lent)
             await asyncio.sleep(1)
-            exchanges = bus.statistics().exchanges
+            exchanges = (await bus.statistics()).exchanges
             await asyncio.sleep(60)
-            assert bus.statistics().exchanges == exchanges
+            assert (await bus.statistics()).exchanges == exchanges
 
     run_in_virtual_time(run())
 

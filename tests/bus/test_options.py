@@ -63,7 +63,7 @@ def test_an_option_that_is_none_is_refused_before_anything_is_sent(
     async def story(bus: Bus) -> None:
         with pytest.raises(InvalidCommand):
             await ask(Hcp2Controller(bus, 1))
-        assert bus.statistics().exchanges == 0
+        assert (await bus.statistics()).exchanges == 0
 
     on_a_bus(story)
 
@@ -193,7 +193,7 @@ def test_a_caller_cancelled_while_it_has_a_time_is_cancelled() -> None:
         with pytest.raises(asyncio.CancelledError):
             await reading
         await asyncio.sleep(0.2)
-        assert bus.statistics().cancelled == 1
+        assert (await bus.statistics()).cancelled == 1
 
     on_a_bus(story, slow())
 

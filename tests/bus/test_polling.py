@@ -457,7 +457,7 @@ def test_a_value_that_cannot_be_decoded_is_an_error_of_its_point_alone() -> None
         sample: Sample[Any] = snapshot[bad]
         assert (sample.value, sample.quality) == (None, Quality.BAD)
         assert isinstance(snapshot[bad].error, GarbledReply)
-        assert bus.statistics().losses == 0
+        assert (await bus.statistics()).losses == 0
         with pytest.raises(GarbledReply, match="colour"):
             await bad.read()
 

@@ -36,7 +36,7 @@ def test_the_plan_of_a_running_bus_is_what_it_does() -> None:
         bus.reset_statistics()
         await asyncio.sleep(20.0)
         prediction = bus.plan()
-        assert bus.statistics().utilisation == pytest.approx(prediction.utilisation, abs=0.02)
+        assert (await bus.statistics()).utilisation == pytest.approx(prediction.utilisation, abs=0.02)
         assert prediction.fits
         for group, planned in zip(bus.groups, prediction.groups, strict=True):
             assert group.statistics().cycle_time.mean == pytest.approx(planned.cycle, rel=0.1)

@@ -214,7 +214,7 @@ async def test_neighbouring_parameters_are_polled_as_runs_where_that_is_allowed(
         group = bus.poll_group("references", period=1.0, points=points)
         [snapshot] = await cycles(group, 1)
         assert [snapshot[point].value for point in points] == list(range(17, 25))
-        assert bus.statistics().exchanges == 1
+        assert (await bus.statistics()).exchanges == 1
 
 
 # DC104
@@ -249,4 +249,4 @@ async def test_controllers_of_both_host_comms_protocols_share_a_line() -> None:
             assert [snapshot[point].value for point in points] == [
                 100 * number + value for number in range(4) for value in (0, 3, 16)
             ]
-        assert bus.statistics().unexpected_bytes == bus.statistics().collisions == 0
+        assert (await bus.statistics()).unexpected_bytes == (await bus.statistics()).collisions == 0

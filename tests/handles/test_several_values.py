@@ -97,7 +97,7 @@ def test_several_values_are_written_and_read_from_an_item_on(case: Case) -> None
 @every_handle
 def test_nothing_is_sent_if_one_of_the_items_or_values_is_wrong(case: Case) -> None:
     async def story(handle: Any, device: Device, bus: Bus) -> None:
-        before = bus.statistics().exchanges
+        before = (await bus.statistics()).exchanges
         with pytest.raises(InvalidCommand, match=r"no value to write|takes a value, not 0"):
             await handle.write(case.items[0])
         with pytest.raises(InvalidCommand):
@@ -110,7 +110,7 @@ def test_nothing_is_sent_if_one_of_the_items_or_values_is_wrong(case: Case) -> N
                 await handle.read(case.last, 2)
             with pytest.raises(InvalidCommand):
                 await handle.write(case.last, *case.values[:2])
-        assert bus.statistics().exchanges == before
+        assert (await bus.statistics()).exchanges == before
 
     told(case, story)
 
@@ -118,12 +118,12 @@ def test_nothing_is_sent_if_one_of_the_items_or_values_is_wrong(case: Case) -> N
 @every_handle
 def test_no_value_is_sent_if_one_of_them_is_beyond_a_limit(case: Case) -> None:
     async def story(handle: Any, device: Device, bus: Bus) -> None:
-        before = bus.statistics().exchanges
+        before = (await bus.statistics()).exchanges
         point = handle.point(str(case.items[1]))
         Node.of(handle).limit(Limit(name="limited", read=point.command, decode=point.value_of, minimum=100))
         with pytest.raises(InvalidCommand, match="100"):
             await handle.write(case.items[0], *case.values)
-        assert bus.statistics().exchanges == before
+        assert (await bus.statistics()).exchanges == before
 
     told(case, story)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from busmaster import ext
 from busmaster.bus.bus import Bus
 from busmaster.capture.frames import UNEXPECTED, Direction, Frame
 from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError
@@ -377,7 +378,7 @@ def on_a_bus(story: Callable[[BisynchInstrument], Awaitable[None]], device: Emul
 def counted(furnace: BisynchInstrument) -> int:
     """The exchanges of its line so far."""
     assert isinstance(furnace.bus, Bus)
-    return furnace.bus.statistics().exchanges
+    return ext.line_statistics(furnace.bus).exchanges
 
 
 def test_a_refused_write_names_the_instruments_own_reason() -> None:

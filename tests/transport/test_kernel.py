@@ -124,9 +124,11 @@ async def test_the_drivers_counts_begin_again_where_the_buss_statistics_are_rese
     driver.counts = {6: 10, 7: 0, 8: 0, 9: 0, 10: 0}
     async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
         driver.counts[6] += 1
-        assert bus.statistics().driver == DriverErrors(framing=1, parity=0, breaks=0, overruns=0, buffer_overruns=0)
+        assert (await bus.statistics()).driver == DriverErrors(
+            framing=1, parity=0, breaks=0, overruns=0, buffer_overruns=0
+        )
         bus.reset_statistics()
-        assert bus.statistics().driver == DriverErrors(0, 0, 0, 0, 0)
+        assert (await bus.statistics()).driver == DriverErrors(0, 0, 0, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +153,7 @@ async def test_marks_of_damaged_zeros_are_no_breaks_where_the_driver_counts_thos
 
         async def heard(marks: int) -> tuple[int, int]:
             pty_master.write(b"\xff\x00\x00" * marks)
-            while (found := bus.statistics()).damaged + found.breaks < marks:  # noqa: ASYNC110  # nothing tells
+            while (found := await bus.statistics()).damaged + found.breaks < marks:  # noqa: ASYNC110  # nothing tells
                 await asyncio.sleep(0.001)
             return found.damaged, found.breaks
 

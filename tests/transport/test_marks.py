@@ -263,7 +263,7 @@ async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(pty_
         with pytest.raises(GarbledReply, match="parity"):
             await axis.read(1, retries=0)
         assert await axis.read(1) == 234
-        line = bus.statistics()
+        line = await bus.statistics()
         assert (line.damaged, line.breaks, line.driver) == (1, 0, None)
         answering.cancel()
 

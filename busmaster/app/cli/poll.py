@@ -115,8 +115,8 @@ async def poll_served(remote: RemoteBus, points: Sequence[Point[Any]], period: f
     try:
         async with remote, late_nodes(remote):
             with anyio.move_on_after(view.seconds):
-                await cycles.show(await remote.poll_group("poll", period=period, points=points))
-                await remote.groups()  # it ended without us: this says why
+                await cycles.show(remote.poll_group("poll", period=period, points=points))
+                remote.link.check()  # it ended without us: this says why
     finally:
         cycles.summarise()
     return ended(cycles.values)

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import anyio
 
-from busmaster import Bus, Health, LineState
+from busmaster import Bus, Health, LineState, ext
 
 AT_LEAST = 0.1
 """Seconds from one sign of life to the next, whatever was asked for."""
@@ -89,7 +89,7 @@ class Movement:
         polled, or while every node is down or suspended.
         """
         now = self._bus.now()
-        exchanges = self._bus.statistics().exchanges
+        exchanges = ext.line_statistics(self._bus).exchanges
         periods = [group.period for group in self._bus.groups if group.points and not group.paused]
         asked = any(node.health is not Health.DOWN and not node.suspended for node in self._bus.nodes)
         if exchanges != self._exchanges or not periods or not asked or self._bus.state is LineState.OFFLINE:

@@ -150,7 +150,7 @@ class Watch:
 
     def summarise(self) -> None:
         """Print the summary on standard error: cycles, missed, achieved period, utilisation; a line for each node."""
-        counts = self.bus.statistics()
+        counts = ext.line_statistics(self.bus)
         if self.bus.state is LineState.RESYNCHRONISING and not (counts.exchanges or counts.unexpected_bytes):
             note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
         if text := loss_text(self.bus):
@@ -178,7 +178,7 @@ class Watch:
 
 def loss_text(bus: Bus) -> str:
     """Return how often and for how long the line was lost, and why it is if it still is; "" where it never was."""
-    losses, lost = bus.statistics().losses, bus.condition
+    losses, lost = ext.line_statistics(bus).losses, bus.condition
     if not (losses or lost.is_lost):
         return ""
     times = f"lost {losses} time{'s' * (losses != 1)}, " if losses else "never connected, "

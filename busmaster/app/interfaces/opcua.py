@@ -218,7 +218,7 @@ class LineServer:
         """Put what each cycle of a group brings, for as long as the line has it."""
         while True:
             with suppress(BusError, InvalidCommand):  # that no cycles come shows in the values' age
-                group = await remote.group(name)
+                group = remote.group(name)
                 try:
                     async for snapshot in group:
                         await self._take(name, snapshot)

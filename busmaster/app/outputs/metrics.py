@@ -105,7 +105,7 @@ class MetricsOutput(Output):
         """Look at how busy the line is, now and again and again until the output is closed. Runs on the loop."""
         assert self._owner is not None
         if not self._stop.is_set() and self._bus.running:
-            self._utilisation.note(self._bus.now(), self._bus.statistics())
+            self._utilisation.note(self._bus.now(), ext.line_statistics(self._bus))
             self._owner.call_later(NOTED_EVERY, self._note_utilisation)
 
     def offer(self, item: object) -> None:
@@ -193,7 +193,7 @@ class MetricsOutput(Output):
         yield waits
 
     def _line_and_utilisation(self) -> tuple[LineStatistics, float]:
-        line = self._bus.statistics()
+        line = ext.line_statistics(self._bus)
         return line, self._utilisation.note(self._bus.now(), line)
 
     def _counts_of_reads(self) -> dict[str, int]:

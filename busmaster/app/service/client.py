@@ -20,7 +20,7 @@ from busmaster.app.service.refusals import INTERFACES
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Rights, Role
 from busmaster.app.service.streams import Broadcast, GroupBroadcast
-from busmaster.app.service.telling import point_of, profile_of, protocol_of, said_statistics
+from busmaster.app.service.telling import listed_groups, point_of, profile_of, protocol_of, said_statistics
 from busmaster.bounds import (
     LONGEST_SENDER,
     MOST_CHECKED,
@@ -227,9 +227,9 @@ class Client:
             case "now":
                 return self._line.bus.now()
             case "statistics":
-                return said_statistics(self._line.bus.statistics())
+                return said_statistics(ext.line_statistics(self._line.bus))
             case "groups":
-                return [{"name": group.name, "period": group.period} for group in self._line.bus.groups]
+                return listed_groups(self._line.bus)
             case "subscribe":
                 return self._follow(params, self._line.broadcast_of(self._line.group(params["group"])))
             case "events":
@@ -422,7 +422,7 @@ class Client:
             group.close()
             raise
         self._groups[params["stream"]] = group
-        return answer
+        return {**answer, "name": group.name}
 
     def _end_stream(self, stream: int) -> None:
         source = self._streams.pop(stream, None)

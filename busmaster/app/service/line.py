@@ -70,11 +70,7 @@ class ServedLine:
 
     def group(self, name: str) -> PollGroup:
         """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
-        found = next((group for group in self.bus.groups if group.name == name), None)
-        if found is None:
-            names = ", ".join(group.name for group in self.bus.groups) or "none"
-            raise InvalidCommand(f"no poll group {name!r}; there are: {names}")
-        return found
+        return self.bus.group(name)
 
     def point(self, group: str, key: str) -> tuple[PollGroup, Point[Any]]:
         """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""

@@ -209,7 +209,7 @@ class Overview(Broadcast):
     # the line
 
     def _frame(self) -> dict[str, Any]:
-        now, statistics = self._bus.now(), self._bus.statistics()
+        now, statistics = self._bus.now(), ext.line_statistics(self._bus)
         condition = self._bus.condition
         settings = self._bus.endpoint.settings
         return {

@@ -30,7 +30,8 @@ from busmaster.app.service.telling import (
 from busmaster.bounds import MOST_CHECKED
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.events import BusEvent, Stream
-from busmaster.ext import Command, Learned, Profile
+from busmaster.ext import Command, Learned, Profile, checked_priority, find_group, seconds
+from busmaster.registry import protocols
 from busmaster.statistics import LineStatistics
 
 T = TypeVar("T")
@@ -85,6 +86,13 @@ class RemoteBus:
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
         self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
+        self._listed: dict[str, float] = {}
+        """The poll groups that the owner has, with their periods."""
+        self._owners: dict[str, RemoteGroup] = {}
+        self._own: dict[str, RemoteGroup] = {}
+        self._own_names: set[str] = set()
+        """The names that the owner gave to groups of this program: it lists them, also for a moment after their end."""
+        self._tasks: set[asyncio.Task[None]] = set()
         self._count = 0
         self._sequences = 0
         self.room = Room(self.now)
@@ -103,6 +111,7 @@ class RemoteBus:
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
+        self._listed = {group["name"]: group["period"] for group in said["groups"]}
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
@@ -176,6 +185,17 @@ class RemoteBus:
             self._name(node)
         return node
 
+    @property
+    def nodes(self) -> tuple[RemoteNode, ...]:
+        """Return the nodes that the owner had when the bus was entered, then those that this program has named.
+
+        Nodes of a protocol that is not installed here are left out.
+        """
+        installed = {protocol.name for protocol in protocols()}
+        known = [node for node in self.about.get("nodes", ()) if node["protocol"] in installed]
+        found = {self.find(node["protocol"], node["address"]): None for node in known}
+        return tuple({**found, **dict.fromkeys(self._named)})
+
     def find(self, protocol: str, address: int) -> RemoteNode:
         """Return a node that the owner speaks of, by the name of its protocol. It is not named for that."""
         return self._find(protocol_of(protocol).profile, address)
@@ -212,14 +232,31 @@ class RemoteBus:
         """Return an immutable snapshot of the line's counts, as `Bus.statistics`."""
         return statistics_of(await self._ask("statistics", {}))
 
-    async def group(self, name: str) -> RemoteGroup:
-        """Return a poll group of the line by its name. Raises InvalidCommand if there is none.
+    @property
+    def groups(self) -> tuple[RemoteGroup, ...]:
+        """Return the poll groups of the line: those of its owner and of other programs, then this program's own.
 
-        Its samples are those that the line's owner makes: of bits, the number.
+        A group that was added or closed there is so here a moment later. The owner sends the cycles of one that is
+        iterated, subscribed to, or asked for by `group`.
         """
-        return await self._follow("subscribe", name, (), {"group": name})
+        own = tuple(group for group in self._own.values() if not group.over)
+        listed = {name: period for name, period in self._listed.items() if name not in self._own_names}
+        for name, period in listed.items():
+            if (known := self._owners.get(name)) is None or known.over:
+                self._owners[name] = self._new_group(name, (), period, "subscribe", {"group": name})
+        return (*(self._owners[name] for name in listed), *own)
 
-    async def poll_group(
+    def group(self, name: str) -> RemoteGroup:
+        """Return a poll group by its name, this program's own before the owner's, and have its cycles sent.
+
+        Samples of the owner's group are those that the owner makes: of bits, the number. Raises InvalidCommand, with
+        the names that exist, for another name.
+        """
+        found = find_group(self.groups, name)
+        found.begin()
+        return found
+
+    def poll_group(
         self,
         name: str,
         *,
@@ -228,9 +265,30 @@ class RemoteBus:
         phase: float | None = None,
         priority: Priority = Priority.POLL,
     ) -> RemoteGroup:
-        """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
+        """Have `points` read every `period` seconds, as `Bus.poll_group`; the group ends with this program.
+
+        Raises InvalidCommand for arguments that `Bus.poll_group` rejects. What only the line's owner can reject, such
+        as one group too many, raises where the group is iterated, or by `await group.ready()`.
+        """
+        self.link.check()
+        period = seconds(period, f"poll group {name!r}: a period")
+        if phase is not None:
+            phase = seconds(phase, f"poll group {name!r}: a phase")
+        priority = checked_priority(priority)
+        if (before := self._own.get(name)) is not None and not before.over:
+            raise InvalidCommand(f"there is a poll group {name!r} already")
+        read = tuple(points)
+        for point in read:
+            if point.node is not self._nodes.get((point.node.profile.name, point.node.address)):
+                raise InvalidCommand(f"poll group {name!r}: {point.key} belongs to another bus")
+            if point.node.address == point.node.profile.broadcast:
+                raise InvalidCommand(
+                    f"poll group {name!r}: no node replies to a read of {point.key}, which is the address of all nodes"
+                )
         params = {"name": name, "period": period, "phase": phase, "priority": priority}
-        return await self._follow("poll", name, tuple(points), params)
+        self._own[name] = group = self._new_group(name, read, period, "poll", params)
+        group.begin()
+        return group
 
     def latest(self, point: Point[T]) -> Sample[T] | None:
         """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
@@ -255,10 +313,6 @@ class RemoteBus:
     def report_failed_logins(self, interface: str, peers: Mapping[str, int]) -> None:
         """Tell the owner how many logins of each peer failed at an interface that this program serves: web or opcua."""
         self.link.tell("failed_logins", {"interface": interface, "peers": dict(peers)})
-
-    async def groups(self) -> tuple[str, ...]:
-        """Return the names of the line's poll groups."""
-        return tuple(group["name"] for group in await self._ask("groups", {}))
 
     def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens to line and nodes from now on; a node in it is this program's."""
@@ -300,13 +354,30 @@ class RemoteBus:
         asked = self.link.ask(method, params, writes=writes)
         return await self.link.answer(asked)
 
-    async def _follow(
-        self, method: str, name: str, points: tuple[Point[Any], ...], params: Mapping[str, Any]
+    def _new_group(
+        self, name: str, points: tuple[Point[Any], ...], period: float, method: str, params: Mapping[str, Any]
     ) -> RemoteGroup:
-        self._count += 1
-        number = self._count
-        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
-        self._streams[number] = group
+        """Return a poll group that asks for its cycles by this method once it begins."""
+
+        def begin(group: RemoteGroup) -> tuple[int, asyncio.Task[None]]:
+            self._count += 1
+            self._streams[self._count] = group
+            opening = asyncio.ensure_future(self._open(group, points, self._count, method, params))
+            self._tasks.add(opening)
+            opening.add_done_callback(self._tasks.discard)
+            return self._count, opening
+
+        return RemoteGroup(name, points, period=period, find=self.find, begin=begin, end=self.end_stream)
+
+    async def _open(
+        self,
+        group: RemoteGroup,
+        points: tuple[Point[Any], ...],
+        number: int,
+        method: str,
+        params: Mapping[str, Any],
+    ) -> None:
+        """Have the owner send the cycles of a group. An error ends the group, whose consumers raise it."""
         said = said_points(points)
         try:
             while len(said) > POINTS_IN_A_MESSAGE:
@@ -314,17 +385,23 @@ class RemoteBus:
                 del said[:POINTS_IN_A_MESSAGE]
             if said:
                 params = {**params, "points": said}
-            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
-        except BaseException:
+            answer = await self._ask(method, {**params, "stream": number})
+        except (BusError, InvalidCommand) as error:
+            group.end(error)
             self.end_stream(number)
-            raise
-        return group
+        else:
+            group.period = answer["period"]
+            if method == "poll":
+                group.owners_name = answer["name"]
+                self._own_names.add(group.owners_name)
 
     def _hear(self, method: str, params: Mapping[str, Any]) -> None:
         if method == "stops":
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "poll_groups":
+            self._listed = {said["name"]: said["period"] for said in params["groups"]}
         elif method == "access":
             self.about = {**self.about, **params}
             for tell in self.on_access:
@@ -343,7 +420,9 @@ class RemoteBus:
 
     def _lost(self) -> None:
         for listener in list(self._streams.values()):
-            listener.end()
+            # One that is not accepted yet ends with the error of that.
+            if not (isinstance(listener, RemoteGroup) and listener.is_opening):
+                listener.end()
         self._streams.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

@@ -1,28 +1,49 @@
-"""A poll group of a line that another program owns: cycles as its owner tells them."""
+"""A poll group of a line that another program owns: cycles as its owner sends them."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from busmaster import Point
+from busmaster import Point, Snapshot
 from busmaster.app.service.telling import FindNode, owners_point_of, snapshot_of
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.events import Stream
 from busmaster.ext import Cycles
 
 
 class RemoteGroup(Cycles):
-    """A poll group of the line. Iterate it, or look at `latest`; close it when it is not read any more."""
+    """A poll group of a line that another program owns, of `RemoteBus.poll_group`, `group` or `groups`.
 
-    def __init__(self, name: str, points: tuple[Point[Any], ...], *, find: FindNode, end: Callable[[], None]) -> None:
+    Iterate it, or look at `latest`; close it when it is not read any more. The owner is asked for it without waiting:
+    what the owner has against it, such as a limit on the groups of one program, iterating it raises, and `ready`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        points: tuple[Point[Any], ...],
+        *,
+        period: float,
+        find: FindNode,
+        begin: Callable[[RemoteGroup], tuple[int, asyncio.Task[None]]],
+        end: Callable[[int], None],
+    ) -> None:
         super().__init__(name)
-        self.period = 0.0
+        self.period = period
+        self.owners_name = name
+        """How the line's owner calls it: a program's own group has the program's name behind its own."""
         self.dropped = 0
         """Cycles that this program was too slow for, counted by the line's owner."""
         self._find = find
-        self._on_end = end
+        self._begin_stream = begin
+        self._end_stream = end
         self._own = points
         self._points = points
         self._set = -1
+        self._stream: int | None = None
+        self._opening: asyncio.Task[None] | None = None
 
     @property
     def own(self) -> bool:
@@ -31,15 +52,53 @@ class RemoteGroup(Cycles):
 
     @property
     def points(self) -> tuple[Point[Any], ...]:
+        """Return the points that a cycle reads; of a group of the owner, none before the owner has sent them."""
         return self._points
+
+    @property
+    def over(self) -> bool:
+        """Return whether no more cycles come: it is closed, the owner has ended it, or it could not begin."""
+        return self._over
+
+    @property
+    def is_opening(self) -> bool:
+        """Return whether the owner has not answered yet."""
+        return self._opening is not None and not self._opening.done()
+
+    def begin(self) -> None:
+        """Have the owner send its cycles, if it does not yet."""
+        if self._stream is None and not self._over:
+            self._stream, self._opening = self._begin_stream(self)
+
+    async def ready(self) -> None:
+        """Wait until the owner has accepted it. Raises what the owner has against it, or LineDown."""
+        self.begin()
+        if self._opening is not None:
+            await asyncio.wait([self._opening])
+        if self._cause is not None:
+            raise self._cause
+
+    def subscribe(self, buffer: int = 16, *, changes: bool = False) -> Stream[Snapshot]:
+        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more.
+
+        With `changes` it is the same: between two cycles, the owner sends the whole last cycle with the new values.
+        """
+        consumer = super().subscribe(buffer, changes=changes)
+        self.begin()
+        return consumer
 
     def close(self) -> None:
         """Read it no more; one that this program made ends."""
-        if not self._over:
-            self._on_end()
+        if self._over:
+            return
+        if self._opening is not None:
+            self._opening.cancel()
+        if self._stream is not None:
+            self._end_stream(self._stream)
+        self.end()
 
     def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says of it."""
+        """Take what the line's owner sends of it."""
         body = params["body"]
         for consumer in self._consumers:
             consumer.dropped += params["dropped"] - self.dropped
@@ -52,8 +111,8 @@ class RemoteGroup(Cycles):
         elif method == "snapshot" and body["set"] == self._set:
             self._tell(snapshot_of(body, self.name, self._points))
         elif method == "ended":
-            self._on_end()
+            self.close()
 
-    def end(self) -> None:
-        """End those who read it, after what they hold."""
-        self._end()
+    def end(self, cause: BusError | InvalidCommand | None = None) -> None:
+        """End its consumers after the snapshots that they hold, with an error if that is the cause."""
+        self._end(cause)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ from busmaster.app.service.overview import state_text
 from busmaster.app.service.peers import Holder, Peer, find_name, process_of
 from busmaster.app.service.refusals import Logins, wait_text
 from busmaster.app.service.tcp import HostPort, check_listening, holder, is_our_name, listening
+from busmaster.app.service.telling import listed_groups
 from busmaster.app.service.visit import Reception, Visit
 from busmaster.errors import InvalidCommand
 from busmaster.ext import LEAST_SHARE, MOST_SHARE, NodeRecord
@@ -42,6 +44,8 @@ HOSTS = ("localhost", "busmaster")
 MOST_WAITING_TO_CONNECT = 100
 NAME_WITHIN = 1.0
 """Seconds that the first client waits at most for this user's name: records then have his number."""
+GROUPS_EVERY = 0.1
+"""Seconds between two lists of the poll groups, however often a client begins and ends its own."""
 
 
 class Service:
@@ -98,6 +102,8 @@ class Service:
         self.tell: Callable[[str], None] = self._log.warning
         """Told, at most once a minute, of connections and logins that were refused."""
         self.reception = Reception()
+        self._groups_sent = -inf
+        self._groups_timer: asyncio.TimerHandle | None = None
 
     @property
     def address(self) -> str:
@@ -155,6 +161,7 @@ class Service:
         ext.line_of(self.bus).on_stop.append(self._tell_stop)
         self.line.journal.begin()
         ext.line_of(self.bus).on_touched.append(self._tell_touched)
+        ext.line_of(self.bus).on_groups.append(self._note_groups)
         self.authorisation.on_access.append(self._tell_access)
         self.authorisation.refusals.on_report.append(self._report)
         return self
@@ -165,6 +172,9 @@ class Service:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         ext.line_of(self.bus).on_stop.remove(self._tell_stop)
         ext.line_of(self.bus).on_touched.remove(self._tell_touched)
+        ext.line_of(self.bus).on_groups.remove(self._note_groups)
+        if self._groups_timer is not None:
+            self._groups_timer.cancel()
         self.authorisation.on_access.remove(self._tell_access)
         self.authorisation.refusals.on_report.remove(self._report)
         await self.line.safe_wishes.close()
@@ -207,6 +217,19 @@ class Service:
         key = (record.profile.name, record.address, None if items is None else tuple(items))
         for client in clients:
             client.tell_touched(params, key)
+
+    def _note_groups(self) -> None:
+        """Have all clients sent the list of the poll groups: it has changed."""
+        if self._groups_timer is None:
+            loop = asyncio.get_running_loop()
+            due = max(loop.time(), self._groups_sent + GROUPS_EVERY)
+            self._groups_timer = loop.call_at(due, self._send_groups)
+
+    def _send_groups(self) -> None:
+        self._groups_timer, self._groups_sent = None, asyncio.get_running_loop().time()
+        text = written({"method": "poll_groups", "params": {"groups": listed_groups(self.bus)}})
+        for client in self._clients:
+            client.outbox.put_latest("poll_groups", text)
 
     # those who come
 
@@ -355,6 +378,7 @@ class Service:
             "failed_logins": self.authorisation.refusals.logins.total(),
             "state": state_text(self.bus),
             "nodes": nodes,
+            "groups": listed_groups(self.bus),
         }
 
 

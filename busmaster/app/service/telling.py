@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, Protocol, cast
 
-from busmaster import Health, Point, Quality, Sample, Snapshot
+from busmaster import Bus, Health, Point, Quality, Sample, Snapshot
 from busmaster.app.service.failures import bus_error_of, error_data
 from busmaster.app.service.messages import value_of
 from busmaster.bounds import MOST_SYNC_READS
@@ -71,6 +71,14 @@ def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
         if command.writes:
             raise InvalidCommand(f"{protocol.name}: a probe or sync read must read, and {command} writes")
     return replace(protocol.profile, probe=first, sync_reads=tuple(others))
+
+
+# poll groups
+
+
+def listed_groups(bus: Bus) -> list[dict[str, Any]]:
+    """Return the poll groups of a line as they are sent."""
+    return [{"name": group.name, "period": group.period} for group in bus.groups]
 
 
 # snapshots

@@ -49,7 +49,7 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, thr
             async with connect("slitter") as remote:
                 controller = Hcp2Controller(remote, 1)
                 await controller.point("10").write(30)
-                async for snapshot in await remote.group("fast"):
+                async for snapshot in remote.group("fast"):
                     [(point, sample)] = snapshot.items()
                     assert point.key == "winder/force"  # as the owner's file calls it
                     if sample.value == 3.0:

@@ -292,12 +292,12 @@ def test_a_limit_is_named_and_nothing_is_written(kind: Kind, limit: str, path: s
     text, value, said = LIMITS[limit]
 
     async def story(plant: Plant) -> None:
-        exchanges = plant.line.bus.statistics().exchanges
+        exchanges = (await plant.line.bus.statistics()).exchanges
         with pytest.raises(InvalidCommand, match=said):
             await PATHS[path](plant, value)
         looked = limit == "max_step"  # what it holds is read first
         one_by_one = looked and path == "list" and kind.several is None  # and the item before it is written
-        assert plant.line.bus.statistics().exchanges == exchanges + looked + one_by_one
+        assert (await plant.line.bus.statistics()).exchanges == exchanges + looked + one_by_one
         assert await plant.held() == BEFORE
         assert [record.outcome for record in plant.records] == [Outcome.REFUSED] * (path in OUTSIDE)
 

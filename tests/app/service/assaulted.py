@@ -51,7 +51,7 @@ async def own(watch: Watch) -> int:
                     "tasks": len(asyncio.all_tasks()),
                     "descriptors": len(os.listdir("/proc/self/fd")),
                     "kilobytes": _resident(),
-                    "backlog": bus.statistics().backlog,
+                    "backlog": (await bus.statistics()).backlog,
                     "longest hold, ms": round(longest, 3),
                 }
                 say(json.dumps(said))

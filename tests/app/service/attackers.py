@@ -131,7 +131,7 @@ async def retried_absent(bus: RemoteBus, number: int) -> None:
 async def groups(bus: RemoteBus, number: int) -> None:
     for one in range(4):
         point: Point[Any] = Point(bus.node(PROFILE, UNIT), str(one), ReadRegisters(20 + one, 1))
-        await quiet(bus.poll_group(f"mine {one}", period=0.01, points=[point]))
+        await quiet(bus.poll_group(f"mine {one}", period=0.01, points=[point]).ready())
     await asyncio.Event().wait()
 
 
@@ -335,7 +335,7 @@ async def _entered(owner: Process, address: str) -> RemoteBus:
             raise AssertionError((await owner.stderr.read()).decode())
         with contextlib.suppress(BusError, InvalidCommand, OSError):
             async with connect(address) as bus:
-                await bus.group(GROUP)
+                await bus.group(GROUP).ready()
             return connect(address)
         await asyncio.sleep(0.1)
     raise AssertionError("the owner does not serve its line")
@@ -344,7 +344,7 @@ async def _entered(owner: Process, address: str) -> RemoteBus:
 async def _busy(bus: RemoteBus) -> float:
     """Return which share of the line the owner's cycles use, with nothing else on it."""
     used: list[float] = []
-    async for snapshot in await bus.group(GROUP):
+    async for snapshot in bus.group(GROUP):
         if snapshot.started is not None:
             used.append((snapshot.finished - snapshot.started) / PERIOD)
         if len(used) > ALONE:  # the first proves that the nodes are there
@@ -353,7 +353,7 @@ async def _busy(bus: RemoteBus) -> float:
 
 
 async def _measure(bus: RemoteBus, tcp: str, seconds: float) -> dict[str, Any]:
-    group = await bus.group(GROUP)
+    group = bus.group(GROUP)
     waits: list[float] = []
     others = False
 

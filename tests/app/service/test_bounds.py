@@ -129,7 +129,7 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
             asyncio.get_running_loop().call_soon(count)
 
         count()
-        await remote.groups()
+        await remote.statistics()
         taken.clear()
         [visit] = line.service._clients.values()
         sizes: list[int] = []
@@ -183,14 +183,16 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
         handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]
         points = [handles[n % 10].point(f"{n % 99 + 1}") for n in range(198)]
         scaled = [replace(point, item=f"{point.item} {n}") for n in range(6) for point in points]
-        cycles = (await remote.poll_group("many", period=60, points=scaled[: bounds.MOST_POLLED_POINTS])).subscribe()
+        group = remote.poll_group("many", period=60, points=scaled[: bounds.MOST_POLLED_POINTS])
+        cycles = group.subscribe()
+        await group.ready()
         line.bus.groups[0].demand()
         snapshot = await anext(cycles)
         assert len(snapshot) == bounds.MOST_POLLED_POINTS
         assert all(sample.value == 0 for sample in snapshot.samples.values())
         assert max(lengths) < bounds.LONGEST_REQUEST / 2
         with pytest.raises(InvalidCommand, match="1000 points at most"):
-            await remote.poll_group("more", period=60, points=scaled[: bounds.MOST_POLLED_POINTS + 1])
+            await remote.poll_group("more", period=60, points=scaled[: bounds.MOST_POLLED_POINTS + 1]).ready()
 
     on_a_served_line(tmp_path, story)
 

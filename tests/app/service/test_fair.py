@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, Priority, RemoteBus, Service, connect
+from busmaster import Hcp2Controller, Priority, RemoteBus, Service, connect, ext
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.shared_backlog import PASSED_BY_EACH
@@ -125,7 +125,7 @@ def test_r9_a_program_with_thousands_of_requests_delays_anothers_by_two_exchange
             flooder, asker = payer(asked[0]), payer(asked[1])
             assert flooder is not asker
             flood = [asyncio.ensure_future(flooding.read(1)) for _ in range(MANY)]
-            await until(lambda: line.bus.statistics().backlog > MOST_UNDER_WAY / 2)
+            await until(lambda: ext.line_statistics(line.bus).backlog > MOST_UNDER_WAY / 2)
             for number in range(20):
                 await asking.write(1, number)
                 await Hcp2Controller(line.bus, 6).read(1)

@@ -80,7 +80,7 @@ def test_a_program_with_a_token_that_reads_writes_nothing_and_stops_nothing(tmp_
             drive = MicroFlexDrive(remote, 7)
             with pytest.raises(InvalidCommand, match="token logger may read this line and not write"):
                 await drive.disable()
-            await remote.groups()
+            await remote.statistics()
             assert [node.stops for node in line.bus.nodes] == [0]
 
     on_a_port(tmp_path, story)
@@ -96,7 +96,7 @@ def test_who_may_write_a_part_of_a_node_stops_it_with_a_write_that_is_let_throug
                 await controller.write(2, 0)
             assert own.stops == controller.node.stops == 0
             controller.node.note_stop()
-            await remote.groups()
+            await remote.statistics()
             assert own.stops == 0, "it is not known yet what it writes"
             await controller.write(1, 0)
             await controller.write(1, 1)
@@ -362,7 +362,9 @@ def test_a_program_of_a_machine_with_another_clock_reads_and_writes_by_the_owner
         async with connect(address, token=SECRETS["hmi"]) as remote:
             point = Hcp2Controller(remote, 5).point("1")
             await point.write(3, start_within=PATIENCE, finish_within=PATIENCE)
-            cycles = (await remote.poll_group("mine", period=60, points=[point])).subscribe()
+            group = remote.poll_group("mine", period=60, points=[point])
+            cycles = group.subscribe()
+            await group.ready()
             line.bus.groups[0].demand()
             await anext(cycles)
             assert abs(remote.now() - line.bus.now()) < PATIENCE

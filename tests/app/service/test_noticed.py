@@ -108,7 +108,8 @@ def test_a_write_to_all_makes_the_samples_of_each_node_stale(tmp_path: Path) -> 
             connect(service.address) as remote,
         ):
             point = MentorDrive(remote, 14).point("1.17")
-            group = await remote.poll_group("mine", period=60, points=[point])
+            group = remote.poll_group("mine", period=60, points=[point])
+            await group.ready()
             cycles = group.subscribe()
             bus.groups[0].demand()
             snapshot = await anext(cycles)
@@ -152,7 +153,7 @@ def test_points_that_a_group_gets_are_told_to_who_reads_it(tmp_path: Path) -> No
         one, two = (Hcp2Controller(line.bus, node).point("1") for node in (5, 6))
         group = line.bus.poll_group("fast", period=0.01, points=[one])
         async with connect(line.address) as remote:
-            theirs = await remote.group("fast")
+            theirs = remote.group("fast")
             cycles = theirs.subscribe()
             assert len(await anext(cycles)) == 1
             group.add(two)

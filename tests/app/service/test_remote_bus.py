@@ -124,7 +124,7 @@ def test_cancelling_here_cancels_there(tmp_path: Path) -> None:
         holding = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
         await line.sent()
         waiting = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 7))
-        await until(lambda: line.bus.statistics().backlog)
+        await until(lambda: ext.line_statistics(line.bus).backlog)
         waiting.cancel()
         holding.cancel()
         assert await asyncio.gather(waiting, holding, return_exceptions=True)
@@ -195,7 +195,7 @@ def test_a_disable_overtakes_what_another_program_waits_to_write(tmp_path: Path)
             holding = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).read(1, retries=0))
             await line.sent()
             enabling = asyncio.ensure_future(MicroFlexDrive(other, 7).enable())
-            await until(lambda: line.bus.statistics().backlog)
+            await until(lambda: ext.line_statistics(line.bus).backlog)
             await MicroFlexDrive(remote, 7).disable()
             with pytest.raises(Superseded):
                 await enabling
@@ -237,8 +237,8 @@ def test_a_poll_group_of_the_owner_is_read_as_there(tmp_path: Path) -> None:
         controller, absent = Hcp2Controller(line.bus, 5), Hcp2Controller(line.bus, ABSENT)
         points: list[Point[float]] = [controller.point("1"), absent.point("1")]
         group = line.bus.poll_group("axes", period=0.02, points=points)
-        assert await remote.groups() == ("axes",)
-        theirs = await remote.group("axes")
+        await until(lambda: [group.name for group in remote.groups] == ["axes"])
+        theirs = remote.group("axes")
         ours = group.subscribe(1000)
         async for snapshot in theirs:
             same = await anext(ours)
@@ -251,8 +251,9 @@ def test_a_poll_group_of_the_owner_is_read_as_there(tmp_path: Path) -> None:
             break
         group.close()
         assert [snapshot async for snapshot in theirs.subscribe()] == [] if not theirs._over else True
+        await until(lambda: not remote.groups)
         with pytest.raises(InvalidCommand, match="no poll group 'axis'; there are: none"):
-            await remote.group("axis")
+            remote.group("axis")
 
     on_a_served_line(tmp_path, story)
 
@@ -261,12 +262,15 @@ def test_a_program_polls_its_own_points_until_it_leaves(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         async with connect(line.address) as other:
             drive = MicroFlexDrive(other, 7)
-            group = await other.poll_group("mine", period=0.02, points=[drive.status_word])
+            group = other.poll_group("mine", period=0.02, points=[drive.status_word])
+            await group.ready()
             async for snapshot in group:
                 assert isinstance(snapshot[drive.status_word].value, StatusWord)
                 break
-            [name] = await remote.groups()
-            assert name.startswith("mine (")
+            assert other.groups == (group,)
+            await until(lambda: remote.groups)
+            assert remote.groups[0].name == group.owners_name
+            assert group.owners_name.startswith("mine (")
         await until(lambda: not (line.bus.groups or line.bus.nodes))
 
     on_a_served_line(tmp_path, story)
@@ -275,14 +279,14 @@ def test_a_program_polls_its_own_points_until_it_leaves(tmp_path: Path) -> None:
 def test_events_tell_what_happens_there(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         events = remote.events()
-        await remote.groups()  # it is told what happens from before this on
+        await remote.statistics()  # it is told what happens from before this on
         controller = Hcp2Controller(remote, 5)
         await controller.read(1)
         event = await anext(events)
         assert isinstance(event, NodeChanged)
         assert (event.node.label, event.before.value, event.after.value) == (controller.node.label, "unknown", "up")
         statistics = await remote.statistics()
-        assert (statistics.exchanges, statistics.waits) == (1, line.bus.statistics().waits)
+        assert (statistics.exchanges, statistics.waits) == (1, (await line.bus.statistics()).waits)
 
     on_a_served_line(tmp_path, story)
 
@@ -335,7 +339,7 @@ def test_an_owner_that_ends_tells_what_became_of_each_request(tmp_path: Path) ->
                 writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
                 await line.sent()
                 waiting = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 1))
-                await until(lambda: line.bus.statistics().backlog)
+                await until(lambda: ext.line_statistics(line.bus).backlog)
                 await line.service.__aexit__(None, None, None)
                 with pytest.raises(WriteUnconfirmed, match="the program that owns the line ends"):
                     await writing
@@ -458,14 +462,15 @@ def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made
     async def story(line: Served, remote: RemoteBus) -> None:
         mine, theirs = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(line.bus, 5).point("1")
         assert await mine.read(max_age=60) == 0
-        group = await remote.poll_group("mine", period=60, points=[mine])
+        group = remote.poll_group("mine", period=60, points=[mine])
+        await group.ready()
         cycles = group.subscribe()
         line.bus.groups[0].demand()
         snapshot = await anext(cycles)
-        exchanges = line.bus.statistics().exchanges
+        exchanges = (await line.bus.statistics()).exchanges
         assert mine.node.latest(mine) is snapshot[mine]
         assert await mine.read(max_age=60) == 0
-        assert line.bus.statistics().exchanges == exchanges
+        assert (await line.bus.statistics()).exchanges == exchanges
         await theirs.write(7)
         assert await Hcp2Controller(remote, 6).read(1) == 0
         assert mine.node.latest(mine) is None

@@ -14,7 +14,7 @@ from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
 from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS
 from busmaster.errors import BacklogFull
-from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw
+from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 
 READ: dict[str, Any] = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
@@ -121,7 +121,8 @@ def test_a_group_of_the_owner_has_all_its_points_there_too(tmp_path: Path) -> No
     async def story(line: Served, remote: RemoteBus) -> None:
         own = [Hcp2Controller(line.bus, address).point(item) for address in (5, 6) for item in ("1", "2")]
         group = line.bus.poll_group("axes", period=0.02, points=own)
-        theirs = await remote.group("axes")
+        await until(lambda: remote.groups)
+        theirs = remote.group("axes")
         snapshot = await anext(aiter(theirs))
         assert [point.key for point in theirs.points] == ["5/1", "5/2", "6/1", "6/2"]
         assert tuple(snapshot) == theirs.points
@@ -164,7 +165,8 @@ def polled(stream: int, **more: Any) -> dict[str, Any]:
 def test_a_poll_group_that_cannot_be_followed_is_not_polled(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line) as client:
-            assert (await asked(client, 1, "poll", **polled(7)))["result"] == {"period": 60.0}
+            accepted = (await asked(client, 1, "poll", **polled(7)))["result"]
+            assert accepted == {"period": 60.0, "name": line.bus.groups[0].name}
             said = await asked(client, 2, "poll", **{**polled(7), "name": "another"})
             assert "each with a number of its own" in said["error"]["message"]
             assert len(line.bus.groups) == 1
@@ -177,7 +179,8 @@ def test_a_program_polls_at_the_priority_of_a_poll_at_most(tmp_path: Path) -> No
         controller = Hcp2Controller(remote, 5)
         for asked in Priority:
             name = asked.name.lower()
-            await remote.poll_group(name, period=60.0, points=[controller.point("1")], priority=asked)
+            group = remote.poll_group(name, period=60.0, points=[controller.point("1")], priority=asked)
+            await group.ready()
         found = [group.planned().priority for group in line.bus.groups]
         assert found == [Priority.POLL, Priority.POLL, Priority.POLL, Priority.BACKGROUND]
 

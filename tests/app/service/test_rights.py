@@ -141,7 +141,8 @@ def test_r9_a_poll_group_of_a_program_is_its_own_line_time(tmp_path: Path, role:
     async def story(line: Served, remote: RemoteBus) -> None:
         point: Point[Any] = Point(remote.node(hcp2.PROFILE, 5), "1", READ)
         await remote.node(hcp2.PROFILE, 5).request(READ)
-        group = await remote.poll_group("mine", period=0.05, points=[point])
+        group = remote.poll_group("mine", period=0.05, points=[point])
+        await group.ready()
         await anext(aiter(group))
         [own] = line.bus.groups
         [client] = line.service.clients

@@ -118,7 +118,7 @@ def test_a_read_that_its_program_gives_up_waits_for_the_line_no_longer(tmp_path:
         for number in (70, 71, 72):
             client.take({"method": "cancel", "params": {"id": number}})
         assert client.errands == ()
-        counts = line.bus.statistics()
+        counts = await line.bus.statistics()
         assert (counts.cancelled, counts.backlog) == (3, 0)
 
     on_a_served_line(tmp_path, story)

@@ -1,0 +1,202 @@
+"""A program that takes a `BusLike` runs on a `Bus` and on a `RemoteBus`, with the same outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Hashable
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+from busmaster import BusLike, Hcp2Controller, InvalidCommand, LineDown, MicroFlexDrive, Point, RemoteBus, connect
+from busmaster.app.service.remote_group import RemoteGroup
+from busmaster.bus.bus_like import GroupLike
+from tests.app.service.lines import ABSENT, Served, on_a_line, on_a_served_line, until
+
+
+async def program(bus: BusLike) -> list[object]:
+    """Use what both have, and return what came of it: drive 7 is on the line."""
+    drive = MicroFlexDrive(bus, 7)
+    group: GroupLike = bus.poll_group("mine", period=0.02, points=[drive.status_word, drive.speed_measured])
+    outcome: list[object] = [group.name, group.period, [point.item for point in group.points]]
+    try:
+        bus.poll_group("mine", period=1.0, points=[])
+    except InvalidCommand as error:
+        outcome.append(str(error))
+    try:
+        bus.poll_group("other", period=-1.0, points=[])
+    except InvalidCommand as error:
+        outcome.append(str(error))
+    events = bus.events()
+    async for snapshot in group:
+        outcome.append([type(sample.value).__name__ for sample in snapshot.values()])
+        sample = bus.latest(drive.status_word)
+        assert sample is not None
+        assert sample.value == snapshot[drive.status_word].value
+        assert group.latest is snapshot
+        assert sample.age(bus.now()) < 60
+        break
+    outcome.append([one.name for one in bus.groups])
+    assert bus.group("mine") is group
+    try:
+        bus.group("mime")
+    except InvalidCommand as error:
+        outcome.append(str(error))
+    outcome.append([(node.profile.name, node.address, node.label) for node in bus.nodes])
+    outcome.append((await bus.statistics()).exchanges > 0)
+    async with drive.exclusive(max_hold=1.0) as held:
+        outcome.append(await held.status())
+    consumer = group.subscribe(buffer=4)
+    group.close()
+    group.close()
+    outcome.append(len([snapshot async for snapshot in consumer]) <= 4)
+    outcome.append(bus.groups)
+    events.close()
+    return outcome
+
+
+def test_a_program_does_the_same_on_a_bus_and_on_a_remote_bus(tmp_path: Path) -> None:
+    outcomes: list[list[object]] = []
+
+    async def near(line: Served) -> None:
+        MicroFlexDrive(line.bus, 7)
+        outcomes.append(await program(line.bus))
+
+    async def far(line: Served) -> None:
+        MicroFlexDrive(line.bus, 7)
+        async with connect(line.address) as remote:
+            outcomes.append(await program(remote))
+
+    on_a_line(tmp_path, near)
+    on_a_line(tmp_path, far)
+    assert outcomes[0] == outcomes[1]
+    assert outcomes[0][:3] == ["mine", 0.02, ["status_word", "speed_measured"]]
+
+
+def test_the_groups_of_the_owner_are_known_when_a_program_comes_and_when_they_change(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        point = Hcp2Controller(line.bus, 5).point("1")
+        fast = line.bus.poll_group("fast", period=0.02, points=[point])
+        async with connect(line.address) as remote:
+            [theirs] = remote.groups
+            assert (theirs.name, theirs.period, theirs.own) == ("fast", 0.02, False)
+            assert remote.groups == (theirs,)
+            slow = line.bus.poll_group("slow", period=60, points=[point])
+            await until(lambda: [group.name for group in remote.groups] == ["fast", "slow"])
+            slow.close()
+            await until(lambda: remote.groups == (theirs,))
+            assert len(line.service.clients[0]._streams) == 0, "only a group that is read costs the owner anything"
+            assert (await anext(aiter(theirs)))[theirs.points[0]].value == 0
+            assert theirs.points[0].key == point.key
+            fast.close()
+            assert [snapshot async for snapshot in theirs][16:] == []
+            assert theirs.over
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_group_that_was_closed_here_can_be_read_again(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        line.bus.poll_group("fast", period=0.02, points=[Hcp2Controller(line.bus, 5).point("1")])
+        async with connect(line.address) as remote:
+            for _ in range(2):
+                theirs = remote.group("fast")
+                assert remote.group("fast") is theirs
+                await anext(aiter(theirs))
+                theirs.close()
+                await until(lambda: not line.service.clients[0]._streams)
+            assert len(line.bus.groups) == 1
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_list_of_groups_is_sent_ten_times_a_second_at_most(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        sent: list[str] = []
+        client = line.service.clients[0]
+        put = client.outbox.put_latest
+
+        def note(key: Hashable, text: str) -> None:
+            sent.append(text)
+            put(key, text)
+
+        client.outbox.put_latest = note  # type: ignore[method-assign]
+        point = Hcp2Controller(line.bus, 5).point("1")
+        for number in range(50):
+            line.bus.poll_group(f"group {number}", period=60, points=[point])
+        await until(lambda: len(remote.groups) == 50)
+        for number in range(50):
+            line.bus.group(f"group {number}").close()
+        await until(lambda: not remote.groups)
+        assert len([text for text in sent if "poll_groups" in text]) == 2
+
+    on_a_served_line(tmp_path, story)
+
+
+async def first(group: RemoteGroup) -> object:
+    return await anext(aiter(group))
+
+
+async def subscribed(group: RemoteGroup) -> object:
+    return await anext(group.subscribe())
+
+
+def test_what_only_the_owner_can_reject_is_raised_where_the_group_is_iterated(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = Hcp2Controller(remote, 5).point("1")
+        node = remote.node(point.node.profile, ABSENT, retries=100_000)  # the owner takes 100 at most
+        uses: list[Callable[[RemoteGroup], Coroutine[Any, Any, object]]] = [first, subscribed, RemoteGroup.ready]
+        for use in uses:
+            group = remote.poll_group("mine", period=60, points=[Point(node, "1", point.command)])
+            with pytest.raises(InvalidCommand, match="retries"):
+                await use(group)
+            assert group.over
+            assert remote.groups == ()
+            with pytest.raises(InvalidCommand, match="retries"):
+                group.subscribe()
+        assert line.bus.groups == ()
+        await remote.poll_group("mine", period=60, points=[point]).ready()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_that_the_owner_never_accepted_raises_that_the_line_is_down(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        group = remote.poll_group("mine", period=60, points=[Hcp2Controller(remote, 5).point("1")])
+        [visit] = line.service._clients.values()
+        visit.connection.abort()
+        with pytest.raises(LineDown):
+            await anext(aiter(group))
+        with pytest.raises(LineDown):
+            remote.poll_group("other", period=60, points=[])
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_point_of_another_bus_is_rejected_before_anything_is_sent(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        of_owner = Hcp2Controller(line.bus, 5).point("1")
+        async with connect(line.address) as other:
+            of_other = Hcp2Controller(other, 5).point("1")
+            for point in (of_owner, of_other):
+                with pytest.raises(InvalidCommand, match="'mine': 5/1 belongs to another bus"):
+                    remote.poll_group("mine", period=60, points=[point])
+        assert remote.groups == ()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_that_is_closed_before_it_was_accepted_does_not_begin(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        points = [Hcp2Controller(remote, 5).point(str(number)) for number in range(1, 99)]
+        for turns in range(4):
+            group = remote.poll_group("mine", period=60, points=points)
+            for _ in range(turns):
+                await anyio.lowlevel.checkpoint()
+            group.close()
+            await remote.statistics()
+            assert line.bus.groups == ()
+            assert line.service.clients[0]._gathered == {}
+
+    on_a_served_line(tmp_path, story)
