@@ -10,26 +10,33 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, MemoryPort, MscController, endpoint
+from busmaster import Bus, BusLike, Endpoint, MemoryPort, MscController, endpoint
 from busmaster.emulator.line import Line
 from busmaster.registry import make_device
 
 TABLE = [round(1000 * math.sin(2 * math.pi * step / 64)) for step in range(64)]
+SETTINGS = MscController.profile.line  # 9600 8N1
 
 
 def show(done: int, total: int) -> None:
     print(f"{done:4} of {total}: {'#' * (40 * done // total)}")
 
 
-async def main(port: Endpoint) -> None:
+async def main(bus: BusLike) -> None:
+    # The address step is not in the manual: 4 where addresses count bytes. `find_address_step` finds it.
+    press = MscController(bus, 3, symbols={"cam": 3000}, address_step=4)
+    await press.load_cam("cam", TABLE, progress=show)  # what was written and what was verified both count
+    print("the first values are", await press.read("cam", 8))
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("msc", 3)]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        # The address step is not in the manual: 4 where addresses count bytes. `find_address_step` finds it.
-        press = MscController(bus, 3, symbols={"cam": 3000}, address_step=4)
-        await press.load_cam("cam", TABLE, progress=show)  # what was written and what was verified both count
-        print("the first values are", await press.read("cam", 8))
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = MscController.profile.line  # 9600 8N1
-    emulated = MemoryPort(Line(settings, [make_device("msc", 3)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

@@ -9,25 +9,33 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, Hcp2Controller, MemoryPort, Refused, endpoint
+from busmaster import Bus, BusLike, Endpoint, Hcp2Controller, MemoryPort, Refused, endpoint
 from busmaster.emulator.line import Line
 from busmaster.registry import make_device
 
+SETTINGS = Hcp2Controller.profile.line  # 57600 8N1
 
-async def main(port: Endpoint) -> None:
+
+async def main(bus: BusLike) -> None:
+    controller = Hcp2Controller(bus, 5)
+    await controller.write(1, 123.456, verify=True)  # acknowledged, read back and compared
+    print("Comms(1) is", await controller.read(1))
+    position = controller.axis(0).position  # a point: it can be read, polled, and written if the map allows it
+    print(f"{position.item} is {await position.read():.1f}")
+    try:
+        await controller.write(100, 0.0)
+    except Refused as error:
+        print(error)
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("hcp2", 5, lively=True)]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        controller = Hcp2Controller(bus, 5)
-        await controller.write(1, 123.456, verify=True)  # acknowledged, read back and compared
-        print("Comms(1) is", await controller.read(1))
-        position = controller.axis(0).position  # a point: it can be read, polled, and written if the map allows it
-        print(f"{position.item} is {await position.read():.1f}")
-        try:
-            await controller.write(100, 0.0)
-        except Refused as error:
-            print(error)
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = Hcp2Controller.profile.line  # 57600 8N1
-    emulated = MemoryPort(Line(settings, [make_device("hcp2", 5, lively=True)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

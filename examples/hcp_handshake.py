@@ -14,13 +14,14 @@ from collections.abc import Generator
 
 import anyio
 
-from busmaster import Bus, Endpoint, HcpController, MemoryPort, endpoint
+from busmaster import Bus, BusLike, Endpoint, HcpController, MemoryPort, endpoint
 from busmaster.emulator.line import Line
 from busmaster.protocols._comms.device import HCP
 from busmaster.protocols._comms.mint import EmulatedMint, command_handshake
 
 MOVE_ABSOLUTE = 1
 ATTEMPTS = 100
+SETTINGS = HcpController.profile.line
 
 
 async def give_command(controller: HcpController, command: int, speed: float, target: float) -> None:
@@ -43,13 +44,12 @@ async def move_to(controller: HcpController, target: float, speed: float) -> int
     raise TimeoutError(f"the axis is not at {target} after {ATTEMPTS} commands: does the program run?")
 
 
-async def main(port: Endpoint) -> None:
-    async with Bus(port) as bus:
-        controller = HcpController(bus, 2)
-        for target in (10.0, 25.0, 0.0):
-            attempts = await move_to(controller, target, speed=200.0)
-            lost = f", after {attempts - 1} lost in the race" if attempts > 1 else ""
-            print(f"moved to {target}{lost}")
+async def main(bus: BusLike) -> None:
+    controller = HcpController(bus, 2)
+    for target in (10.0, 25.0, 0.0):
+        attempts = await move_to(controller, target, speed=200.0)
+        lost = f", after {attempts - 1} lost in the race" if attempts > 1 else ""
+        print(f"moved to {target}{lost}")
 
 
 def program(mint: EmulatedMint) -> Generator[int, None, None]:
@@ -59,7 +59,14 @@ def program(mint: EmulatedMint) -> Generator[int, None, None]:
         yield line
 
 
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [EmulatedMint(2, HCP, program=program)]))
+
+
+async def on_port(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        await main(bus)
+
+
 if __name__ == "__main__":
-    settings = HcpController.profile.line
-    emulated = MemoryPort(Line(settings, [EmulatedMint(2, HCP, program=program)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

@@ -9,22 +9,30 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, HcpController, MemoryPort, endpoint
+from busmaster import Bus, BusLike, Endpoint, HcpController, MemoryPort, endpoint
 from busmaster.emulator.line import Line
 from busmaster.registry import make_device
 
+SETTINGS = HcpController.profile.line  # 57600 8N1
 
-async def main(port: Endpoint) -> None:
+
+async def main(bus: BusLike) -> None:
+    winder = HcpController(bus, 2)
+    await winder.write(10, 123.456, -0.5, 1200)  # three elements in one telegram; the controller's ACK is awaited
+    print("Comms(10) is", await winder.read(10))
+    print("Comms(11) is", await winder.read(11))
+    await winder.point("12").write(1500)  # the same, as a point: it can be read, polled and written
+    print("Comms(12) is", await winder.point("12").read())
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("hcp", 2)]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        winder = HcpController(bus, 2)
-        await winder.write(10, 123.456, -0.5, 1200)  # three elements in one telegram; the controller's ACK is awaited
-        print("Comms(10) is", await winder.read(10))
-        print("Comms(11) is", await winder.read(11))
-        await winder.point("12").write(1500)  # the same, as a point: it can be read, polled and written
-        print("Comms(12) is", await winder.point("12").read())
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = HcpController.profile.line  # 57600 8N1
-    emulated = MemoryPort(Line(settings, [make_device("hcp", 2)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

@@ -9,29 +9,36 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, MemoryPort, MentorDrive, NoSuchParameter, endpoint
+from busmaster import Bus, BusLike, Endpoint, MemoryPort, MentorDrive, NoSuchParameter, endpoint
 from busmaster.emulator.line import Line
 from busmaster.registry import make_device
 
 DECIMALS = {"1.17": 1, "3.02": 1}  # the line carries whole numbers: these have one decimal, so that values are in %
+SETTINGS = MentorDrive.profile.line  # 9600 7E1
 
 
-async def main(port: Endpoint) -> None:
+async def main(bus: BusLike) -> None:
+    drive = MentorDrive(bus, 14, decimals=DECIMALS)
+    await drive.write("1.17", -47.6)
+    print("speed reference", await drive.read("1.17"), "%")
+    for _ in range(3):
+        await anyio.sleep(0.1)
+        print("speed feedback ", await drive.read("3.02"), "%")
+    await drive.write("1.17", 0.0)
+    try:
+        await drive.read("17.23")
+    except NoSuchParameter as error:
+        print(error)
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("mentor", 14)]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        drive = MentorDrive(bus, 14, decimals=DECIMALS)
-        await drive.write("1.17", -47.6)
-        print("speed reference", await drive.read("1.17"), "%")
-        for _ in range(3):
-            await anyio.sleep(0.1)
-            print("speed feedback ", await drive.read("3.02"), "%")
-        await drive.write("1.17", 0.0)
-        try:
-            await drive.read("17.23")
-        except NoSuchParameter as error:
-            print(error)
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = MentorDrive.profile.line  # 9600 7E1
-    emulated = MemoryPort(Line(settings, [make_device("mentor", 14)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

@@ -9,29 +9,37 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, MemoryPort, MicroFlexDrive, endpoint
+from busmaster import Bus, BusLike, Endpoint, MemoryPort, MicroFlexDrive, endpoint
 from busmaster.emulator.line import Line
 from busmaster.registry import make_device
 
+SETTINGS = MicroFlexDrive.profile.line  # 57600 8N1
 
-async def main(port: Endpoint) -> None:
+
+async def main(bus: BusLike) -> None:
+    drive = MicroFlexDrive(bus, 7)
+    print("firmware build", await drive.check_firmware())
+    try:
+        status = await drive.enable()  # returns once the drive's status word says so
+        print("status:", status.name)
+        await drive.set_speed_reference(10.0)
+        for _ in range(4):
+            await anyio.sleep(0.05)
+            print(f"{await drive.speed_measured.read():.2f} %")
+    finally:
+        with anyio.CancelScope(shield=True):  # the motor stops even if this task is cancelled
+            status = await drive.disable()  # before anything else on the line, and verified
+        print("status:", status.name)
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("microflex", 7)]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        drive = MicroFlexDrive(bus, 7)
-        print("firmware build", await drive.check_firmware())
-        try:
-            status = await drive.enable()  # returns once the drive's status word says so
-            print("status:", status.name)
-            await drive.set_speed_reference(10.0)
-            for _ in range(4):
-                await anyio.sleep(0.05)
-                print(f"{await drive.speed_measured.read():.2f} %")
-        finally:
-            with anyio.CancelScope(shield=True):  # the motor stops even if this task is cancelled
-                status = await drive.disable()  # before anything else on the line, and verified
-            print("status:", status.name)
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = MicroFlexDrive.profile.line  # 57600 8N1
-    emulated = MemoryPort(Line(settings, [make_device("microflex", 7)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

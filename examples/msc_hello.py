@@ -9,27 +9,35 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, MemoryPort, MscController, endpoint
+from busmaster import Bus, BusLike, Endpoint, MemoryPort, MscController, endpoint
 from busmaster.emulator.line import Line
 from busmaster.protocols.msc import ProgramStatus
 from busmaster.registry import make_device
 
+SETTINGS = MscController.profile.line  # 9600 8N1
 
-async def main(port: Endpoint) -> None:
+
+async def main(bus: BusLike) -> None:
+    press = MscController(bus, 3, symbols={"count": 2000, "length": 2008}, address_step=4)
+    status = await press.status()
+    print("the program is", "running" if ProgramStatus.PROGRAM_RUNNING in status else "not running")
+    await press.write("length", 1234)
+    print("length is", await press.read("length"))
+    await press.set_flag(200)
+    print("flag 200 is", await press.flag(200))
+    await anyio.sleep(0.3)
+    print("count is", await press.read("count"))
+    await press.clear_flag(200)
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("msc", 3)]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        press = MscController(bus, 3, symbols={"count": 2000, "length": 2008}, address_step=4)
-        status = await press.status()
-        print("the program is", "running" if ProgramStatus.PROGRAM_RUNNING in status else "not running")
-        await press.write("length", 1234)
-        print("length is", await press.read("length"))
-        await press.set_flag(200)
-        print("flag 200 is", await press.flag(200))
-        await anyio.sleep(0.3)
-        print("count is", await press.read("count"))
-        await press.clear_flag(200)
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = MscController.profile.line  # 9600 8N1
-    emulated = MemoryPort(Line(settings, [make_device("msc", 3)]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

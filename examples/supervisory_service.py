@@ -58,7 +58,7 @@ async def health(request: Request) -> JSONResponse:
     bus: Bus = request.state.bus
     nodes = {node.label: node.health.value for node in bus.nodes}
     return JSONResponse(
-        {"line": bus.state.name.lower(), "in use": round(bus.statistics().utilisation, 3), "nodes": nodes}
+        {"line": bus.state.name.lower(), "in use": round((await bus.statistics()).utilisation, 3), "nodes": nodes}
     )
 
 

@@ -11,16 +11,17 @@ import sys
 
 import anyio
 
-from busmaster import Bus, Endpoint, MemoryPort, MentorDrive, endpoint
+from busmaster import Bus, BusLike, Endpoint, MemoryPort, MentorDrive, endpoint
 from busmaster.emulator.line import Line
 from busmaster.registry import make_device
 
 ADDRESSES = (11, 12, 13)
 REFERENCE, FEEDBACK = "1.17", "3.02"
 DECIMALS = {REFERENCE: 1, FEEDBACK: 1}  # both in % with one decimal
+SETTINGS = MentorDrive.profile.line  # 9600 7E1
 
 
-async def set_all(bus: Bus, drives: list[MentorDrive], percent: float) -> None:
+async def set_all(bus: BusLike, drives: list[MentorDrive], percent: float) -> None:
     """One write to address 0; then a write of its own for whoever missed it."""
     await MentorDrive(bus, 0, decimals=DECIMALS).write(REFERENCE, percent)
     for drive in drives:
@@ -29,16 +30,22 @@ async def set_all(bus: Bus, drives: list[MentorDrive], percent: float) -> None:
             await drive.write(REFERENCE, percent, verify=True)
 
 
-async def main(port: Endpoint) -> None:
+async def main(bus: BusLike) -> None:
+    drives = [MentorDrive(bus, address, decimals=DECIMALS) for address in ADDRESSES]
+    await set_all(bus, drives, 20.0)
+    for _ in range(3):
+        print([await drive.read(FEEDBACK) for drive in drives], "%")
+    await set_all(bus, drives, 0.0)
+
+
+def emulated() -> MemoryPort:
+    return MemoryPort(Line(SETTINGS, [make_device("mentor", address) for address in ADDRESSES]))
+
+
+async def on_port(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        drives = [MentorDrive(bus, address, decimals=DECIMALS) for address in ADDRESSES]
-        await set_all(bus, drives, 20.0)
-        for _ in range(3):
-            print([await drive.read(FEEDBACK) for drive in drives], "%")
-        await set_all(bus, drives, 0.0)
+        await main(bus)
 
 
 if __name__ == "__main__":
-    settings = MentorDrive.profile.line  # 9600 7E1
-    emulated = MemoryPort(Line(settings, [make_device("mentor", address) for address in ADDRESSES]))
-    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
+    anyio.run(on_port, endpoint(sys.argv[1], defaults=SETTINGS) if sys.argv[1:] else emulated())

@@ -9,7 +9,7 @@ The application knows nothing of that: it is given a drive, and sleeps and polls
 import asyncio
 import time
 
-from busmaster import Bus, MemoryPort, MicroFlexDrive
+from busmaster import Bus, BusLike, MemoryPort, MicroFlexDrive
 from busmaster.emulator.line import Line
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.testing import run_in_virtual_time
@@ -17,7 +17,7 @@ from busmaster.testing import run_in_virtual_time
 # The application
 
 
-async def guard(bus: Bus, drive: MicroFlexDrive, limit: float) -> None:
+async def guard(bus: BusLike, drive: MicroFlexDrive, limit: float) -> None:
     """Looks at the drive's temperature once a second, and disables it when that is above `limit`."""
     group = bus.poll_group("guard", period=1.0, points=[drive.temperature])
     try:

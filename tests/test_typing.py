@@ -11,6 +11,7 @@ import pytest
 
 from busmaster import (
     Bus,
+    BusLike,
     Dc104Drive,
     Hcp2Controller,
     InvalidCommand,
@@ -19,17 +20,23 @@ from busmaster import (
     MscController,
     Node,
     Point,
+    PollGroup,
+    RemoteBus,
     Sample,
     open_line,
 )
+from busmaster.app.service.remote_group import RemoteGroup
+from busmaster.bus.bus_like import GroupLike
 from busmaster.bus.handle import Handle
 from busmaster.bus.requester import NodeSource, Requester
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
+from busmaster.events import BusEvent, Stream
 from busmaster.protocols.hcp2 import StatusWord
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.protocols.msc import ProgramStatus
+from busmaster.statistics import LineStatistics
 from tests.handles.fake_bus import FakeBus
 from tests.stories import on_a_bus
 
@@ -60,6 +67,46 @@ async def every_handles_values(bus: NodeSource) -> None:
     assert_type(await MentorDrive(bus, 14).read("1.17", 2), tuple[float, ...])
     assert_type(await MscController(bus, 3).status(), ProgramStatus)
     assert_type(await Hcp2Controller(bus, 5).node.request(hcp2.Read(1)), float)
+
+
+async def program(bus: BusLike) -> None:
+    """Never run."""
+    drive = MicroFlexDrive(bus, 7)
+    group = bus.poll_group("g", period=0.1, points=[drive.status_word])
+    assert_type(group, GroupLike)
+    assert_type(bus.group("g"), GroupLike)
+    async for snapshot in group:
+        assert_type(snapshot[drive.status_word], Sample[StatusWord])
+    assert_type(bus.latest(drive.status_word), Sample[StatusWord] | None)
+    assert_type(await bus.statistics(), LineStatistics)
+    assert_type(bus.events(), Stream[BusEvent])
+    async with drive.exclusive() as held:
+        assert_type(await held.status(), StatusWord)
+
+
+async def either(near: Bus, far: RemoteBus) -> None:
+    """Never run: a type checker accepts both, and knows of each more than of a `BusLike`."""
+    await program(near)
+    await program(far)
+    assert_type(near.groups, tuple[PollGroup, ...])
+    assert_type(far.group("g"), RemoteGroup)
+    both: list[GroupLike] = [*near.groups, *far.groups]
+    nodes: list[Requester] = [*near.nodes, *far.nodes]
+    assert both
+    assert nodes
+
+
+def test_what_both_kinds_of_bus_have_has_the_same_signature() -> None:
+    for shared, kinds in ((BusLike, (Bus, RemoteBus)), (GroupLike, (PollGroup, RemoteGroup))):
+        for name in [name for name in vars(shared) if name[0] != "_"]:
+            for kind in kinds:
+                of_protocol, own = inspect.getattr_static(shared, name), inspect.getattr_static(kind, name, None)
+                if isinstance(of_protocol, property):
+                    assert own is None or isinstance(own, property), f"{kind.__name__}.{name}"
+                    continue
+                assert inspect.iscoroutinefunction(own) == inspect.iscoroutinefunction(of_protocol), name
+                asked = inspect.signature(of_protocol).parameters
+                assert list(asked) == list(inspect.signature(own).parameters)[: len(asked)], f"{kind.__name__}.{name}"
 
 
 async def as_open_line_is_documented() -> None:

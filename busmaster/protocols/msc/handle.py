@@ -96,7 +96,8 @@ class MscController(Handle):
     def point(self, item: str) -> Point[Any]:
         """Return the point of a value ("2008" or a symbol), a run ("2008:32"), "flag:5", "flags" or "status"."""
         if item_text(item) == "status":
-            return Point(self.node, item, ReadStatus())
+            # A line that another program owns brings the number alone.
+            return Point(self.node, item, ReadStatus(), decode=ProgramStatus)
         if item == "flags":
             return Point(self.node, item, ReadFlags())
         name, colon, number = item.partition(":")
@@ -286,7 +287,7 @@ class MscController(Handle):
 
     async def status(self, **options: Unpack[ReadOptions]) -> ProgramStatus:
         """Return the macroprogram status word."""
-        return await self.node.request(ReadStatus(), **options)
+        return ProgramStatus(await self.node.request(ReadStatus(), **options))
 
     async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
         """Return that the program runs, which uses the data, as its status word says; "" if it does not."""
