@@ -39,7 +39,7 @@ SETTINGS = LineSettings(57600)
 DELAY = 0.002
 WANTED_MS = 2.0
 HELD_BY_DESIGN = "plan"
-"""Says of itself that it holds the loop: `plan_in_steps` is for a line that runs."""
+"""Says of itself that it holds the loop: `plan` is for a line that runs."""
 COLUMNS = ("call", "hold ms", "collector included: longest ms", "by the clock: longest ms")
 
 
@@ -61,7 +61,7 @@ def run(options: Options) -> Outcome:
         if name.partition("(")[0] != HELD_BY_DESIGN:
             outcome.claims.append(Claim(f"longest hold of the loop, ms: {name}", own, WANTED_MS))
     table.notes.append("hold: processor time without the garbage collector, median of the rounds")
-    table.notes.append("plan() calculates at once and says so; plan_in_steps() does the same while the line goes on")
+    table.notes.append("plan_at_once() calculates at once and says so; plan() does the same while the line goes on")
     outcome.tables.append(table)
     outcome.series = {name: [hold.own for hold in holds] for name, holds in calls.items()}
     _running_line(options, outcome)
@@ -174,8 +174,8 @@ async def _one_large_group(turn: Round, values: dict[Point[Any], float]) -> int:
     await turn.hold(f"a snapshot for {STREAMS} streams", lambda: None, 0.8)
     await turn.hold(f"Stream.close(), {STREAMS} times", lambda: [stream.close() for stream in streams])
     await asyncio.gather(*readers)
+    await turn.hold("plan_at_once() of 500 points", lambda: bus._plan_at_once(()))
     await turn.hold("plan() of 500 points", bus.plan)
-    await turn.hold("plan_in_steps() of 500 points", bus._plan_in_steps)
     await turn.hold("worst_case_wait() of 500 points", bus.worst_case_wait)
     wrong = wrong_in(group, values)
     await turn.hold("PollGroup.close() of 500 points", group.close)
@@ -191,8 +191,8 @@ async def _many_groups(turn: Round, values: dict[Point[Any], float]) -> int:
     some = _some(points, GROUPS)
     groups.append(await turn.hold("poll_group(), the 200th", lambda: _group(bus, "last", 0.3, some), 2.0))
     await turn.hold("cycles of 200 groups", lambda: None, 1.0)
+    await turn.hold("plan_at_once() of 200 groups", lambda: bus._plan_at_once(()))
     await turn.hold("plan() of 200 groups", bus.plan)
-    await turn.hold("plan_in_steps() of 200 groups", bus._plan_in_steps)
     await turn.hold("worst_case_wait() of 200 groups", bus.worst_case_wait)
     await turn.hold("Bus.statistics()", bus.statistics)
     await turn.hold("Bus.reset_statistics()", bus.reset_statistics)

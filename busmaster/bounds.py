@@ -109,6 +109,10 @@ MOST_POLLED = 32
 """Poll groups of one client."""
 MOST_POLLED_POINTS = 1000
 """Points of one poll group of a client."""
+MOST_PLANNED_READS = 200
+"""Reads of all groups that a client has planned beside those that run."""
+MOST_PLANNED_GROUPS = 200
+"""Poll groups of a line, with those of the client, beyond which no plan is calculated for a client."""
 LONGEST_REPLY = 5.0
 """Seconds for which a client may have the line wait for a reply: nothing else is sent meanwhile."""
 LONGEST_WAIT = 86_400.0

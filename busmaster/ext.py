@@ -198,8 +198,8 @@ __all__ = [
     "open_file",
     "open_port",
     "owning_group",
-    "plain_handle",
-    "plan_in_steps",
+    "plan_at_once",
+    "plan_with_pauses",
     "prepare_write",
     "read_file",
     "read_item",
@@ -275,9 +275,14 @@ def line_statistics(bus: Bus) -> LineStatistics:
     return bus._statistics()
 
 
-async def plan_in_steps(bus: Bus, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-    """Calculate as `Bus.plan` does, in steps of less than a millisecond between which exchanges continue."""
-    return await bus._plan_in_steps(*more, could_merge=could_merge)
+def plan_at_once(bus: Bus, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
+    """Do what `Bus.plan` does, where nothing can be awaited: with hundreds of points, for tens of milliseconds."""
+    return bus._plan_at_once(more, could_merge)
+
+
+async def plan_with_pauses(bus: Bus, *more: PlannedGroup, pause: float) -> Plan:
+    """Do what `Bus.plan` does for a client, with a pause, in seconds, after each millisecond of calculation."""
+    return await bus._plan_in_steps(more, pause=pause)
 
 
 def take_overheard(bus: Bus, samples: Mapping[Point[Any], Sample[Any]]) -> None:

@@ -411,17 +411,23 @@ class Bus:
         for group in self._groups.values():
             group.reset_statistics()
 
-    def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
+    async def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
         """Calculate the load of the running groups and of `more`, with the reply times measured so far.
 
-        The calculation blocks the event loop: with hundreds of points for some ten milliseconds, in which no line of
-        this loop continues. While a line runs, use `await ext.plan_in_steps`.
+        It calculates in steps of less than a millisecond, between which exchanges continue. `could_merge`: merges to
+        evaluate that no group has enabled.
         """
+        return await self._plan_in_steps(more, could_merge)
+
+    def _plan_at_once(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge] = ()) -> Plan:
+        """Do what `plan` does, at once: with hundreds of points, no line of this loop goes on for tens of ms."""
         self._check_loop()
         return at_once(self._outlook.plan_steps(more, could_merge))
 
-    async def _plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Calculate as `plan` does, in steps of less than a millisecond between which exchanges continue."""
+    async def _plan_in_steps(
+        self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge] = (), *, pause: float = 0.0
+    ) -> Plan:
+        """Calculate as `plan` does, with a pause, in seconds, between two steps."""
         self._check_loop()
         steps = self._outlook.plan_steps(more, could_merge)
         done = 0
@@ -433,7 +439,7 @@ class Bus:
                 return plan
             if done >= SLICE:
                 done = 0
-                await asyncio.sleep(0)
+                await asyncio.sleep(pause)
 
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
         """Return the longest time, in seconds, until a request of this class, made now, is sent (R9).

@@ -16,6 +16,7 @@ from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand
+from busmaster.planning import Plan, PlannedGroup
 
 __all__ = ["BusLike", "GroupLike"]
 
@@ -105,6 +106,10 @@ class BusLike(Protocol):
 
     def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens to the line and its nodes from now on."""
+        ...
+
+    async def plan(self, *more: PlannedGroup) -> Plan:
+        """Calculate what becomes of the groups that run, and of `more`, by the reply times measured so far."""
         ...
 
     async def statistics(self) -> LineStatistics:

@@ -193,9 +193,9 @@ def test_a_plan_in_steps_is_the_plan_and_others_run_meanwhile() -> None:
                 await asyncio.sleep(0)
 
         counting = asyncio.create_task(count_turns())
-        planned = await bus._plan_in_steps()
+        planned = await bus.plan()
         counting.cancel()
-        assert planned == bus.plan()
+        assert planned == bus._plan_at_once(())
         assert turns > 50
 
     on_a_bus(story)

@@ -344,7 +344,7 @@ def test_neighbouring_values_come_in_one_exchange_and_points_stay_what_they_are(
         assert [snapshot[point].value for point in points] == [100 + n for n in range(8)]
         assert [snapshot[flag].value for flag in flags] == [True, False]
         assert Node.of(press).statistics().attempts == 2
-        merged = bus.plan().groups[0].merged
+        merged = (await bus.plan()).groups[0].merged
         assert [m.serves for m in merged] == [8, 2]
 
     device, settings = mscs()
@@ -358,10 +358,10 @@ def test_what_is_merged_is_weighed_again_when_reply_times_are_known() -> None:
     async def story(bus: Bus) -> None:
         press = MscController(bus, 3, address_step=4)
         group = bus.poll_group("g", period=1.0, points=[press.point(str(2000 + 4 * n)) for n in range(3)])
-        assert bus.plan().groups[0].exchanges == 1
+        assert (await bus.plan()).groups[0].exchanges == 1
         await cycles(group, 9)
         assert Node.of(press).statistics().attempts == 8 + 3
-        assert bus.plan().groups[0].exchanges == 3
+        assert (await bus.plan()).groups[0].exchanges == 3
 
     device, settings = mscs()
     on_a_bus(story, device, settings=settings)
@@ -378,7 +378,7 @@ def test_a_refused_batch_falls_back_to_single_reads_in_the_same_period() -> None
         snapshots = await cycles(group, 3)
         assert [[s[point].value for point in points] for s in snapshots] == [[100 + n for n in range(6)]] * 3
         assert snapshots[0].finished - started < 4.0
-        assert bus.plan().groups[0].merged == ()
+        assert (await bus.plan()).groups[0].merged == ()
 
     device, settings = mscs(values=6, addresses=2024)
     on_a_bus(story, device, settings=settings)
@@ -403,7 +403,7 @@ def test_runs_of_parameters_are_chained_only_by_those_who_opt_in() -> None:
         chained = bus.poll_group("chained", period=1.0, points=points, merge=[mentor.merge_runs])
         first, second = await asyncio.gather(cycles(single, 2), cycles(chained, 2))
         assert [first[1][p].value for p in points] == [second[1][p].value for p in points]
-        one, other = bus.plan().groups
+        one, other = (await bus.plan()).groups
         assert (one.exchanges, other.exchanges) == (3, 1)
         assert other.merged[0].saved > 0
 

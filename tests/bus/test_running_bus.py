@@ -35,7 +35,7 @@ def test_the_plan_of_a_running_bus_is_what_it_does() -> None:
         await asyncio.sleep(5.0)
         bus.reset_statistics()
         await asyncio.sleep(20.0)
-        prediction = bus.plan()
+        prediction = await bus.plan()
         assert (await bus.statistics()).utilisation == pytest.approx(prediction.utilisation, abs=0.02)
         assert prediction.fits
         for group, planned in zip(bus.groups, prediction.groups, strict=True):
@@ -53,8 +53,8 @@ def test_a_plan_of_what_might_be_added() -> None:
         group = bus.poll_group("now", period=0.1, points=[axis.point("1")])
         await cycles(group, 10)
         greedy = PlannedGroup("greedy", 0.05, [(Node.of(axis).planned(), hcp2.Read(e)) for e in range(1, 40)])
-        assert bus.plan().fits
-        assert not bus.plan(greedy).fits
+        assert (await bus.plan()).fits
+        assert not (await bus.plan(greedy)).fits
 
     on_a_bus(story)
 

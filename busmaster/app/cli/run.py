@@ -156,7 +156,7 @@ class Running:
     async def _say_what_learning_would_gain(self) -> None:
         """Say once what learned reply times would spare of the line, where a node has none."""
         if self.line.groups and any(node.could_learn for node in self.line.file.nodes.values()):
-            losses = (await ext.plan_in_steps(self.line.bus)).losses
+            losses = (await self.line.bus.plan()).losses
             if losses.documented - losses.learned >= WORTH_SAYING:
                 note(losses_text(losses))
 

@@ -207,7 +207,7 @@ class ConfiguredLine:
             for group in self.file.groups.values()
             if group.name not in self.groups  # one that runs is in the plan of the bus already
         )
-        return self.bus.plan(*planned)
+        return ext.plan_at_once(self.bus, *planned)
 
     # inside
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
 from itertools import islice
@@ -16,6 +17,7 @@ from busmaster.app.service.outbox import Outbox
 from busmaster.app.service.overview import said_details
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.permission import Permission
+from busmaster.app.service.plans import groups_of
 from busmaster.app.service.refusals import INTERFACES
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Rights, Role
@@ -43,6 +45,7 @@ from busmaster.ext import (
     seconds,
     whole_number,
 )
+from busmaster.planning import PlannedGroup
 
 NodeKey = tuple[str, int]
 MOST_FAILED = 1_000_000
@@ -91,6 +94,7 @@ class Client:
         """What its requests take turns by, with those of the others."""
         self._holds: dict[int, Hold | str] = {}
         """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
+        self._planning: asyncio.Task[None] | None = None
         self._gathered: dict[int, list[Point[Any]]] = {}
         """Points for poll groups that it will make, by the streams of those."""
 
@@ -177,6 +181,9 @@ class Client:
             self.requests.begin_safe(number, params)
             return
         self.requests.check_number(number)
+        if method == "plan":
+            self._begin_plan(number, params)
+            return
         try:
             answer = self._answer(method, params)
         except REFUSED as error:
@@ -247,6 +254,25 @@ class Client:
             case "pause" | "demand" | "suspend":
                 return self._steer(method, params)
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
+
+    def _begin_plan(self, number: int, params: Mapping[str, Any]) -> None:
+        """Have a plan calculated: one at a time."""
+        try:
+            if self._planning is not None and not self._planning.done():
+                raise InvalidCommand("one plan is calculated for a program at a time")
+            more = groups_of(params.get("groups", []), self._line.bus)
+        except REFUSED as error:
+            self._refuse(number, refusal_of("plan", error))
+        else:
+            self._planning = asyncio.ensure_future(self._plan(number, more))
+
+    async def _plan(self, number: int, more: list[PlannedGroup]) -> None:
+        try:
+            plan = await self._line.planner.plan(more)
+        except REFUSED as error:
+            self._refuse(number, refusal_of("plan", error))
+        else:
+            self._tell_result(number, plan)
 
     def _steer(self, method: str, params: Mapping[str, Any]) -> None:
         """Do what changes how the line is polled, for all who use it: it is told whose wish that was.
@@ -442,6 +468,8 @@ class Client:
 
     async def leave(self) -> None:
         """End all that it asked for, and give back its nodes."""
+        if self._planning is not None:
+            self._planning.cancel()
         for stream in list(self._streams):
             self._end_stream(stream)
         await self.requests.give_up()

@@ -11,6 +11,7 @@ from busmaster import Bus, Node, Point, PollGroup, ext
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.exchanges import ExchangesBroadcast
 from busmaster.app.service.overview import Journal, Overview
+from busmaster.app.service.plans import Planner
 from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.app.service.safe import SafeWishes
 from busmaster.app.service.streams import Broadcast, EventBroadcast, GroupBroadcast
@@ -31,6 +32,7 @@ class ServedLine:
         self.title = title
         """What is written over what a person sees of the line."""
         self.safe_wishes = SafeWishes(authorisation)
+        self.planner = Planner(bus)
         self.journal = Journal(bus)
         """What happens from now on, also before it is served."""
         self._demanded: dict[tuple[str, Role], float] = {}

@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 
 from busmaster import Point, Priority, Sample, Timings
 from busmaster.app.service.link import TCP, Link
-from busmaster.app.service.messages import said_timings
+from busmaster.app.service.messages import said_timings, words
+from busmaster.app.service.plans import plan_of, said_groups
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.app.service.remote_node import RemoteNode
@@ -27,10 +28,11 @@ from busmaster.app.service.telling import (
     said_sync_reads,
     statistics_of,
 )
-from busmaster.bounds import MOST_CHECKED
+from busmaster.bounds import LONGEST_REQUEST, MOST_CHECKED
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.events import BusEvent, Stream
 from busmaster.ext import Command, Learned, Profile, checked_priority, find_group, seconds
+from busmaster.planning import Plan, PlannedGroup
 from busmaster.registry import protocols
 from busmaster.statistics import LineStatistics
 
@@ -93,6 +95,7 @@ class RemoteBus:
         self._own_names: set[str] = set()
         """The names that the owner gave to groups of this program: it lists them, also for a moment after their end."""
         self._tasks: set[asyncio.Task[None]] = set()
+        self._planning = asyncio.Lock()
         self._count = 0
         self._sequences = 0
         self.room = Room(self.now)
@@ -231,6 +234,18 @@ class RemoteBus:
     async def statistics(self) -> LineStatistics:
         """Return an immutable snapshot of the line's counts, as `Bus.statistics`."""
         return statistics_of(await self._ask("statistics", {}))
+
+    async def plan(self, *more: PlannedGroup) -> Plan:
+        """Have the line's owner calculate what becomes of the groups that run, and of `more`, as `Bus.plan` does.
+
+        Nodes that the owner has are as it has measured them. Raises InvalidCommand for groups that have more than 200
+        reads in all, or merges.
+        """
+        question = words("plan", {"groups": said_groups(more)})
+        if len(question) > LONGEST_REQUEST // 2:
+            raise InvalidCommand("these groups are too long for one message: plan fewer of them at once")
+        async with self._planning:  # the owner calculates one at a time for each program
+            return plan_of(await self.link.answer(self.link.put(question, False)))
 
     @property
     def groups(self) -> tuple[RemoteGroup, ...]:

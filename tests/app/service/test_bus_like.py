@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Coroutine, Hashable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import anyio
 import pytest
 
-from busmaster import BusLike, Hcp2Controller, InvalidCommand, LineDown, MicroFlexDrive, Point, RemoteBus, connect
+from busmaster import (
+    BusClosed,
+    BusLike,
+    Hcp2Controller,
+    InvalidCommand,
+    LineDown,
+    MicroFlexDrive,
+    Node,
+    Point,
+    Priority,
+    RemoteBus,
+    connect,
+)
 from busmaster.app.service.remote_group import RemoteGroup
+from busmaster.bounds import MOST_PLANNED_READS
 from busmaster.bus.bus_like import GroupLike
-from tests.app.service.lines import ABSENT, Served, on_a_line, on_a_served_line, until
+from busmaster.planning import PlannedGroup, PlannedNode
+from busmaster.protocols.hcp2.codec import Write
+from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, raw, until
 
 
 async def program(bus: BusLike) -> list[object]:
@@ -45,6 +62,11 @@ async def program(bus: BusLike) -> list[object]:
         outcome.append(str(error))
     outcome.append([(node.profile.name, node.address, node.label) for node in bus.nodes])
     outcome.append((await bus.statistics()).exchanges > 0)
+    node = PlannedNode(drive.node.profile, 7)
+    more = PlannedGroup("more", 0.001, [(node, drive.status_word.command), (node, drive.speed_measured.command)])
+    plan = await bus.plan(more)
+    outcome.append([one.exchanges for one in plan.groups])
+    outcome.append(plan.groups[-1].name)
     async with drive.exclusive(max_hold=1.0) as held:
         outcome.append(await held.status())
     consumer = group.subscribe(buffer=4)
@@ -200,3 +222,87 @@ def test_a_group_that_is_closed_before_it_was_accepted_does_not_begin(tmp_path: 
             assert line.service.clients[0]._gathered == {}
 
     on_a_served_line(tmp_path, story)
+
+
+def test_a_plan_of_a_remote_bus_is_that_of_its_owner(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = Hcp2Controller(line.bus, 5).point("1")
+        fast = line.bus.poll_group("fast", period=60, points=[point])
+        absent = PlannedNode(point.node.profile, ABSENT, PATIENT, reply_time=0.1)
+        known = PlannedNode(point.node.profile, 5, PATIENT)
+        more = PlannedGroup("more", 0.05, [(absent, point.command), (known, point.command)], 0.01, Priority.BACKGROUND)
+        fast.demand()
+        await until(lambda: fast.latest)
+        measured = replace(more, reads=[(absent, point.command), (Node.of(point).planned(), point.command)])
+        assert await remote.plan(more) == await line.bus.plan(measured)
+        assert await remote.plan() == await line.bus.plan()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_plan_that_would_hold_up_the_owner_is_refused(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        command = Hcp2Controller(line.bus, 5).point("1").command
+        node = PlannedNode(Hcp2Controller.profile, 5)
+        reads = [(node, command)] * MOST_PLANNED_READS
+        assert (await remote.plan(PlannedGroup("most", 1.0, reads))).groups[0].exchanges == 1
+        for groups, why in (
+            (
+                [PlannedGroup("one", 1.0, reads), PlannedGroup("two", 1.0, reads[:1])],
+                "200 reads planned at once, and not 201",
+            ),
+            ([PlannedGroup("one", 0.0, reads)], "0.001 to 86400 s, not 0"),
+            ([PlannedGroup("one", 1.0, [])] * 201, "200 groups at most"),
+            ([PlannedGroup("one", 1.0, [], merge=[lambda commands: []])], "merges"),
+            ([PlannedGroup("one", 1.0, [(node, Write(1, (1.0,)))])], "only reads"),
+        ):
+            with pytest.raises(InvalidCommand, match=why):
+                await remote.plan(*groups)
+        both = await asyncio.gather(remote.plan(), remote.plan())
+        assert both[0] == both[1]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_the_owner_refuses_such_a_plan_itself(tmp_path: Path) -> None:
+    read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+    write = {**read, "command": {"command": "write", "element": 1, "values": [1.0]}}
+
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for reads, period, why in (
+                ([read] * 201, 1.0, "200 reads planned"),
+                ([read], 0.0, "0.001 to 86400 s"),
+                ([read], "1", "a period"),
+                ([write], 1.0, "only reads"),
+                ([{**read, "address": 99999}], 1.0, "hcp2"),
+            ):
+                said = await client.ask("plan", groups=[{"name": "one", "period": period, "reads": reads}])
+                assert why in said["error"]["message"], said
+            said = await client.ask("plan", groups=[{"name": "one", "period": 1.0, "reads": []}] * 201)
+            assert "200 groups at most" in said["error"]["message"]
+            said = await client.ask("plan", groups="all")
+            assert "a list of objects" in said["error"]["message"]
+            async with line.service.line.planner._turn:
+                await client.say(method="plan", params={}, id=2)
+                said = await client.ask("plan")
+                assert "one plan is calculated for a program at a time" in said["error"]["message"]
+            assert (await client.hear())["id"] == 2
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_plan_ends_with_its_program(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with connect(line.address) as remote, line.service.line.planner._turn:
+            asking = asyncio.ensure_future(remote.plan())
+            await until(lambda: line.service.clients[0]._planning)
+            [client] = line.service.clients
+            await remote.link.close()
+            with pytest.raises(BusClosed):
+                await asking
+            await line.alone()
+            assert client._planning is not None
+            assert client._planning.cancelled()
+
+    on_a_line(tmp_path, story)

@@ -257,11 +257,11 @@ def test_programs_that_have_gone_leave_nothing_on_the_line(tmp_path: Path) -> No
 def test_r9_the_longest_wait_counts_the_programs_that_are_connected(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         await Hcp2Controller(line.bus, 5).read(1)
-        with_one = line.bus.worst_case_wait(), line.bus.plan().worst_waits[Priority.URGENT]
+        with_one = line.bus.worst_case_wait(), (await line.bus.plan()).worst_waits[Priority.URGENT]
         async with connect(line.address) as other:
             await other.statistics()
             assert line.bus.worst_case_wait() > with_one[0]
-            assert line.bus.plan().worst_waits[Priority.URGENT] > with_one[1]
+            assert (await line.bus.plan()).worst_waits[Priority.URGENT] > with_one[1]
 
     on_a_served_line(tmp_path, story)
 
