@@ -544,6 +544,7 @@ def test_a_bus_is_served_again_after_it_was(tmp_path: Path) -> None:
             for _ in range(2):
                 async with Service(bus, path=tmp_path / "a.sock") as service, connect(service.address) as remote:
                     assert remote.groups == ()
-            assert bus._line.on_stop == []
+            assert not bus._line.on_stop
+            assert not bus._line.on_groups
 
     asyncio.run(run())

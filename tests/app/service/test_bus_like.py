@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Hashable
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from busmaster import (
     RemoteBus,
     connect,
 )
+from busmaster.app.service import service
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.bounds import MOST_PLANNED_READS
 from busmaster.bus.bus_like import GroupLike
@@ -133,25 +134,24 @@ def test_a_group_that_was_closed_here_can_be_read_again(tmp_path: Path) -> None:
     on_a_line(tmp_path, story)
 
 
-def test_the_list_of_groups_is_sent_ten_times_a_second_at_most(tmp_path: Path) -> None:
+def test_the_list_of_groups_is_sent_once_in_a_while_however_often_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "GROUPS_EVERY", 3600.0)
+
     async def story(line: Served, remote: RemoteBus) -> None:
-        sent: list[str] = []
-        client = line.service.clients[0]
-        put = client.outbox.put_latest
-
-        def note(key: Hashable, text: str) -> None:
-            sent.append(text)
-            put(key, text)
-
-        client.outbox.put_latest = note  # type: ignore[method-assign]
         point = Hcp2Controller(line.bus, 5).point("1")
-        for number in range(50):
+        for number in range(5):
             line.bus.poll_group(f"group {number}", period=60, points=[point])
-        await until(lambda: len(remote.groups) == 50)
-        for number in range(50):
+        await until(lambda: len(remote.groups) == 5)
+        for number in range(5):
             line.bus.group(f"group {number}").close()
+            await remote.statistics()
+        assert len(remote.groups) == 5, "the next list is due in an hour"
+        due = line.service._groups_timer
+        assert due is not None
+        line.service._send_groups()
         await until(lambda: not remote.groups)
-        assert len([text for text in sent if "poll_groups" in text]) == 2
 
     on_a_served_line(tmp_path, story)
 
