@@ -263,11 +263,11 @@ async def test_a_reply_with_a_remote_parity_error_fails_the_attempt_and_is_count
             with pytest.raises(GarbledReply, match="parity"):
                 await axis.read(1, retries=0)
             assert await axis.read(1) == 0
-            counts = bus.statistics()
+            counts = await bus.statistics()
             assert (counts.damaged, counts.breaks) == (1, 0)
             assert counts.driver == DriverErrors(framing=0, parity=1, breaks=0, overruns=0, buffer_overruns=0)
             bus.reset_statistics()
-            assert bus.statistics().driver == DriverErrors(0, 0, 0, 0, 0)
+            assert (await bus.statistics()).driver == DriverErrors(0, 0, 0, 0, 0)
 
 
 @pytest.mark.asyncio

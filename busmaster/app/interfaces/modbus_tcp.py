@@ -540,7 +540,7 @@ class Values:
     async def _follow_group(self, remote: RemoteBus, name: str) -> None:
         while True:
             with suppress(BusError, InvalidCommand):  # values without a cycle become stale by their age
-                group = await remote.group(name)
+                group = remote.group(name)
                 try:
                     async for snapshot in group:
                         self._heard[name] = snapshot.finished
