@@ -71,7 +71,7 @@ from busmaster.contract.places import Changing, Placed, Telling
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.files import FOLDER_MODE, MODE, check_regular, open_file, read_file
-from busmaster.planning import Bounds, GroupPlan, Losses, Plan, PlannedGroup
+from busmaster.planning import Bounds, GroupPlan, Losses, MergedReads, Plan, PlannedGroup, PlannedNode
 from busmaster.planning.merging import Merge
 from busmaster.renames import TIMES, now_called
 from busmaster.transport import identity
@@ -129,6 +129,7 @@ __all__ = [
     "Mark",
     "MeansNothing",
     "Merge",
+    "MergedReads",
     "Named",
     "NodeRecord",
     "NodeSource",
@@ -142,6 +143,7 @@ __all__ = [
     "Placed",
     "Plan",
     "PlannedGroup",
+    "PlannedNode",
     "Poll",
     "Profile",
     "ReadAfterWrite",

@@ -39,13 +39,13 @@ from busmaster.ext import (
     Hold,
     LineClient,
     NodeRecord,
+    PlannedGroup,
     Requester,
     RequestOptions,
     checked_priority,
     seconds,
     whole_number,
 )
-from busmaster.planning import PlannedGroup
 
 NodeKey = tuple[str, int]
 MOST_FAILED = 1_000_000

@@ -12,8 +12,19 @@ from busmaster.app.service.messages import said_timings, timings_of, value_of
 from busmaster.app.service.telling import protocol_of
 from busmaster.bounds import MOST_PLANNED_GROUPS, MOST_PLANNED_READS
 from busmaster.errors import InvalidCommand
-from busmaster.ext import Command, Learned, checked_priority, seconds, whole_number
-from busmaster.planning import GroupPlan, Losses, MergedReads, Plan, PlannedGroup, PlannedNode
+from busmaster.ext import (
+    Command,
+    GroupPlan,
+    Learned,
+    Losses,
+    MergedReads,
+    Plan,
+    PlannedGroup,
+    PlannedNode,
+    checked_priority,
+    seconds,
+    whole_number,
+)
 
 PAUSE = 0.005
 """Seconds between two milliseconds of calculation: clients that request one plan after the other take a sixth of the

@@ -31,8 +31,7 @@ from busmaster.app.service.telling import (
 from busmaster.bounds import LONGEST_REQUEST, MOST_CHECKED
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.events import BusEvent, Stream
-from busmaster.ext import Command, Learned, Profile, checked_priority, find_group, seconds
-from busmaster.planning import Plan, PlannedGroup
+from busmaster.ext import Command, Learned, Plan, PlannedGroup, Profile, checked_priority, find_group, seconds
 from busmaster.registry import protocols
 from busmaster.statistics import LineStatistics
 
@@ -291,7 +290,7 @@ class RemoteBus:
             phase = seconds(phase, f"poll group {name!r}: a phase")
         priority = checked_priority(priority)
         if (before := self._own.get(name)) is not None and not before.over:
-            raise InvalidCommand(f"there is a poll group {name!r} already")
+            raise InvalidCommand(f"a poll group {name!r} already exists")
         read = tuple(points)
         for point in read:
             if point.node is not self._nodes.get((point.node.profile.name, point.node.address)):

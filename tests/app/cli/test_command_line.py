@@ -38,6 +38,7 @@ PROMISED = {
     "top": "[LINE|unix:PATH|PORT] [--read-only]",
     "web": "[LINE|unix:PATH|PORT] [--bind HOST:PORT] [--read-only]",
     "opcua": "[LINE|unix:PATH|PORT] [--bind HOST:PORT] [--read-only]",
+    "modbus-tcp": "[LINE|unix:PATH|PORT] [--bind HOST:PORT] [--read-only]",
     "safe": "LINE.toml",
     "points": "LINE.toml [--csv] [--from CSV]",
     "items": "PROTOCOL [WORD]... [--json]",
