@@ -64,6 +64,8 @@ BESIDE = {
     "serve": f"{CAPTURE} [--port PORT] [--seconds S]",
     "web": "[--token-file FILE] [--host NAME]",
     "opcua": "[--allow POINT] [--token-file FILE] [--certificate FILE] [--key FILE] [--trusted FOLDER]",
+    "modbus-tcp": "[--map FILE] [--print-map] [--type TYPE] [--last] [--allow POINT] [--pass-through]"
+    " [--allow-unit ID] [--allow-from ADDRESS] [--idle SECONDS]",
     "safe": f"{CAPTURE} [--port PORT]",
     "bench": NODE,
     **dict.fromkeys(("params save", "params diff", "params load"), f"{CAPTURE} {NODE}"),
