@@ -17,7 +17,17 @@ ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
 CLEAN = [  # files and folders
     *("README.md", "CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md", "benchmarks/README.md", "docs/README.md"),
-    *(f"docs/{name}.md" for name in ("tutorial", "questions", "public-api", "upgrading", "explanation/words")),
+    *(
+        f"docs/{name}.md"
+        for name in (
+            "tutorial",
+            "questions",
+            "public-api",
+            "upgrading",
+            "explanation/words",
+            "explanation/how-the-arbiter-thinks",
+        )
+    ),
     *(
         "docs/howto",
         "docs/protocols",
