@@ -9,7 +9,7 @@ import pytest
 from tests import language
 from tests.language import CLEAN, EXCEPTIONS, ROOT, RULES, files, findings
 
-REVISED = files(CLEAN)
+REVISED = files(CLEAN.split())
 
 
 @pytest.mark.parametrize("path", REVISED, ids=lambda path: str(path.relative_to(ROOT)))
