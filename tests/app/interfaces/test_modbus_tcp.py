@@ -376,6 +376,7 @@ def test_an_idle_client_and_half_a_request_are_closed() -> None:
     with_server(story, idle=0.05)
 
 
+@pytest.mark.slow
 def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_tcp, "SEND_WITHIN", 0.05)
 

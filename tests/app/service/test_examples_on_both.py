@@ -20,6 +20,7 @@ from busmaster.emulator.line import Line
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from tests.docs.pages import ROOT
 from tests.patience import PATIENCE
+from tests.tiers import one_by_default
 
 OWN_THEIR_LINE = {
     "supervisory_service": "shows the state of the line and the health of its nodes, which only their owner has",
@@ -68,7 +69,7 @@ def test_every_example_takes_a_bus_like_or_says_why_not() -> None:
         assert "Bus" not in annotations, name
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", one_by_default(PROGRAMS))
 def test_an_example_does_as_much_on_a_remote_bus_as_on_a_bus(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
