@@ -34,6 +34,7 @@ from benchmarks.served_line import ServedLine
 from busmaster import BusError, InvalidCommand, Priority, RemoteBus, connect
 from busmaster.bus.points import Point
 from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.ext import PlannedGroup, PlannedNode
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters, WriteRegisters
 from tests.app.service import floods
 
@@ -171,6 +172,15 @@ async def pauses(bus: RemoteBus, number: int) -> None:
         await quiet(bus.link.answer(bus.link.ask("pause", {"group": GROUP, "paused": True})))
 
 
+async def plans(bus: RemoteBus, number: int) -> None:
+    """Request one plan after the other, each with about as many groups as one message holds."""
+    unit = PlannedNode(PROFILE, UNIT, PROFILE.timings)
+    reads = [(unit, ReadRegisters(2 * one, 1)) for one in range(2)]
+    while True:
+        more = [PlannedGroup(f"mine {one}", 0.01 + one / 1000, reads) for one in range(20)]
+        await quiet(bus.plan(*more))
+
+
 async def mixed(bus: RemoteBus, number: int) -> None:
     await (reads, urgent_reads, slow_absent, groups, demands)[number % 5](bus, number)
 
@@ -203,6 +213,7 @@ KINDS = {
     "read: demand": Kind(READER, demands),
     "read: pause": Kind(READER, pauses),
     "read: sequences of 5 s": Kind(READER, holds),
+    "read: plans of 20 groups": Kind(READER, plans),
     "read: a connection a read": Kind(READER, one_read, anew=True),
     "read: mixed": Kind(READER, mixed),
     "write: reads": Kind(WRITER, reads),

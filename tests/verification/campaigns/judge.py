@@ -148,7 +148,8 @@ class Judge:
         if last.start > now + ROUNDING:
             self.problem(f"R3: a request leaves while a reply is still to come, at {last.start:.6f}")
         calm = self.mix.edges is not None and not self.mix.device  # then whatever noise did to it, its end is known
-        if last.end > now + ROUNDING and (calm or not self.ledger.damaged(last.start, now)):
+        spared = self.ledger.damaged(last.start, now) or self.ledger.disguised(last.cause, now)
+        if last.end > now + ROUNDING and (calm or not spared):
             self.problem(f"R1: a request leaves into a reply that lasts until {last.end:.6f}")
 
     def _goes_on(self, last: Frame, now: float) -> bool:

@@ -198,6 +198,13 @@ class Ledger:
         """Something that passed in that time was not what was said."""
         return any(start <= end and begin < stop for start, stop in self._damage)
 
+    def disguised(self, asked: float, now: float) -> bool:
+        """Since the request at `asked`, an overdue reply has ended that noise had changed. Nothing can tell it from the
+        reply to this request where the noise made it look like that."""
+        return any(
+            frame.cause < asked < frame.end <= now and self.damaged(frame.start, frame.end) for frame in self._frames
+        )
+
     def broken(self) -> bool:
         """A device spoke unexpected a short while ago."""
         return self.now() - self._unexpected_at < RECENT

@@ -18,6 +18,7 @@ from tests.verification.campaigns.__main__ import main
 from tests.verification.campaigns.hunt import Hunt
 from tests.verification.campaigns.judge import Totals
 from tests.verification.campaigns.kinds import KINDS
+from tests.verification.campaigns.ledger import Frame, Ledger
 from tests.verification.campaigns.mixes import BEYOND, IN_SYNC, STANDING_LONG, WITHIN
 
 EACH = 700
@@ -201,3 +202,15 @@ def test_damage_to_a_request_that_takes_no_time_belongs_to_its_own_exchange() ->
         line._spoiled(talk, "passes as something else")
     assert ledger.damaged(5.0, 5.1)
     assert not ledger.damaged(7.0, 7.1)
+
+
+def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_fault_of_the_master() -> None:
+    """Seed 60200 of EI-Bisynch: it ended the exchange at the moment the device's own reply began."""
+    ledger = Ledger(97, 5)
+    late = Frame(8.0, 9.0, 11.0)
+    ledger._frames.append(late)
+    assert not ledger.disguised(10.0, 11.0)
+    ledger.spoiled(late.start, late.end)
+    assert ledger.disguised(10.0, 11.0)
+    assert not ledger.disguised(10.0, 10.5), "it still lasts"
+    assert not ledger.disguised(7.0, 11.0), "it replies to this request"
