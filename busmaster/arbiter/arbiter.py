@@ -45,7 +45,7 @@ from collections.abc import Callable, Hashable
 from math import inf
 from typing import Any
 
-from busmaster.arbiter.choice import Choice, Idle, WaitUntil
+from busmaster.arbiter.choice import Choice, Idle, Send
 from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.counters import (
     EXCHANGE,
@@ -274,13 +274,13 @@ class Arbiter:
             return True
         unexpected = self._unexpected
         action = self._choice.next(now, unexpected.last_byte)
-        if isinstance(action, Idle):
-            return False
-        if isinstance(action, WaitUntil):
+        if type(action) is not Send:
+            if isinstance(action, Idle):
+                return False
             self._quarantine = action.time
             self._resynchronise(now, begun=True)
             return True
-        transaction, exchange = action
+        transaction, exchange = action.transaction, action.exchange
         self.dispatcher.started(transaction, now)
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)

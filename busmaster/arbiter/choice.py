@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from math import inf
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, final
 
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
@@ -97,11 +97,15 @@ MOST_BEFORE = 3
 R9 in planning include them."""
 
 
-class Send(NamedTuple):
+@final
+class Send:
     """Send this transaction now, as this exchange."""
 
-    transaction: Transaction
-    exchange: Exchange[Any]
+    __slots__ = ("exchange", "transaction")
+
+    def __init__(self, transaction: Transaction, exchange: Exchange[Any]) -> None:
+        self.transaction = transaction
+        self.exchange = exchange
 
 
 class WaitUntil(NamedTuple):
@@ -171,7 +175,7 @@ class Choice:
         self._last_byte = last_byte
         in_sync.lapse(now)
         chosen: Send | WaitUntil = first
-        transaction, exchange = first
+        transaction, exchange = first.transaction, first.exchange
         answers = exchange.answers
 
         def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
@@ -417,7 +421,7 @@ def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[Nod
 
 def _is_decisive(chosen: Send) -> bool:
     """Return True for a write, or the last attempt of a read: an overdue reply must not spoil it."""
-    transaction, exchange = chosen
+    transaction, exchange = chosen.transaction, chosen.exchange
     last = transaction.retried >= transaction.retries and not transaction.probe
     return transaction.writes or not exchange.answered or last
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Hashable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from math import inf
-from threading import get_ident
 from typing import Any, Generic, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.clients import Hold, LineClient
@@ -21,7 +20,7 @@ from busmaster.bus.limiter import Limiter
 from busmaster.bus.limits import Limit
 from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
 from busmaster.bus.samples import Sample
-from busmaster.bus.shared_line import SharedLine
+from busmaster.bus.shared_line import SharedLine, running_loop
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
@@ -263,7 +262,7 @@ class Node:
             for command in commands:
                 self._shared.limiter.check(self, command)
 
-    async def request(
+    def request(
         self,
         command: Command[T],
         *,
@@ -271,8 +270,8 @@ class Node:
         stops_seen: int | None = None,
         stop: bool = False,
         **options: Unpack[CommandOptions],
-    ) -> T:
-        """Run one command and return its value. The options are those of `RequestOptions`.
+    ) -> Coroutine[Any, Any, T]:
+        """Run one command and return its value: `await` it. The options are those of `RequestOptions`.
 
         A write that violates a limit of the node raises InvalidCommand. A `stop` and a write of the safe state are not
         limited.
@@ -283,8 +282,9 @@ class Node:
 
         Raises a BusError subclass. Cancelling it frees the caller immediately and does not disturb the line (R6).
         """
+        # No `async def`: a second coroutine costs time for every request (benchmark `turnaround`).
         chosen = self._options(options) if options else ORDINARY
-        return await self._run(Request(command, chosen, touches, stops_seen, stop))
+        return self._run(Request(command, chosen, touches, stops_seen, stop))
 
     async def timed_request(self, command: Command[T], **options: Unpack[CommandOptions]) -> tuple[T, Timeline]:
         """Run one command as `request` does. Returns the value and the timeline of the request."""
@@ -320,15 +320,18 @@ class Node:
         self._shared.check_loop()
         return self._shared.arbiter.exclusive(self._record, client, checked_hold(max_hold, self.label))
 
-    async def _run(self, request: Request[T]) -> T:
-        """Run a request that keeps its progress, also after a cancellation.
+    def _run(self, request: Request[T]) -> Coroutine[Any, Any, T]:
+        """Return the run of a request that keeps its progress, also after a cancellation.
 
-        Raises HoldEnded if its sequence has ended.
+        Its coroutine raises HoldEnded if the request's sequence has ended.
         """
         # Most requests are reads, and most lines have no limits: neither needs a check.
         limiter = self._shared.limiter
         if limiter is None or not getattr(request.command, "writes", False):
-            return await self._value(request)
+            return self._value(request)
+        return self._limited(request, limiter)
+
+    async def _limited(self, request: Request[T], limiter: Limiter) -> T:
         free, within = request.stop or request.options.safe, self._within(request)
         async with limiter.passing(self, request.command, request.options, free, within) as request.options:
             return await self._value(request)
@@ -358,14 +361,15 @@ class Node:
         before anything is sent.
         """
         record, line, command, options = self._record, self._shared, request.command, request.options
-        if isinstance(request.client, Hold) and request.client.over:
-            raise hold_ended(self, request.client.longest, command)
+        client, touches = request.client, request.touches
+        if client is not None and isinstance(client, Hold) and client.over:
+            raise hold_ended(self, client.longest, command)
         if self._to_all and not command.writes:
             raise InvalidCommand(
                 f"{self.profile.name}: address {self.address} is for writes to all nodes; no node replies to a read"
             )
         # same as check_loop, written out: this runs for every request
-        if get_ident() != line.thread or not line.loop_runs():
+        if running_loop() is not line.loop:
             if not line.running:
                 raise line.not_open(record=record, command=str(command))
             line.check_loop()
@@ -389,8 +393,8 @@ class Node:
             options.idempotent,
             request.probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
-            self if request.touches is None else (self, request.touches),
-            request.client,
+            self if touches is None else (self, touches),
+            client,
             None,
             None,
             command.writes and (request.stop or options.safe),

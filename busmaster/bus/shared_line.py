@@ -32,6 +32,11 @@ from busmaster.transport.pump import Pump
 CLOCK_WAS_SET = 0.005
 """Difference in seconds above which the machine's clock counts as set."""
 
+NO_LOOP = object()
+"""In place of the event loop of a bus that is not open."""
+running_loop = asyncio._get_running_loop
+"""Return the event loop that runs in this thread, or None. One call of a C function: it runs for every request."""
+
 
 class SharedLine:
     """The line of one bus. `name` is its port's name."""
@@ -52,7 +57,8 @@ class SharedLine:
         """Number of callers that currently allow only writes of the safe state."""
         self.thread = 0
         """Thread of its event loop; 0 while the bus is not open."""
-        self.loop_runs: Callable[[], bool] = lambda: False
+        self.loop: object = NO_LOOP
+        """Its event loop while the bus is open."""
         self.on_stop: list[Callable[[NodeRecord], None]] = []
         """Called immediately when a node is stopped."""
         self.on_groups: list[Callable[[], None]] = []
@@ -81,14 +87,13 @@ class SharedLine:
 
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
         """Open the bus: it is used from this thread and by this loop from now on."""
-        self.loop_runs = loop.is_running
         self.pump.bind(loop)
         self.losses.lost(self.now(), "its port is not open yet")
-        self.thread = get_ident()
+        self.thread, self.loop = get_ident(), loop
 
     def unbind(self) -> None:
         """Mark the bus as not open."""
-        self.thread = 0
+        self.thread, self.loop = 0, NO_LOOP
 
     # what holds now
 
@@ -261,7 +266,7 @@ class SharedLine:
 
     def check_loop(self) -> None:
         """Raise InvalidCommand if an open bus is used from another thread or another event loop."""
-        if self.running and (get_ident() != self.thread or not self.loop_runs()):
+        if self.running and running_loop() is not self.loop:
             self._check_elsewhere()
 
     def _check_elsewhere(self) -> None:
@@ -283,11 +288,3 @@ class SharedLine:
             error = BusClosed("the bus was closed", node=record, command=command, hint=hint)
         error.line = self.name
         return error
-
-
-def running_loop() -> asyncio.AbstractEventLoop | None:
-    """Return the asyncio event loop that runs in this thread, or None."""
-    try:
-        return asyncio.get_running_loop()
-    except RuntimeError:
-        return None
