@@ -5,6 +5,7 @@
 """
 
 import ast
+import inspect
 import io
 import re
 import sys
@@ -57,14 +58,15 @@ def markdown(text: str) -> Iterator[tuple[int, str]]:
 
 
 def python(text: str) -> Iterator[tuple[int, str]]:
-    """Docstrings, comments, and strings of three words and more."""
+    """Docstrings, comments, and strings of three words and more, without literal blocks and tables."""
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == tokenize.COMMENT:
             yield token.start[0], token.string.lstrip("# ")
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and len(node.value.split()) > 2:
-            for paragraph in re.split(r"\n\s*\n", re.sub(r"`[^`]+`", "CODE", node.value)):
-                yield node.lineno, " ".join(paragraph.split())
+            for paragraph in re.split(r"\n\s*\n", re.sub(r"`[^`]+`", "CODE", inspect.cleandoc(node.value))):
+                if not paragraph.startswith(("    ", "====")):  # a literal block or a table, as in Markdown
+                    yield node.lineno, " ".join(paragraph.split())
 
 
 def findings(path: Path, *, exceptions: bool = True) -> Iterator[tuple[int, str, str]]:
