@@ -1,1 +1,1 @@
-"""The pure heart: no asyncio, no clock, no I/O. It is told the time and the bytes, and says what to send."""
+"""The state of one line, without asyncio, clock or I/O: its caller passes time and bytes, and sends the output."""

@@ -141,11 +141,13 @@ class Arbiter:
         max_reply_delay = max((node.max_reply_delay for node in self.dispatcher.nodes), default=UNKNOWN_MAX_REPLY_DELAY)
         self._up_at = now
         self._quarantine = now + max_reply_delay + self._step.latency + self._step.byte_time
+        # A node may hold half a frame of an earlier master, and answer the next frame on the line, whichever node it is
+        # for (R15).
         self._in_sync.came_up()
         self._resynchronise(now)
 
     def line_down(self, cause: str, now: float) -> None:
-        """Handle a lost port: fail all requests and discard what is queued (R13)."""
+        """Handle a lost port: fail all requests, including the queued ones (R13)."""
         # A port that fails while it is being closed reports its loss twice.
         if self.state is OFFLINE:
             return
@@ -159,6 +161,7 @@ class Arbiter:
 
     def still_down(self, cause: str, hint: str) -> None:
         """Store why the port cannot be reopened. Requests that fail report this cause instead of the original loss."""
+        # The old cause ("it hung up") does not help later: "no permission" or "in use by PID 812" does.
         self._cause, self._hint = cause, hint
 
     def data_received(self, data: bytes, now: float) -> None:
@@ -181,6 +184,9 @@ class Arbiter:
 
     def byte_marked(self, mark: Mark, now: float) -> None:
         """Handle a UART report of a break or a damaged byte. The byte is not accepted as part of any reply."""
+        # The byte may have been any part of the reply, or the echo. A UART mark is more reliable than a checksum: a
+        # single exclusive-or byte misses some double errors, and only parity distinguishes a damaged ACK from Mentor
+        # II's EOT (docs/proof.md, 5).
         self._counters.mark(mark)
         self._unexpected.last_byte = now
         self._echo.forget()
@@ -226,7 +232,10 @@ class Arbiter:
         reply. The caller must report the count again before it passes received bytes. A line that is being closed does
         not wait for unsent bytes; they are only mentioned in the error.
         """
+        # A request held for less than its window and released before the first query is not noticed: its window then
+        # counts from the write (docs/proof.md, 6). R15 keeps its late reply from being delivered.
         again = self._wire.output.unsent(count, now)
+        # Closing does not wait: flow control can hold the bytes for ever, and `close` must end (R8).
         if again is not None and (again == inf or not self._closed):
             self._deadlines.line = self._due_anew(now) if again == inf else again
 
@@ -296,6 +305,7 @@ class Arbiter:
         assert transaction is not None
         # R4: bytes that arrive before 90 % of the request is on the wire, or while the port still holds part of it,
         # cannot be its reply.
+        # They are noise, or the reply to an earlier request that is later than its maximum reply delay.
         if now < step.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._unexpected.last_byte = now
@@ -303,9 +313,12 @@ class Arbiter:
             return
         if not wire.answered:
             self._unexpected.note(data, now, step.quiet())
+            # A broadcast has no reply, so these bytes fail nothing. They are unexpected, and the line resynchronises
+            # when it has left.
             wire.came_unexpected = True
             return
         if transaction.node.profile.noise_tolerant:
+            # Only bytes with which no reply of this exchange can begin are noise.
             heard, data = data, wire.without_noise(data)
             self._counters.noise_bytes += len(heard) - len(data)
             if not data:
@@ -313,9 +326,12 @@ class Arbiter:
                 return
         step.begun = True
         step.begun_at = now
+        # Their number is needed to learn reply times: an adapter with a latency timer delivers a whole reply at once.
         step.first_bytes = data
         if transaction.first_byte == -inf:
             transaction.first_byte = now
+        # Both count from the end of the request, and allow for the time in the adapter: a slow adapter does not make a
+        # node late.
         if now > step.end + step.timing.late_after + step.latency:
             transaction.late = True
             if now > step.end + step.timing.window + step.latency:
@@ -355,14 +371,15 @@ class Arbiter:
         wire, step, unexpected = self._wire, self._step, self._unexpected
         if step.begun or not wire.answered or step.timing.silence is not None:
             return False
-        if (
-            self._closed or self._echo.pending
-        ):  # Closing waits for the window only (R8). If an echo was lost, the reply cannot be separated from it.
+        # Closing waits for the window only (R8). If an echo was lost, the reply cannot be separated from it.
+        if self._closed or self._echo.pending:
             return False
         # R2: no reply can begin after the maximum reply delay, so no caller waits longer for one.
         until = step.last_begin()
         if now >= until:
             return False
+        # From here on the line is read every tenth of a maximum reply delay: the age of a late reply must be known
+        # exactly, because it may raise that delay.
         assert wire.transaction is not None
         unexpected.unanswered(wire.transaction.node, step.end, step.timing.max_reply_delay)
         self._deadlines.line = unexpected.look_before(until, now)
@@ -385,9 +402,13 @@ class Arbiter:
         assert exchange is not None
         answered, rest = wire.answered, progress.rest
         alert = self._in_sync.alert
+        # The first frame on a new line has left: from now on it is known until when a NAK or an ACK may be for an
+        # earlier master.
         if alert and self._in_sync.lone_bytes_until == inf:
             self._first_frame_ended()
         if answered:
+            # The usual reply needs no check: nothing is overdue and no byte follows. This comparison is all that R15
+            # costs then.
             if alert or rest:
                 verdict = self._trust.weigh(wire, progress, now)
                 if isinstance(verdict, str):
@@ -402,11 +423,14 @@ class Arbiter:
                 self._watch_max_reply_delay()
             # Unpaced port: a request that was answered has left, even if the configured baud rate is lower than the
             # real one.
+            # The proof found the opposite error too: an ambiguous reply that moved these times let the next request
+            # leave 11.8 ms too early (docs/proof.md, 1).
             if step.end > begun_at:
                 step.end = step.out = begun_at
             transaction.node.note_reply(exchange.answers, transaction.command, begun_at - step.end)
             if transaction.node.learning is not None:
                 wire.learn(now)
+        # MSC: the packet is acknowledged before its caller is notified, because the unit repeats it until then.
         if progress.send:
             wire.say(progress.send, now)
         wire.transaction = wire.exchange = None  # `trust.held` is None here: a held reply has been evaluated again
@@ -442,6 +466,8 @@ class Arbiter:
         assert transaction is not None
         if no_reply and self._wire.output.held:
             error.what, error.hint = "the port had not sent it when the bus was closed", HELD
+        # The next bytes may be its reply, however late. `unanswered` stores its age, so that the node's delay can be
+        # raised.
         elif no_reply:
             unexpected.unanswered(transaction.node, step.end, step.timing.max_reply_delay)
             if error.what == NO_REPLY:
@@ -456,12 +482,14 @@ class Arbiter:
             if transaction.overdue:
                 # Late and wrong bytes may be noise, so they do not raise the maximum reply delay.
                 unexpected.answered()
+            # For example an ACK from noise in place of the ACK: the overdue reply may be among these bytes.
             if error.heard:
                 unexpected.came(now)
                 unexpected.run[:] = error.heard
-        spared = error.whole and not self._in_sync.is_overdue(
-            now
-        )  # The reply has begun (bad checksum), so only silence is awaited and not the maximum reply delay (R3).
+        # The reply was complete (bad checksum), so only silence is awaited and not the maximum reply delay (R3).
+        spared = error.whole and not self._in_sync.is_overdue(now)
+        # Two replies to one request: a node replies twice, or an overdue reply came first. Neither is delivered, and
+        # for the next 30 s ambiguous replies are held.
         both = error.what is TWO_ANSWERS
         if both:
             self._in_sync.said_twice(now)
@@ -482,11 +510,14 @@ class Arbiter:
         """
         transaction = self._wire.transaction
         assert transaction is not None
+        # A NAK is one byte, the same for all nodes: while any reply is overdue, it can be the reply to another request.
         certain = not self._in_sync.refusals_are_ambiguous(now)
         if not certain:
             self._trust.add_overdue(self._wire, heard=False)
         elif transaction.writes:
             self._watch_max_reply_delay()
+        # The second refusal of a read in a row cannot be noise: only silence is awaited, and not the maximum reply
+        # delay.
         confirmed = transaction.refusals > 0
         transaction.last_byte = now
         self._end_exchange()
@@ -507,10 +538,11 @@ class Arbiter:
         if self._in_sync.lone_bytes_until == inf:
             self._first_frame_ended()
         if wire.exchange is not None:
+            # The order matters: `came_unexpected` extends only what `give_up` has noted.
             self._step.give_up(wire.exchange.later)
-            self._step.came_unexpected(
-                self._unexpected.last_byte
-            )  # the unexpected bytes may have been the reply, damaged
+            # MSC: the bytes may have been the ACK, damaged. Its packet then begins up to its own maximum reply delay
+            # later: the proof found it half a second inside the next exchange (docs/proof.md, 2).
+            self._step.came_unexpected(self._unexpected.last_byte)
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
@@ -540,6 +572,7 @@ class Arbiter:
         self._echo.forget()
         # Our own bytes count as well: a two-wire adapter does not receive while it transmits.
         last = max(self._unexpected.last_byte, self._step.out)
+        # R3's first condition. A silence alone proves nothing: a drive that replies after 40 ms is silent until then.
         silent = max(last + self._step.quiet(), self._quarantine, now)
         # After a learned window the line continues: the reply that may still arrive is tracked as overdue (R15).
         goes_on = begun or self._step.timing.silence is not None
@@ -549,6 +582,8 @@ class Arbiter:
     def _free(self, now: float) -> None:
         """End a holdoff or a resynchronisation."""
         if self.state is RESYNCHRONISING:
+            # This order: bytes that were just received may clear an overdue reply, and only then may the next request
+            # be chosen.
             self._step.resynchronised()
             self._hear_out(self._unexpected.silent(), now)
             if self._answer_unexpected(self._unexpected.reply_to_silence(), now):
@@ -570,6 +605,8 @@ class Arbiter:
             return
         self._resynchronise(now)
         self._answer_unexpected(unexpected.reply_to(data, self.noisy), now)
+        # Failing is better than waiting: a node that transmits without a pause blocks the line until it is replaced. No
+        # request could meet its deadline.
         if unexpected.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1
@@ -580,6 +617,7 @@ class Arbiter:
     def _hear_out(self, run: bytes, now: float) -> None:
         """Process the bytes received before this silence. A node whose overdue reply is found is alive (R11, R15)."""
         node = self._trust.hear(self._wire, run, self._unexpected, now, self._echo.astray) if run else None
+        # It has transmitted, so its next probe is sent at once instead of after up to 30 s.
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 
@@ -588,6 +626,7 @@ class Arbiter:
         resynchronises."""
         if send:
             self._wire.say(send, now)
+            # `_resynchronise` below forgets pending echoes.
             overdue = self._echo.pending
             self._resynchronise(now)
             self._echo.pending = overdue  # the resynchronisation cleared it, but these bytes are echoed too
@@ -599,6 +638,8 @@ class Arbiter:
         self._unexpected.last_byte = now  # if the echo was lost, these bytes may be another node's that look like it
         if self.state is RESYNCHRONISING:  # an ACK may precede its packet (MSC)
             self._silent_at = max(self._silent_at, self._step.came_unexpected(now))
+        # Another master, or a node that replies to an earlier request: both corrupt the request, so no reply to it can
+        # be trusted.
         if rest is None:
             self._counters.collisions += 1
             self.events.append(CameUnexpected(data, collision=True))
@@ -623,6 +664,7 @@ class Arbiter:
         self._unexpected.forget()
         if transaction is not None:
             self._wire.output.discard()
+            # The node may still reply after the port is open again: a lost port clears nothing (R15).
             self._trust.add_overdue(self._wire, heard=True)
             self._end_exchange()
             self.dispatcher.cut_off(transaction, self._offline(), now)
@@ -632,6 +674,7 @@ class Arbiter:
         spent = now - counters.entered
         counters.spent[before] += spent
         counters.entered = now
+        # Idle time pays for probes of dead nodes (R11).
         if before is READY:
             self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
@@ -639,7 +682,7 @@ class Arbiter:
     def _offline(self) -> BusError:
         return LineDown(f"the line is down: {self._cause}", hint=self._hint)
 
-    # what its owner asks of it
+    # called by the owner
 
     @property
     def byte_time(self) -> float:
@@ -684,9 +727,11 @@ class Arbiter:
             self.name,
         )
         if isinstance(timings, Learned):
+            # Learned windows are safe only by R15, which a protocol must support: HCP's read request has no checksum,
+            # so a corrupted request can be answered.
             node.learning = Learning()
         self.dispatcher.nodes.append(node)
-        # One listener per line: only one protocol of a line has replies to what nobody requested (MSC).
+        # One listener per line: only one protocol of a line acknowledges packets that were not requested (MSC).
         if profile.listen is not None and self._unexpected.listener is None:
             self._unexpected.listener = profile.listen()
         # R3: an earlier master may have sent this node a request just before the port was opened. Wait for that reply.
@@ -709,6 +754,7 @@ class Arbiter:
 
     def ask_within_budget(self, node: NodeRecord, now: float) -> None:
         """Treat a new node as DOWN until its first reply, so that requests to it use only the probe budget (R11)."""
+        # A client may name any address. Each absent one would cost a maximum reply delay at normal priority.
         node.health, node.budgeted, node.probe_at = DOWN, True, now
         self.dispatcher.probes.plan()
 
@@ -747,6 +793,7 @@ class Arbiter:
 
     def remove_client(self, client: LineClient) -> None:
         """Remove a client that has no queued requests. Its exchange on the wire, if any, is finished."""
+        # A retry of its request on the wire would be sent for a program that is gone.
         client.over = True
         self.dispatcher.share().forget(client)
 
@@ -784,6 +831,7 @@ class Arbiter:
 
     def add_poll(self, poll: Poll, now: float) -> None:
         """Start a poll. Its first cycle waits until a line that has just been opened is usable."""
+        # Otherwise the first cycles of all groups would count as late on each start.
         self.dispatcher.add_poll(poll, max(now, self._quarantine))
 
     def remove_poll(self, poll: Poll, now: float) -> None:

@@ -79,6 +79,7 @@ class Fifo:
                 self.live -= 1
             else:
                 passed.append(transaction)
+        # Back in front, in the same order: a request that was only examined keeps its place.
         self._entries.extendleft(reversed(passed))
         return found
 
@@ -238,6 +239,8 @@ class Backlog:
         """Remove and return a suitable transaction of any class, or None. For a request that must be sent now."""
         for queue in self.queues:
             # Bounded: with ten thousand requests waiting, an unbounded search would take longer than an exchange.
+            # In any order and not the first by deadline: the read only has to prove that replies match, and is due
+            # anyway.
             found = next((t for t in islice(queue.entries(), SEARCHED) if t.phase is QUEUED and suits(t)), None)
             if found is not None:
                 queue.remove(found)
@@ -260,6 +263,7 @@ class Backlog:
         URGENT always goes first. Below it, a waiting lower class gets every eighth slot.
         """
         urgent, command, poll, background = self.queues
+        # `restore` needs them: a transaction that R15 holds back has not used a slot.
         self._streak_before = self._streak
         self._rotated_before = self._rotated
         if urgent.live and not self._urgent_yields:
@@ -321,6 +325,7 @@ class Writes:
 
     def is_first(self, write: Transaction) -> bool:
         """Return True if no earlier write of its client to its node is unfinished."""
+        # The cheap comparison first: usually one program writes to a node.
         return self.queues[write.node][0] is write or self.first_of(write.node, turn_of(write.client)) is write
 
     def first_of(self, node: NodeRecord, client: LineClient) -> Transaction | None:
@@ -332,6 +337,8 @@ class Writes:
         waiting = self.backlog.waiting_of(transaction.priority, transaction.client)
         if transaction.writes:
             client = turn_of(transaction.client)
+            # Parked writes are in no class queue. Without this sum, a program could queue any number of writes to one
+            # node.
             waiting = max(waiting, sum(turn_of(write.client) is client for write in self.queues[transaction.node]))
         return waiting
 
@@ -343,6 +350,7 @@ class Writes:
         """Park a write behind an earlier write to its node, and raise that one to its class."""
         write.phase = PARKED
         # the earlier write was queued before, so it is still there
+        # Per client and not per node: a program must not be able to block another program's writes with its own.
         first = self.first_of(write.node, turn_of(write.client))
         assert first is not None
         # R7: they must keep their order, and the write of the higher class must not wait for a turn of the lower class.
@@ -353,11 +361,13 @@ class Writes:
 
     def forget_empty(self) -> None:
         """Remove empty queues, which may belong to removed nodes. A node gets a new one with its next write."""
+        # A list: the dictionary must not change while it is iterated.
         for node in [node for node, waiting in self.queues.items() if not waiting]:
             del self.queues[node]
 
     def over(self, write: Transaction) -> None:
         """Handle the end of a write: the next write of its client to its node may be sent."""
+        # The write that has ended is nearly always the first one. A superseded or cancelled write can be anywhere.
         writes = self.queues[write.node]
         if writes and writes[0] is write:
             writes.popleft()

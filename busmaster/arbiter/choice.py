@@ -6,15 +6,15 @@ correct reply proves that the line is in sync. An urgent write is never held bac
 
 This module also limits runs of exchanges with similar replies, in which one reply too many would not show.
 
-If all replies look alike, one duplicate shifts every later reply by one exchange: it is taken for the reply to the next
-request, whose own reply is taken for that of the one after it, and so on. No reply is overdue and no unexpected byte is
-received. A read with a different reply reveals the shift and costs one exchange. A pause reveals it too.
+If all replies look alike, one duplicate shifts every later reply by one exchange. It is accepted as the reply to the
+next request, whose own reply is accepted for the request after that, and so on. No reply is overdue and no unexpected
+byte is received. A read with a different reply reveals the shift and costs one exchange. A pause reveals it too.
 
 On a port whose bytes leave at the baud rate, reply times reveal it as well. In sync, a node begins to prepare its reply
 after it has received the request. If replies are shifted by one exchange, the received reply belongs to the request
-before, and its node could begin to prepare it when the previous reply was accepted, which is when the current request
-began to leave. So a shifted reply arrives earlier, by the wire time of the request. Nodes with different delays show
-each other's delays; over a run these cancel out.
+before. Its node could begin to prepare it when the previous reply was accepted, which is when the current request began
+to leave. So a shifted reply arrives earlier, by the wire time of the request. Nodes with different delays show each
+other's delays; over a run these cancel out.
 
 So a reply is *untimely* if it differs from its node's usual reply time by more than half of that wire time. A run with
 an untimely reply is checked as if there were no times. A reply that is too early may belong to the previous request. A
@@ -88,6 +88,7 @@ class Alike:
         if usual is None:
             node.usual = took
             return True
+        # Updated also by an untimely reply: if the node has become slower for good, the next replies are timely again.
         node.usual = usual + USUAL_SHARE * (took - usual)
         return abs(took - usual) > asking / 2
 
@@ -173,6 +174,7 @@ class Choice:
         """Select as `next` does, while a reply is overdue or ambiguous, or `too_many` replies were alike."""
         in_sync = self._in_sync
         self._last_byte = last_byte
+        # First: an expired reply must not cause a sync read, and `alert` may be cleared by it.
         in_sync.lapse(now)
         chosen: Send | WaitUntil = first
         transaction, exchange = first.transaction, first.exchange
@@ -181,26 +183,30 @@ class Choice:
         def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
             return other == answers or in_sync.clashes(other, now, node)
 
-        # R9: an urgent write waits for nothing. This applies to its first attempt only: a late reply to that one could
-        # be taken for the retry's, which needs proof like any other request.
+        # R9: an urgent write waits for nothing. This applies to its first attempt only: a late reply to that one looks
+        # like the reply to the retry, which needs proof like any other request.
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
         elif transaction.writes and now < in_sync.lone_bytes_until and any(len(key) == 1 for key in answers):
+            # A single byte may be the NAK of a node that an earlier master left in the middle of a frame (R15).
             chosen = self._before_first_write(first, now)
         elif _is_decisive(first) and now < in_sync.awaited_until(self._last_byte):
             chosen = self._while_awaited(first, now) or WaitUntil(in_sync.awaited_until(self._last_byte))
         elif transaction.probe and in_sync.clashes(answers, now, transaction.node):
-            # The reply to the previous probe may still arrive and would be taken for this one's.
+            # The reply to the previous probe may still arrive and look like the reply to this one.
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_sync.clashes(answers, now):
             chosen = self._instead_of(first, now)
         elif in_sync.clashes(answers, now, transaction.node):
+            # Only the node's own overdue reply could be confused with this one, so only its own reply proves anything.
             chosen = self._ask_itself(first, now) or first
         elif too_many:
             unlike = self._another(first, now, alike)
             chosen = unlike or self._ask_sync_read(self._whom_to_ask(now)[0], now, alike) or first
             self._alike.count = 0
         elif in_sync.has_ambiguity(now) and answers == in_sync.last:
+            # After a duplicate: a request with a different reply goes first if one is queued, but no sync read is sent
+            # for this. Equal requests behind one another would only make the replies ambiguous, not wrong.
             chosen = self._another(first, now, alike) or first
         if chosen is first:
             self._gone_before = 0
@@ -209,6 +215,7 @@ class Choice:
             return chosen
         if chosen.transaction is not transaction:
             self._dispatcher.backlog.restore(transaction)
+        # A different reply reveals a shift, so the run of similar replies is over.
         if chosen.exchange.answers != in_sync.last:
             self._alike.count = 0
         self._alike.node = chosen.transaction.node
@@ -239,6 +246,7 @@ class Choice:
             node = first.transaction.node
             # only a reply of the node itself proves that its reply is not overdue
             of = node if node in nodes_overdue else None
+            # The last of the three places is reserved for a sync read: other requests may prove nothing.
             other = self._another(first, now, clashes, of)
         if other is None:
             ends = in_sync.ends(answers, now)
@@ -247,9 +255,8 @@ class Choice:
                 return (self._ask_itself(first, now) if own else None) or WaitUntil(ends)
             asked, silent = self._whom_to_ask(now)
             worth_it = first.transaction.writes or not first.transaction.attempts
-            if worth_it and not (
-                nodes_overdue or asked
-            ):  # All nodes are silent: a sync read of its own node costs no more than the request would.
+            # All nodes are silent: a sync read of its own node costs no more than the request would.
+            if worth_it and not (nodes_overdue or asked):
                 asked = [first.transaction.node]
             # Nodes with an overdue reply first: their reply clears it at once, another node's only after the maximum
             # reply delay.
@@ -259,6 +266,8 @@ class Choice:
                 over = in_sync.over(answers)
                 if now < over:
                     return WaitUntil(over)
+                # No read can prove anything: every node has refused all others, or their replies are overdue too. Then
+                # only time helps.
                 in_sync.forgive(answers)
         if other is None:
             return first
@@ -266,7 +275,7 @@ class Choice:
         return other
 
     def _before_first_write(self, first: Send, now: float) -> Send | WaitUntil:
-        """Return what goes before the first write on a new line: a read, then the time until which a NAK may arrive.
+        """Return the substitute for the first write on a new line: a read, then the time until which a NAK may arrive.
 
         The read ends the unfinished frame that a node may hold from an earlier master. Without it, a write that this
         node's NAK seems to refuse would be sent again, and be carried out twice.
@@ -288,7 +297,7 @@ class Choice:
         return self._ask_sync_read(dict.fromkeys([*own, *alive, *silent]), now, clashes) or first
 
     def _while_awaited(self, first: Send, now: float, answers: Sequence[bytes] | None = None) -> Send | None:
-        """Return what goes while an overdue reply may still be on time, or None if the request must wait.
+        """Return the request to send while an overdue reply may still be on time, or None if none may be sent.
 
         First choice is a sync read of the node, which shows that its reply will not arrive; then another request. After
         two of them only sync reads follow, which are short if times are learned, for one maximum reply delay. Together
@@ -305,6 +314,7 @@ class Choice:
             return self._in_sync.clashes(answers, now, node)
 
         nodes_overdue = dict.fromkeys(self._in_sync.nodes_overdue(answers, now))
+        # A reply of the node itself ends the wait at once, because a node answers in order.
         other = self._of_these(nodes_overdue, now, clashes) or self._ask_sync_read(nodes_overdue, now, clashes)
         if other is None and not two_gone:
             other = self._another(first, now, clashes)
@@ -377,6 +387,7 @@ class Choice:
             exchange = _opened(other)
             if exchange is None or unfit(exchange.answers, other.node):
                 return False
+            # The overdue reply may collide with this exchange. A read that can be repeated loses nothing by that.
             if awaited and (_is_decisive(Send(other, exchange)) or in_sync.clashes(exchange.answers, now)):
                 return False
             opened.append(exchange)
@@ -390,6 +401,7 @@ class Choice:
         for node, command, exchange in _fit_checks(nodes, unfit):
             check = self._dispatcher.check(node, command, now)
             if node.learning is not None:
+                # With the learned window, unlike the exchange that was used to find it: a sync read can be repeated.
                 exchange = command.open(node.address, check.timings())
             return Send(check, exchange)
         return None
@@ -399,6 +411,7 @@ class Choice:
         nodes = [
             node
             for node in self._dispatcher.nodes
+            # A suspended node may be switched off or in maintenance: nothing at all is sent to it.
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
         # The node that replied last is the most likely to reply now.

@@ -110,6 +110,7 @@ class Histogram:
     def _sort_in(self) -> None:
         new = self._new
         counts = self._counts
+        # A clock that was read twice may be slightly older the second time.
         if min(new) < 0.0:
             new[:] = [max(seconds, 0.0) for seconds in new]
         for bucket, count in Counter(array("H", array("d", new).tobytes())[_UPPER]).items():
@@ -190,7 +191,7 @@ class DriverErrors:
     buffer_overruns: int
 
     def since(self, before: DriverErrors) -> DriverErrors:
-        """Return what was counted after `before`."""
+        """Return the errors counted after `before`."""
         return DriverErrors(
             self.framing - before.framing,
             self.parity - before.parity,
@@ -255,6 +256,7 @@ class RecentUtilisation:
         if seen and used < seen[-1][1]:  # the statistics were reset
             seen.clear()
         seen.append((now, used))
+        # One snapshot from before the window is kept, from which the share is calculated.
         while len(seen) > 2 and seen[1][0] <= now - self._window:
             seen.popleft()
         since, used_then = seen[0]
@@ -352,6 +354,7 @@ class LineCounters:
         self.completed = self.cancelled = self.unexpected_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.resyncs = self.noisy = self.losses = 0
         self.sync_reads = self.ambiguous = self.damaged = self.breaks = 0
+        # The counters run on, because differences of them are stored in queued requests. A snapshot subtracts these.
         self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 

@@ -79,6 +79,7 @@ class Expiries:
     def due(self, now: float) -> Iterator[Transaction]:
         """Remove and yield the unfinished transactions of which one of the two times has passed."""
         heap = self._heap
+        # Most requests end before their time. They are removed when they are first, which costs no search.
         while heap and (heap[0][0] < now or heap[0][2].phase is ENDED):
             transaction = heapq.heappop(heap)[2]
             if transaction.phase is not ENDED:

@@ -1,8 +1,8 @@
 """Selects the next transaction and ends each transaction (R6 to R12).
 
-The arbiter reports when the line is free and how an attempt ended. The dispatcher does not know what is on the wire. It
-queues requests, keeps the writes of a node in order, retries, confirms refusals, parks the polls of dead nodes, charges
-probes to their budget, and ends each transaction exactly once.
+The arbiter reports when the line is free and how an attempt ended. The dispatcher does not know the bytes on the wire.
+It queues requests, keeps the writes of a node in order, retries, and confirms refusals. It parks the polls of dead
+nodes, charges probes to their budget, and ends each transaction exactly once.
 
 If the line becomes unusable, all queued transactions are removed at once, so that none of them can be sent later. Their
 callers are notified in batches: a thousand callers in one callback would block the event loop, which may also serve
@@ -100,6 +100,7 @@ def take_out(queues: Iterable[deque[Transaction]], backlog: Backlog) -> list[Tra
     for writes in queues:
         if writes:
             taken += (write for write in writes if write.phase is PARKED)
+            # The arbiter ends it itself, as cut off: it may have been carried out.
             on_wire = [write for write in writes if write.phase is ON_WIRE]
             writes.clear()
             writes += on_wire
@@ -128,6 +129,7 @@ class Tapped:
     def started(self, transaction: Transaction) -> None:
         """Start an attempt with the number of its transaction."""
         if transaction.attempts == 1 or transaction not in self._numbers:
+            # A poll's transaction is used again in each cycle, with a new number each time.
             self._numbers[transaction] = next(self._order_of_transactions)
         node = transaction.node
         self.attempt = Attempt(
@@ -209,6 +211,7 @@ class Dispatcher:
         transaction.deadline = now + RETRY_PATIENCE
         transaction.exchanges_ahead = counters.exchanges  # same as `_waits`, written out: this runs for every request
         transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING]
+        # Checked again for each request and not only at the loss: requests keep arriving while the line is down.
         if self.fault is not None:
             self._admitted(transaction, now)
             return True
@@ -226,6 +229,7 @@ class Dispatcher:
             if self._admitted(transaction, now) is None:
                 return True
             if node.budgeted and transaction.client is not None and not isinstance(transaction.client, Hold):
+                # All requests to such nodes share one small part of the line, whichever client names them (1/128, R9).
                 transaction.client = self.share().new_nodes()
         # After the capacity check, so that a rejected write never blocks the writes behind it.
         if changed:
@@ -248,6 +252,7 @@ class Dispatcher:
             self.backlog.discard(transaction, PARKED)
         if transaction.phase is not ON_WIRE:
             self._release_stops(transaction)
+            # It was paid when it was queued, and was not sent.
             self.probes.budget.refund(transaction.probe_cost)
             self._end(transaction, now)
 
@@ -285,6 +290,7 @@ class Dispatcher:
             cost = transaction.node.max_reply_delay
             if self.probes.spare(cost, now):
                 transaction.probe_cost = cost
+                # The budget has paid for one attempt. A dead node does not reply to the second one either.
                 transaction.retries = 0
                 verdict = self.eligibility(transaction, now)
             else:
@@ -329,6 +335,7 @@ class Dispatcher:
                 continue
             if not write.stop:
                 break
+            # An attempt of its own may have been carried out: such a stop ends with its own outcome.
             if write.attempts or type(write.command) is not type(stop.command) or write.command != stop.command:
                 continue
             if write.priority is not stop.priority or isinstance(write.client, Hold):
@@ -345,6 +352,7 @@ class Dispatcher:
         alike, stop.stops_alike = stop.stops_alike, ()
         for other in alike:
             if other.phase is ON_WIRE:
+                # Its first attempt was the shared one, whose outcome is not known.
                 other.unsure = True
                 self.backlog.push(other)
 
@@ -382,6 +390,7 @@ class Dispatcher:
         if node.max_reply_delay_until < inf:
             self._watch.lower_max_reply_delay(transaction, now)
         if transaction.probe_cost:
+            # A reply costs far less than the maximum reply delay that was paid in advance.
             self.probes.budget.refund(transaction.probe_cost - (now - transaction.started))
         transaction.refused_cycles = 0
         self._end(transaction, now)
@@ -389,7 +398,7 @@ class Dispatcher:
     def attempt_failed(
         self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, ambiguous: bool = False
     ) -> None:
-        """Retry or fail a transaction. An `ambiguous` reply says nothing about the node's health (R15)."""
+        """Retry or fail a transaction. An `ambiguous` reply does not change the node's health (R15)."""
         if self.tapped is not None:
             self.tapped.over(transaction, _verdict(no_reply, failure.what, ambiguous), failure.what, now)
         node = transaction.node
@@ -401,6 +410,7 @@ class Dispatcher:
         # An ambiguous reply is not a failure of the node, so the attempt is repeated even if the node is SUSPECT.
         worth = ambiguous or self._watch.is_worth_a_retry(transaction)
         if transaction.retried < transaction.retries and worth and self.is_wanted(transaction):
+            # At the back of its class: a node that loses frames must not delay the other nodes with its retries.
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
@@ -420,7 +430,7 @@ class Dispatcher:
         if self.tapped is not None:
             self.tapped.over(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
-        # not a failure of the node: a bug in the reader says nothing about its health
+        # Not a failure of the node: the bug would be the same for a healthy one.
         transaction.node.counters.garbled += 1
         kind = WriteUnconfirmed if transaction.writes else BusError
         error = make_error(kind, what, transaction)
@@ -440,6 +450,7 @@ class Dispatcher:
         node.counters.refused += 1
         transaction.unsure = transaction.unsure or not certain
         again = refusal.confirm if certain else not transaction.writes or transaction.idempotent
+        # Not a probe: a refusal is a reply, which is all that a probe needs. Not for a caller that has gone (R6).
         if again and not transaction.refusals and not transaction.probe and self.is_wanted(transaction):
             transaction.refusals += 1
             self._requeue(transaction, now)
@@ -472,6 +483,7 @@ class Dispatcher:
 
     def share(self) -> SharedBacklog:
         """Return the backlog in which clients take turns. Converts the backlog on the first call."""
+        # On demand: a line that only its owner uses keeps the simple queues, which cost less per request.
         backlog = self.backlog
         if not isinstance(backlog, SharedBacklog):
             self.backlog = self.writes.backlog = backlog = SharedBacklog(backlog, self.writes, self._deadlines)
@@ -482,6 +494,7 @@ class Dispatcher:
         backlog = self.share()
         hold = hold or backlog.hold
         if hold is not None:
+            # Failed and not sent without the hold: other requests would come between the halves of the sequence.
             for transaction in backlog.end_hold(hold, now):
                 self._end(transaction, now, hold_ended(transaction, hold))
             self.writes.wake(hold.node, hold.client)
@@ -507,6 +520,7 @@ class Dispatcher:
             self.fail_more(now)
         if now >= deadlines.schedule:
             self.release_polls(now)
+        # The unread bytes may be the reply that the caller waits for.
         if now >= deadlines.expiry and not unread:
             self.expire(now)
         if now >= deadlines.hold:
@@ -534,6 +548,8 @@ class Dispatcher:
             if transaction.phase is ON_WIRE:
                 transaction.wanted = False
                 self.counters.cancelled += 1
+                # The caller is notified now, while the exchange keeps the line: the reply that may come must not reach
+                # the next request.
                 self.events.append(Overdue(transaction, too_late(transaction, now, held=self.is_held())))
                 continue
             if transaction.phase is QUEUED:
@@ -643,6 +659,7 @@ class Dispatcher:
             self.tapped.forget(transaction)
         if transaction.writes:
             unsure = transaction.unsure or (transaction.attempts > 0 and not isinstance(error, NOT_DONE))
+            # R7: a later NodeDown or Superseded does not mean that the first attempt was not carried out.
             if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
                 error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
             self.writes.over(transaction)

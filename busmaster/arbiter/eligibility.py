@@ -48,6 +48,7 @@ def eligibility(
     node = transaction.node
     if fault is not None:
         return Rejected(name_error(fault, transaction))
+    # `start_by` limits only the first attempt: a retry belongs to a request that was sent in time.
     if transaction.start_by < now and (  # a request queued now is in time: its caller read the clock earlier
         transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
     ):
@@ -57,6 +58,7 @@ def eligibility(
     if now < node.suspended_until:
         return Rejected(make_error(NodeDown, SUSPENDED, transaction))
     if transaction.poll is not None:
+        # Each request to a dead node costs its maximum reply delay. A poll is not worth that, once per period.
         if node.health is DOWN:
             return Rejected(make_error(NodeDown, PROBED, transaction))
         if node.holds:

@@ -159,6 +159,7 @@ class NodeRecord:
         # fast ones must not be forgotten.
         slowest = self.slowest
         self.slowest = took if took > slowest else slowest - SLOWEST_DECAY * (slowest - took)
+        # A node may refuse the protocol's sync reads. A command that it has answered once is certain to work.
         if answers not in self.answered and len(self.answered) < MOST_ANSWERED and not command.writes:
             self.answered[answers] = command
 
@@ -168,8 +169,7 @@ class NodeRecord:
         return self.unheard >= SILENT
 
     def latest(self, unknown: float) -> float:
-        """Return the time, in seconds, to the first byte of a reply that is no later than usual; `unknown` if none was
-        timed."""
+        """Return the longest usual time, in seconds, to the first byte of a reply; `unknown` if none was timed."""
         return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
 
     def note_refused(self, command: Command[Any]) -> None:
@@ -180,6 +180,7 @@ class NodeRecord:
         # A refusal is a reply too, so a node that refuses all of them is still a better choice than a silent one.
         if self._refused.issuperset(self.profile.sync_reads):
             self._refused.clear()
+        # A drive can stop supporting an item, for example after another program was loaded.
         self.answered = {key: read for key, read in self.answered.items() if read != command}
 
     def sync_reads(self) -> Iterator[Command[Any]]:
@@ -191,7 +192,8 @@ class NodeRecord:
 
     def raise_max_reply_delay(self, max_reply_delay: float, now: float) -> None:
         """Raise the node's maximum reply delay to at least `max_reply_delay` seconds."""
-        # The first timings are kept however often it is raised: an hour of prompt replies restores them.
+        # The timings from before the first raise are kept, however often it is raised: an hour of prompt replies
+        # restores them.
         if self._before_raised is None:
             self._before_raised = self.timings
         self.timings = self.timings.with_max_reply_delay(max_reply_delay)
@@ -230,6 +232,7 @@ class ProbeBudget:
         """
         before, probe = self._pause, self.probe
         pause = before + seconds
+        # Not in a pause that is shorter than a probe: 1000 pauses of 5 ms do not have room for one probe of 150 ms.
         if self.tokens < BUDGET_CAPACITY and pause > probe:
             # only the part that is longer than a probe and was not counted before
             earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
@@ -249,6 +252,7 @@ class ProbeBudget:
         # A probe that costs more than the capacity would otherwise never be sent.
         if self.tokens < min(cost + beside, BUDGET_CAPACITY):
             return False
+        # May become negative, for a probe that costs more than the capacity: the next one then waits longer.
         self.tokens -= cost
         return True
 
@@ -272,7 +276,7 @@ class ProbeBudget:
 
 
 def flaps(node: NodeRecord, now: float) -> bool:
-    """Return True if the node came back recently: its next change of health says nothing about other nodes."""
+    """Return True if the node came back recently: then its next change of health proves nothing about other nodes."""
     return now - node.up_since < STEADY
 
 
@@ -296,7 +300,7 @@ def note_success(node: NodeRecord, now: float) -> None:
 def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
     """Update the health after a transaction that failed without a valid reply. The caller reports the change.
 
-    A broadcast can fail because of its echo. That is no failure of a node, and there is none to probe.
+    A broadcast can fail because of its echo. That is not a failure of a node, and there is no node to probe.
     """
     if node.address == node.profile.broadcast:
         return  # its probe cannot be sent, and would be selected and paid for again and again
@@ -304,6 +308,7 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
     node.failures += 1
     node.failed_at = now
     node.replies = 0
+    # It has failed a probe, or a request of a caller that the budget has paid for.
     if node.health is DOWN:
         # Only a failed probe doubles the delay; requests of callers to a dead node do not postpone its probe.
         if now >= node.probe_at:

@@ -23,13 +23,14 @@ If each request that could prove something is overdue itself, an overdue reply i
 although its reply could be the overdue one. Its reply is held until the maximum reply delay has passed. If a second one
 arrives, neither is delivered.
 
-A master that stopped in the middle of a frame leaves a node waiting for the rest. That node takes the first bytes of
-the next frame, to any node, for the rest, and replies with a NAK (or an ACK) of its own, up to its maximum reply delay
-later. Until that time has passed after the first frame on a new line, no NAK is trusted and each ACK is held.
+A master that stopped in the middle of a frame leaves a node waiting for the rest. The next frame may be for any node,
+but that node interprets its first bytes as the rest. It replies with a NAK (or an ACK) of its own, up to its maximum
+reply delay later. Until that time has passed after the first frame on a new line, no NAK is trusted and each ACK is
+held.
 
 A reply that is not overdue but looks like the reply to one of the last exchanges is a duplicate. After a duplicate,
-replies like recent ones are ambiguous for a while, and requests whose replies could be confused are not sent one after
-the other if there is a choice.
+replies like recent ones are ambiguous for a while. If there is a choice, requests whose replies could be confused are
+then not sent one after the other.
 """
 
 from __future__ import annotations
@@ -135,7 +136,7 @@ class InSync:
         self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
         self._ambiguous_until = inf if strict else -inf
 
-    # what is overdue
+    # overdue replies
 
     def add_overdue(
         self,
@@ -148,6 +149,7 @@ class InSync:
         """Add an overdue reply for each key; see `OverdueReply`."""
         self.overdue_replies += [OverdueReply(key, node, asked, over, inf, awaited) for key in keys]
         # Bounded: a line without any reply for ten seconds must not use more and more memory (R12).
+        # The oldest are dropped: they lapse first.
         del self.overdue_replies[:-MOST_OVERDUE]
         self.alert = True
 
@@ -158,11 +160,13 @@ class InSync:
         self.overdue_replies = [overdue for overdue in self.overdue_replies if now - overdue.asked <= LAPSE]
         self._ambiguous = [entry for entry in self._ambiguous if entry[1] > now]
         self._forgiven = [entry for entry in self._forgiven if entry[1] > now]
+        # Only here is `alert` cleared: it is set wherever something becomes uncertain, and tested for every reply.
         unsure = self.overdue_replies or self._ambiguous or self._forgiven
         self.alert = bool(unsure or self._ambiguous_until > now or self.lone_bytes_until > now)
 
     def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
         """Return True if a reply with one of these keys, from this node if given, could be an overdue one."""
+        # Not limited to the nodes' own replies: without an address in it, any node's reply could be any other node's.
         return any(overdue.of(node, now) and _could_be(overdue, answers) for overdue in self.overdue_replies)
 
     def over(self, answers: Sequence[bytes]) -> float:
@@ -219,6 +223,8 @@ class InSync:
     def forgive(self, answers: Sequence[bytes]) -> None:
         """Forgive overdue replies with these keys: no request with a distinct reply is available, so R3 and holding
         must do."""
+        # They stay ambiguous until they lapse: forgiven means that a request may be sent, not that its reply is
+        # trusted.
         self._forgiven += [
             (overdue.key, overdue.asked + LAPSE) for overdue in self.overdue_replies if _could_be(overdue, answers)
         ]
@@ -229,11 +235,13 @@ class InSync:
 
         `patience`: assumed reply time, in seconds, of a node whose replies were never timed.
         """
+        # A node answers in order: a reply to an earlier request cannot come after this one.
         self.overdue_replies = [overdue for overdue in self.overdue_replies if not overdue.is_of(node)]
         for overdue in self.overdue_replies:
             # Only a request sent after the maximum reply delay proves something. Before that, both replies can be on
             # the way.
             if overdue.over <= asked and overdue.until == inf and _is_silent(overdue):
+                # Delayed replies arrive together, and that of the slower node arrives last.
                 overdue.until = now + (0.0 if overdue.node is None else overdue.node.latest(patience))
                 self._ambiguous.append(
                     (
@@ -268,18 +276,22 @@ class InSync:
                 self._pay(overdue)
                 rest = rest[:place] + rest[place + len(overdue.key) :]
         # All bytes are accounted for: no duplicate is suspected.
+        # Without bytes left over, the run is explained by overdue replies.
         if payers and not rest:
             return payers[0]
         if not payers and any(until > now and _is(run, key) for key, until in (*self._ambiguous, *self._forgiven)):
+            # It has arrived after all, so replies like it are not ambiguous any more.
             self._ambiguous = [entry for entry in self._ambiguous if not _is(run, entry[0])]
             self._forgiven = [entry for entry in self._forgiven if not _is(run, entry[0])]
             return None
         # Built here and not stored: unexpected bytes are rare, exchanges are not.
         recent = {key for answers in self.recent for key in answers}
+        # Not for keys of one byte: an ACK may be any byte of noise.
         contained = any(len(key) > 1 and key in rest for key in recent)
         alike = any(_is(rest, key) for key in recent)
         if contained or (alike and not payers):
             self.said_twice(now)
+        # The rest is part of an unknown reply, whose last byte may still arrive and look like an ACK.
         if payers or not alike:
             self.add_overdue((ANY_BYTE,), None, now, now)
         return payers[0] if payers else None
@@ -288,8 +300,8 @@ class InSync:
         """Variant of `heard` for when the line has continued before a reply was over.
 
         Two replies may have collided, and the remains can begin with any byte. So only a whole reply clears an entry,
-        and only if no other node has an overdue reply: that one could be the answer to another request. Returns the
-        apparent sender's entry.
+        and only if no other node has an overdue reply: the bytes could be that one. Returns the apparent sender's
+        entry.
         """
         first = None
         while found := next(
@@ -304,6 +316,7 @@ class InSync:
             if all((other.node, other.asked) == request for other in self.overdue_replies if other.awaited is not None):
                 # also removes the ANY_BYTE entry of the same request, which stood for a part of this reply
                 self.overdue_replies = [other for other in self.overdue_replies if (other.node, other.asked) != request]
+        # The remains of a collision: their last bytes may still be in the adapter.
         if run:
             self.add_overdue((ANY_BYTE,), None, now, now)
         return first
@@ -335,15 +348,17 @@ class InSync:
             if overdue.key == paid.key and overdue.node is not paid.node:
                 overdue.node = None
 
-    # how far an answer can be trusted
+    # ambiguous replies
 
     def said_twice(self, now: float) -> None:
         """Record a duplicate reply: for AMBIGUITY_PERIOD, replies like recent ones are ambiguous."""
+        # `max`: in a strict bus it is infinite.
         self._ambiguous_until = max(self._ambiguous_until, now + AMBIGUITY_PERIOD)
         self.alert = True
 
     def said(self, answers: Sequence[bytes], now: float) -> None:
         """Remember a delivered reply, to recognise a duplicate of it."""
+        # Remembered only after a first duplicate: a healthy line must not pay for this with each reply.
         if now < self._ambiguous_until:
             self._said.append((answers, now))
 
@@ -354,6 +369,7 @@ class InSync:
     def is_to_be_held(self, answers: Sequence[bytes], now: float) -> bool:
         """Return True if a reply like this may be a forgiven one, or the reply to an earlier master's unfinished
         frame."""
+        # An ACK, or another reply of one byte, which the unfinished frame of an earlier master can cause (R15).
         lone = any(len(key) == 1 for key in answers)
         if lone and now < self.lone_bytes_until:
             return True

@@ -18,8 +18,8 @@ attempt of a read has twice that window. The silence after which a reply is over
 replies, and at least 17 bytes. (A smoothed mean and deviation, as in TCP, follows the usual reply too closely: of
 76,000 replies it missed 1236, the maximum none.)
 
-A node that replied after three quarters of a learned window (if that is shorter than the documented one), or after the
-window, has the documented times again for 20 replies. That is enough to distinguish a node that has become slower from
+The documented times apply again for 20 replies if a node replied after three quarters of a learned window that is
+shorter than the documented one, or after that window. That is enough to distinguish a node that has become slower from
 one late reply. A node that was away has them for 200 replies, because it may be another device.
 
 Times are only added, subtracted, compared and multiplied by constants here.
@@ -92,6 +92,8 @@ class _Largest:
 
     def turn(self) -> None:
         """Begin the next epoch."""
+        # The maximum of an epoch counts for one more epoch, so an unusually late reply is forgotten after 1000 replies
+        # at most.
         self.before, self.now = self.now, 0.0
 
 
@@ -165,6 +167,8 @@ class Kind:
 
     def timings(self, document: Timings, hurry: int) -> Timings:
         """Return the times to open an exchange with. `hurry`: AT_FIRST, AGAIN, AT_LAST or NEVER."""
+        # Cached: it is called for every attempt, and the times change with few replies. `document` changes if the
+        # maximum reply delay was raised.
         if self._given is None or document is not self._document:
             self._document = document
             own = replace(
@@ -177,6 +181,7 @@ class Kind:
     def note(self, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
         """Record the reply to one of its steps."""
         step = self.packet if packet else self.first
+        # The byte time of the line becomes known here with the first reply.
         if step.note(begun, heard, pause) or byte_time != self._byte_time:
             self._byte_time = byte_time
             self._given = None
@@ -184,6 +189,7 @@ class Kind:
     def doubt(self, replies: int) -> None:
         """Use the documented times for at least this many replies."""
         for step in (self.first, self.packet):
+            # Never fewer: a late reply during the first 200 must not shorten them to 20.
             step.doubts = max(step.doubts, replies)
         self._given = None
 
@@ -248,12 +254,14 @@ class Learning:
 
     def to_keep(self, document: Timings) -> tuple[LearnedTimes, ...]:
         """Return the times to store for the next run: the trusted ones, and initial ones that were not replaced."""
+        # Untrusted times of this run do not replace trusted ones of the last run.
         trusted = {(times.kind, times.packet): times for times in self.times(document) if times.trusted}
         return tuple({**self._known, **trusted}.values())
 
     def _doubt(self, replies: int) -> None:
         self.returns += 1
         for kind in self.kinds.values():
+            # All kinds: a drive that has become slower is slower for each of them.
             kind.doubt(replies)
 
     def _begin(self, name: str) -> Kind:

@@ -1,10 +1,10 @@
 """The exchange on the wire: its steps, reader, output and echo, and the replies it leaves overdue.
 
-Calculates the times of one step of an exchange (R2 to R4): until when its reply may begin, how long it may last, and
-when no byte of it can arrive any more. The states of the line are in arbiter.py.
+Calculates the times of one step of an exchange (R2 to R4). They are the latest begin of its reply, the longest reply,
+and the time after which no byte of it can arrive. The states of the line are in arbiter.py.
 
-All calculations of R3 are here. A node must meet two conditions: the *start bit* of its reply falls within
-`max_reply_delay` of the last byte sent, and a pause within the reply ends, with the next start bit, within
+All calculations of R3 are here. A node must meet two conditions. The *start bit* of its reply falls within
+`max_reply_delay` of the last byte sent. A pause within the reply ends, with the next start bit, within
 `inter_byte_timeout`. Bytes are received later than they start:
 
 ===============================  ===============================================================================
@@ -67,7 +67,7 @@ class Echo:
         pending = self.pending
         length = min(len(pending), len(data))
         if data[:length] != pending[:length]:
-            # After a mismatch nothing can be distinguished from echo: the other sender changed, removed or added bytes.
+            # After a mismatch nothing can be separated from the echo: the other sender changed, removed or added bytes.
             # A search for the rest of the echo might find it in another node's reply.
             self.forget()
             return None
@@ -141,6 +141,7 @@ class Step:
 
     def say(self, count: int, now: float) -> None:
         """Add the wire time of `count` bytes, sent behind all earlier ones."""
+        # Behind all earlier bytes: MSC's closing ACK and the next request are written in one call.
         self.out = max(self.out, now) + count * self.byte_time
 
     def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
@@ -165,6 +166,7 @@ class Step:
         latest = self.end + timing.window + latency
         if self.begun_at > latest:  # a reply that began after its window has its length counted from its first byte
             latest = self.begun_at
+        # R2: without this limit, a node that sends one byte per 20 ms would hold the line for ever.
         limit = latest + self.longest * byte_time + timing.inter_byte_timeout
         return due if due < limit else limit
 
@@ -176,6 +178,7 @@ class Step:
 
     def echoed(self, now: float) -> float:
         """Restart the step's times at the end of its echo. Returns when the reply must begin."""
+        # The echo shows when the request was really on the wire, which is more exact than the calculation.
         self.shift(now - self.end)
         return now + self.timing.window + self.latency
 
@@ -237,6 +240,7 @@ class Step:
         """
         past = self.last_begin()
         if self.longest:
+            # R1: the driver of the node holds the line even if its reply was lost on the way.
             past += self.timing.driver_release_time
         return past if self._follows is None else max(past, self._follows_until)
 
@@ -267,6 +271,7 @@ class Output:
 
     def add(self, data: bytes, now: float) -> None:
         """Append bytes to the output."""
+        # A closing ACK alone starts no request; in front of one it does not hide it.
         self.begins = self.begins and bool(self.waiting)
         self.waiting += data
         self.said_at = now
@@ -288,6 +293,8 @@ class Output:
         if not self.held:
             return None
         self.held = False
+        # R2: the windows of this request count from now. It was held back for an unknown part of the time since the
+        # write.
         self._step.shift(max(0.0, now - self._step.out))
         return inf
 

@@ -36,6 +36,7 @@ class Probes:
         # A probe of a dead node is expected to fail. A failed attempt costs the maximum reply delay and not the window.
         self.budget.probe = max((node.max_reply_delay for node in down), default=0.0)
         due = min(map(_due, down), default=inf)
+        # Also if nothing is due: whether the line is idle then is checked when the deadline expires.
         free = min((max(self._free_at, node.suspended_until) for node in down), default=inf)
         self._deadlines.health = min(due, free)
 
@@ -91,6 +92,7 @@ class Probes:
 
     def _probe(self, node: NodeRecord, cost: float, now: float) -> Transaction:
         probe = Transaction(node, node.profile.probe, priority=BACKGROUND, retries=0, probe=True)
+        # Refunded, less the time it took, if the node replies.
         probe.probe_cost = cost
         probe.queued = now
         node.counters.probes += 1
@@ -138,10 +140,10 @@ class NodeWatch:
         flaps = health.flaps(node, now)
         health.note_success(node, now)
         new, node.budgeted = node.budgeted, False
-        # A reply of a new node says nothing about the others. Otherwise a client that keeps naming one would have the
+        # A reply of a new node proves nothing about the others. Otherwise a client that keeps naming one would have the
         # budget filled faster forever.
         if before is DOWN and not (flaps or new):
-            # The others may be back too. A flapping node says nothing about them.
+            # The others may be back too. A flapping node proves nothing about them.
             self._probes.budget.node_returned(now)
             for other in self._nodes:
                 if other.health is DOWN:
@@ -168,6 +170,7 @@ class NodeWatch:
     def _report(self, node: NodeRecord, before: Health) -> None:
         if node.health is not before:
             returning = before is DOWN and node.has_hook
+            # The polls wait for the hook: it may write the parameters that the polled values depend on.
             node.holds += returning
             self._events.append(NodeChanged(node, before, node.health, returning))
         self._probes.plan()

@@ -56,6 +56,7 @@ def quietest_offset(
     """
     # Stretched over the available time: cycles that just fit one behind the other would overlap as soon as one of them
     # takes longer than calculated.
+    # A cycle longer than its period occupies all of it. More would count the same time twice.
     own = min(poll.cost * stretch, poll.period)
     pairs: list[Pair] = []
     divisors: dict[float, float] = {}
@@ -66,6 +67,7 @@ def quietest_offset(
         if step is None:
             step = divisors[other.period] = common_divisor(poll.period, other.period)
         length = min(other.cost * stretch, other.period)
+        # Otherwise the overlap is nearly the same at each phase: the pair would only cost time here.
         if own + length < MEETINGS * step:
             pairs.append(((other.base - now) % step, length, step, step / other.period))
             before += (own + length) / step + 1
@@ -75,6 +77,7 @@ def quietest_offset(
             yield STRIDE
     if not pairs:
         return 0.0
+    # Four kinks per meeting. At least up to the nearest divisor, within which every overlap with one poll occurs once.
     reach = min(poll.period, max((KINKS / 4 - before) / frequency, nearest))
     return (yield from _least(pairs, own, reach, 1 + int(4 * reach * frequency / STRIDE)))
 
@@ -99,6 +102,7 @@ def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Gene
     best, least = 0.0, overlap
     for piece in bends:
         for x in sorted(piece):
+            # The sums of thousands of floats are not exact: a residue of 1e-12 s is not an overlap.
             if least <= ROUNDING:
                 return best  # no overlap here, and the earliest minimum is used
             overlap += slope * (x - at)
@@ -186,6 +190,7 @@ class Schedule:
         """
         if poll.active or poll.cycles:
             raise InvalidCommand(f"poll group {poll.name!r} is or was running: make a new one")
+        # The first poll sets the origin of all phases, so that a phase in LINE.toml means the same after a restart.
         self._epoch = min(self._epoch, now)
         poll.active = True
         self.polls[poll] = None
@@ -230,6 +235,7 @@ class Schedule:
     def next_due(self) -> float:
         """Return when the next cycle, preparation or remaining work is due; inf if nothing is."""
         heap = self._heap
+        # Removed polls are skipped here: removing them from the middle of the heap would cost a search.
         while heap and not heap[0][2].active:
             heapq.heappop(heap)
         return min(heap[0][0] if heap else inf, self._work_at, self._left_over_at)
@@ -240,6 +246,7 @@ class Schedule:
         while self._demanded:
             poll = self._demanded.popleft()
             # Cycles that are due now have not started yet, and at most one cycle of a poll is running (R10).
+            # A demand while a cycle runs uses that cycle: a second one beside it would make both late.
             if poll.active and not poll.running and poll not in due:
                 poll.due = now
                 due.append(poll)
@@ -247,6 +254,7 @@ class Schedule:
         begun: list[Transaction] = []
         while self._cycles and len(begun) < AT_ONCE:
             poll, cycle = self._cycles[0]
+            # A group of a thousand points is queued in pieces of 32, between which the line continues.
             fresh = list(islice(cycle, AT_ONCE - len(begun))) if poll.active else []
             begun += fresh
             if not fresh:
@@ -280,6 +288,7 @@ class Schedule:
             behind = max(behind, 0) + 1  # The quotient was rounded down although the next cycle is due exactly now.
         if behind > 0:
             poll.number += behind
+            # After a stopped process, hundreds of periods can have passed: they are counted, not caught up.
             poll.missed += 0 if poll.paused else behind
         due = poll.next_due()
         poll.number += 1
@@ -367,6 +376,7 @@ class Schedule:
     def _start(self, poll: Poll, base: float, now: float) -> None:
         """Start the poll's grid with its first due time from now on."""
         poll.placed = True
+        # Never in the past: the poll would start with missed cycles.
         poll.base = base + ceil((now - base) / poll.period) * poll.period
         poll.number = 0
         heapq.heappush(self._heap, (poll.base, next(self._order), poll))

@@ -90,6 +90,8 @@ class Turns:
     def give_back(self, transaction: Transaction) -> None:
         """Put back the transaction that was popped last. It is popped next."""
         self.push_front(transaction)
+        # R15 held it back only for another request to prove something. Without this, its client would lose its turn
+        # each time.
         self._next = self._of(turn_of(transaction.client))
 
     def keep_turn(self, client: LineClient) -> None:
@@ -118,6 +120,7 @@ class Turns:
 
     def pop_entitled(self, now: float, *, urgent: bool = False) -> Transaction | None:
         """Remove and return the first transaction of a client that has not used its part of the line, or None."""
+        # The owner is always entitled: its `owner_time` is 0.
         entitled = [turn for turn in self._waiting() if turn.client.is_entitled(now, urgent)]
         if not entitled:
             return None
@@ -224,6 +227,7 @@ class Turns:
         """Charge line time to a client."""
         turn = self._turns.get(client)
         if turn is not None:
+            # Line time and not the number of exchanges: a block of MSC takes far longer than a short read.
             turn.had += seconds / client.share
 
     def forget(self, client: LineClient) -> None:
@@ -271,6 +275,7 @@ class Turns:
         return turn
 
     def _chosen(self) -> _Turn:
+        # URGENT only: the safe state must not wait for the stops of 64 programs.
         if self._owner_first and self._own.live:
             return self._turns[OWN]
         given_back, self._next = self._next, None
@@ -278,9 +283,12 @@ class Turns:
             return given_back
         waiting = self._waiting()
         first = min(waiting, key=_had)
+        # The value with which a client starts that begins to wait now.
         self._had = first.had
         if len(waiting) > 1:
             most = PASSED_BY_EACH * (len(waiting) - 1)
+            # R9's bound: without it, a client that has used much would wait until all others had used as much, for any
+            # time.
             first = next((turn for turn in waiting if turn.passed * turn.client.share >= most), first)
             for turn in waiting:
                 turn.passed += 1
@@ -396,7 +404,7 @@ class SharedBacklog(Backlog):
         """Return the number of queued transactions of this class and client."""
         return self._turns[priority].waiting_of(turn_of(client))
 
-    # what goes next
+    # the next request
 
     def pop(self, now: float) -> Transaction | None:
         """Remove and return the next transaction at the time `now`, or None. While a sequence holds the line, only its
@@ -409,6 +417,7 @@ class SharedBacklog(Backlog):
         transaction = super().pop(now) if self.hold is None else self._pop_within(self.hold, now)
         if self._members and transaction is not None and self.hold is None:
             transaction = self._entitled(transaction, now)
+        # Otherwise the write would wait until the sequence ends, although its program requested it before (R7).
         while transaction is not None and (write := self._write_before(transaction)) is not None:
             self.restore(transaction)
             self.promote(write, transaction.priority)
@@ -483,6 +492,7 @@ class SharedBacklog(Backlog):
         self._begins = isinstance(asks, Hold) and self._may_begin(asks)
         self._owner_waited = self._owner_waits()
         if self._pause and self.hold is None and transaction is None and any(turns.aside for turns in self._turns):
+            # On an idle line no exchange ends, so the end of the pause needs a deadline of its own.
             self._deadlines.sequence = min(now + self._pause, self._pause_ends)
         return transaction
 
@@ -493,6 +503,7 @@ class SharedBacklog(Backlog):
         urgent = self._turns[URGENT]
         if priority is not URGENT:
             urgent.begin_runs()
+        # The owner's urgent requests have no limit: they are its safe state and its stops.
         elif client is not OWN:
             urgent.count_run(client)
 
@@ -534,6 +545,7 @@ class SharedBacklog(Backlog):
         if self._payer is not None:
             turns, client = self._payer
             turns.charge(client, now - self._since)
+            # A client without it takes turns with the owner as an equal: nothing more is counted.
             if client.owner_time:
                 self._use(client, now)
                 if turns is self._turns[URGENT] and not (self.hold is not None and self.hold.client is client):
@@ -545,7 +557,7 @@ class SharedBacklog(Backlog):
         self._since = now
 
     def _count_pause(self, now: float) -> None:
-        """Count the line time that the owner gets before the next sequence, and end the pause when it has had it."""
+        """Count the line time that the owner gets before the next sequence, and end the pause after that time."""
         time, hold = now - self._since, self.hold
         payer = None if self._payer is None else self._payer[1]
         if payer is not None and payer.role is self._held_by and (self._owner_waited or self._owner_waits()):
@@ -554,7 +566,7 @@ class SharedBacklog(Backlog):
             return
         if hold is not None:
             return
-        # The owner has nothing to send, or its request was on the wire. Counted in time and not in exchanges: polls may
+        # The owner's queue was empty, or its request was on the wire. Counted in time and not in exchanges: polls may
         # be short and sequences long.
         self._pause -= time
         if self._pause <= LEAST_PAUSE or now >= self._pause_ends:
@@ -586,6 +598,7 @@ class SharedBacklog(Backlog):
         held = (now - hold.began) * cost if hold is not None and hold.client is client else 0.0
         members = self._members.get(client.owner_time, 1)
         self._charge(client.role, used, held, now)
+        # With n users of a role, each may use a part of 1/n.
         self._charge(client.account, used * members, held * members, now)
 
     def _charge(self, account: Account, used: float, held: float, now: float) -> None:
@@ -597,7 +610,7 @@ class SharedBacklog(Backlog):
         account.used_until = max(account.used_until, until)
 
     def _delay_urgent(self, client: LineClient, now: float) -> None:
-        """Give the owner its time behind an urgent exchange, minus what it had in excess before."""
+        """Give the owner its time behind an urgent exchange, minus its excess from before."""
         # Bounded: a stop of a client that has used its part waits no longer than this, whatever others have used.
         time = client.owner_time * (now - self._since)
         self._before_urgent = min(self._before_urgent + time, MOST_BEFORE_URGENT * time)
@@ -619,6 +632,8 @@ class SharedBacklog(Backlog):
             self._turns[transaction.priority].push(transaction)
         self.hold = hold
         if hold.client.owner_time:
+            # By role and not by client: a user with several programs could otherwise hold the line with one after the
+            # other.
             self._held_by, hold.began = hold.client.role, self._since
         self._admit_sequences()
         self._deadlines.hold = self._since + hold.longest
@@ -640,6 +655,7 @@ class SharedBacklog(Backlog):
             self.hold = None
             self._deadlines.hold = inf
             if hold.priority <= COMMAND:
+                # The next slot goes to a lower class: consecutive sequences would otherwise starve the polls.
                 self._streak = SHARE
             if hold.priority == URGENT and hold.client is not OWN:
                 self._turns[URGENT].count_run(hold.client, URGENT_RUN)
@@ -677,6 +693,7 @@ class SharedBacklog(Backlog):
         key = _account_of(client)
         account = self._accounts.get(key)
         if account is None:
+            # A user that reconnects has its used line time again (see `_left_accounts`).
             account = self._accounts[key] = self._left_accounts.pop(key, client.account)
             self._members[owner_time] = self._members.get(owner_time, 0) + 1
         account.clients += 1

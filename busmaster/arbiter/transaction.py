@@ -174,11 +174,13 @@ class Transaction:
         self.tag = tag
         self.poll = poll
         self.stop = stop
+        # Set here and not in `reset`: only a poll's transactions run more than once, and they are never stops.
         self.stops_alike: tuple[Transaction, ...] = ()
         self.client = client
         self.probe = probe
         self.check = False
         self.touches = touches
+        # Not part of `reset`: a poll must remember over its cycles that a point is refused.
         self.refused_until = -inf
         self.refused_cycles = 0
         self.reset()
@@ -210,6 +212,8 @@ class Transaction:
         elif self.writes and node.profile.acks_are_commands:
             hurry = NEVER  # a late ACK would make the addressed drive send its next value
         elif self.check or (self.retried < self.retries and not self.writes and self.retried < 2):
+            # Twice the learned window for the second attempt: the first may have failed because the node has become
+            # slower.
             hurry = AGAIN if self.retried else AT_FIRST
         return node.learning.timings(self.command, node.timings, hurry)
 
@@ -272,11 +276,13 @@ class Poll:
             raise InvalidCommand(f"poll group {name!r}: a phase is at least 0 s and below the period, not {phase!r}")
         self.name = name
         self.period = period
+        # A group that is read once an hour must not wait for an hour behind groups with shorter periods.
         self.patience = min(period, LONGEST_PATIENCE)
         self.phase = phase
         self.cost = cost
         self.priority = POLL
         self.results: Sequence[Transaction] = ()
+        # The members of the next cycle, if they differ: a running cycle keeps its own.
         self.fresh: Sequence[Transaction] | None = None
         self.preparation: Iterator[int] | None = None
         self.group: Any = None
@@ -331,6 +337,7 @@ def too_late(transaction: Transaction, now: float, *, held: bool = False) -> Bus
     if not transaction.attempts:
         what = f"not sent within its time: it waited {waited:.0f} ms for the line"
         return make_error(NotStarted, what, transaction, HELD if held else None)
+    # After the request was sent, NotStarted would be wrong: the drive may have acted on it.
     kind = WriteUnconfirmed if transaction.writes else NoReply
     what = "the port did not send it within its time" if held else "sent, but not answered within its time"
     error = make_error(kind, f"{what}: {waited:.0f} ms", transaction)

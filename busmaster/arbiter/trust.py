@@ -43,7 +43,9 @@ class Trust:
         assert transaction is not None
         assert exchange is not None
         in_sync, answers = self._in_sync, exchange.answers
+        # Called again when the time of a held reply is over: it is then delivered, unless another check fails by now.
         held, self.held = self.held is not None, None
+        # Bytes behind a reply that begin like a reply: a duplicate, or an overdue reply in front of the right one.
         if any(progress.rest.startswith(key) for key in answers):
             return TWO_ANSWERS
         if in_sync.clashes(answers, now, transaction.node):
@@ -52,6 +54,7 @@ class Trust:
         to_be_held = in_sync.is_to_be_held(answers, now)
         if not held and (to_be_held or in_sync.is_ambiguous(answers, now)):
             latest = step.end + transaction.node.latest(step.timing.window) + step.latency
+            # Later than this node ever is, so it is more likely the reply of another node.
             if progress.rest or step.begun_at > latest:
                 return "ambiguous reply: it may be a late or duplicate reply to another request"
             if to_be_held:  # its own reply may take as long as documented, not only as long as usual
@@ -60,9 +63,12 @@ class Trust:
                 if progress.send:  # at once: MSC repeats its packet until it is acknowledged
                     wire.say(progress.send, now)
                 self.held = Done(progress.value)
+                # Two byte times: the first byte of a second reply must be received, not only begun.
                 return max(now, latest) + 2 * step.byte_time
         if to_be_held:
             in_sync.stood_alone(answers)
+        # `started` is earlier than the end of the request: the safe side, because only a request sent after the maximum
+        # reply delay of an overdue reply proves something about it.
         in_sync.answered(transaction.node, transaction.started, now, step.timing.late_after)
         in_sync.said(answers, now)
         return None
@@ -86,11 +92,13 @@ class Trust:
             silence = max(QUIET, transaction.node.timings.read.inter_byte_timeout) + step.latency + step.byte_time
             # with one pause
             awaited = Awaited(transaction.command, step.timing.window, silence, step.wire_time() + silence)
-        # The ACK before the packet (MSC) may have been an overdue one. This request's own ACK is then still to come.
+        # The ACK before the packet (MSC) may have been an overdue one. This request's own ACK is then still to come,
+        # and would confirm the next write (docs/proof.md, 21).
         ack_in_doubt = exchange.later and self._in_sync.lone_byte_is_overdue()
         if heard or (awaited is not None and keys) or ack_in_doubt:
             keys += (ANY_BYTE,)
         if exchange.answered:
+            # Bytes from a node, even damaged ones, show that it is alive and worth a sync read.
             transaction.node.unheard += not heard
             self._in_sync.add_overdue(keys, transaction.node, step.end, over, awaited)
 
@@ -111,6 +119,8 @@ class Trust:
         if paid is None or node is None or len(paid.key) < 2:
             return node  # a single byte may be noise, so it raises no maximum reply delay
         if node.learning is None or paid.awaited is None:
+            # All nodes with this key: it is not known which of them has sent it. The delay is raised only if the last
+            # unanswered request was to one of them.
             unexpected.blame_overdue_reply([one for one, key in overdue if key == paid.key])
         else:
             node.unheard = 0  # the node is alive: a sync read can clear its other overdue replies

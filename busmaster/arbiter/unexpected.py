@@ -52,10 +52,12 @@ class UnexpectedBytes:
     def note(self, data: bytes, now: float, quiet: float) -> None:
         """Count these bytes. `quiet`: silence, in seconds, that ends a run of noise."""
         self._counters.unexpected_bytes += len(data)
+        # R12: a node that transmits without a pause would fill the memory.
         if len(self.run) < LONGEST_RUN:
             self.run += data
         self._events.append(CameUnexpected(data))
         if now - self.last_byte > quiet or self._noise_since == inf:
+            # A silence in between starts the count again, so a line with a burst per second is not noisy.
             self._noise_since = now
         self.last_byte = now
         self.came(now)
@@ -84,6 +86,7 @@ class UnexpectedBytes:
         """Discard all state after the port was lost: the next port does not continue its data."""
         self.answered()
         self.silent()
+        # The result is dropped: there is no port to send it to.
         self.reply_to_silence()  # half a packet, which cannot be acknowledged any more
 
     def answered(self) -> None:
@@ -101,6 +104,8 @@ class UnexpectedBytes:
         if self.unanswered_one is not None and now - self.unanswered_one[1] > LATE_REPLY_MEMORY:
             self.unanswered_one = None
         if self.unanswered_one is not None:
+            # A late reply lies unread until the next read. Ten reads per maximum reply delay measure its age to within
+            # a tenth.
             due = min(due, now + self.unanswered_one[2] / LOOKS)
             self.looked(now, due)
         return due
@@ -110,6 +115,7 @@ class UnexpectedBytes:
         slower."""
         self.unanswered(node, asked, timing.max_reply_delay)
         age = self.blame(first_byte)
+        # R14: a node that is always late is reported once, not with every reply.
         if age > timing.window and age > TOLD_AGAIN * node.told_late:
             node.told_late = age
             self._events.append(RepliesLate(node, age, timing.window))
@@ -139,6 +145,7 @@ class UnexpectedBytes:
         self.unanswered_one = None
         stalled = first_byte > self._look_at + LOOK_SLACK  # the bytes may have lain unread for as long
         age = (self._looked if stalled else first_byte) - asked
+        # Bounded: each failed attempt costs this time, so one delayed reply must not make a line unusable.
         raised = min(LATE_REPLY_MARGIN * age, LONGEST_MAX_REPLY_DELAY)
         # Raised before the maximum reply delay is exceeded: beyond it, a reply could be taken for another node's. Bytes
         # later than LATE_REPLY_MEMORY are noise, or an overdue reply (R15).
@@ -176,6 +183,8 @@ class UnexpectedBytes:
 
     def reply_to_silence(self) -> bytes:
         """Return the bytes to send in reply to a packet that was cut off or arrived in noise, if any."""
+        # After noise a packet may have been missed. Its unit would send it again into the next exchange, where it could
+        # make a value (docs/proof.md, 13).
         if self.listener is None or not self._listening:
             return b""
         self._listening = False
