@@ -2,9 +2,8 @@
 
 An event loop rounds its timers up to the next millisecond, the unit of its system call. For a reply window of 50 ms
 that is negligible. For the pause of 1.75 ms before each Modbus request it is up to a third more, each time. So a near
-deadline uses a kernel timer (timerfd) that the loop reads like a port. If there is none (another system, a loop that
-cannot read descriptors, a loop with a virtual clock), the loop's timer is used for all deadlines, and this is logged
-once.
+deadline uses a kernel timer (timerfd) that the loop reads like a port. Without one, the loop's timer is used for all
+deadlines, and this is logged once: on another system, on a loop that cannot read descriptors, or with a virtual clock.
 """
 
 from __future__ import annotations
@@ -67,6 +66,7 @@ class Alarm:
         """Cancel the deadline and close the descriptor."""
         self.cancel()
         if self._precise is not None:
+            # First: the loop must not watch the number of a closed descriptor, which the next file gets.
             self._loop.remove_reader(self._precise.descriptor)
             self._precise.close()
             self._precise = None
@@ -76,6 +76,7 @@ class Alarm:
         self._ring()
 
     def _on_expiry(self) -> None:
+        # Read even if the deadline was cancelled: an unread descriptor would wake the loop again and again.
         if self._precise is not None and self._precise.has_expired() and self._is_set:
             self._is_set = False
             self._ring()
@@ -86,7 +87,9 @@ class KernelTimer:
 
     def __init__(self) -> None:
         self.descriptor = call_system("timerfd_create", CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC)
+        # Allocated once, because `set` runs for every request.
         self._when = ItimerSpec()
+        # Without `use_errno`, which costs a copy of errno for each call: with these arguments the call cannot fail.
         self._settime = ctypes.CDLL(None).timerfd_settime
         self._settime.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.POINTER(ItimerSpec), ctypes.c_void_p)
         self._pointer = ctypes.pointer(self._when)
@@ -105,6 +108,7 @@ class KernelTimer:
     def has_expired(self) -> bool:
         """Return True if it has expired since it was last set."""
         try:
+            # It was set again after the loop had found it readable: then the read would block.
             return len(os.read(self.descriptor, EXPIRATIONS)) == EXPIRATIONS
         except BlockingIOError:
             return False
@@ -145,6 +149,7 @@ def kernel_timer(loop: asyncio.AbstractEventLoop, on_expiry: Callable[[], None])
         tell_once(str(error))
         return None
     try:
+        # A loop that is not built on descriptors, for example one made for tests.
         loop.add_reader(timer.descriptor, on_expiry)
     except NotImplementedError:
         timer.close()

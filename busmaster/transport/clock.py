@@ -17,4 +17,5 @@ def is_virtual(loop: asyncio.AbstractEventLoop) -> bool:
 
 def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
     """Return the loop's own clock if it is virtual, else the machine's, which is finer than that of some loops."""
+    # uvloop's clock stands still during a turn of the loop and counts whole milliseconds.
     return loop.time if is_virtual(loop) else time.monotonic

@@ -75,6 +75,7 @@ class Endpoint(Protocol):
 def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
     """Return True if bytes leave `transport` at the baud rate, so that bytes that arrive too early cannot be a reply
     (R4)."""
+    # None: a serial port can be a pty, which is known only when it is open.
     return bool(transport.get_extra_info("paced", False) if endpoint.paced is None else endpoint.paced)
 
 
@@ -86,6 +87,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
     """
     if not isinstance(url, str):
         raise InvalidCommand(f"a port must be text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
+    # The two kinds of address are confused easily: both are given to `busmaster` in the same place.
     if is_served(url):
         raise InvalidCommand(
             f"{url} is the address of a running line, for read, write, poll and scan. A port is needed here; "
@@ -116,6 +118,7 @@ def is_served(address: str) -> bool:
 def _with_line(name: str, options: dict[str, Any], defaults: LineSettings | None) -> dict[str, Any]:
     """Return the options, and the defaults for line settings that they leave open. Raises InvalidCommand."""
     if defaults is not None:
+        # The protocol's document has these defaults; only the user knows which of several baud rates a line uses.
         options = asdict(defaults) | options
     if "baudrate" not in options:
         raise InvalidCommand(f"{name}: no baud rate given; write for example {name.partition('?')[0]}?baudrate=57600")
@@ -128,6 +131,7 @@ def _address(url: str) -> tuple[str, int, str]:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
+        # A port that is not a number, or above 65535.
         host, port = None, None
     if not host or port is None or parts.path not in ("", "/"):
         raise InvalidCommand(f"{url!r} is not of the form {url.partition('://')[0]}://HOST:PORT")

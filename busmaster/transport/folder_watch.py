@@ -1,7 +1,8 @@
 """Reports at once that an entry of a folder was created or changed: a device node, a link, its rights.
 
-Linux's inotify, read by the loop like a port. Where it is not available (another system, a loop that
-cannot read descriptors or has a virtual clock, no watch left for this user), this is logged once, and callers poll.
+It uses Linux's inotify, which the loop reads like a port. If that is not available, this is logged once, and callers
+poll. It is not available on another system, with a loop that cannot read descriptors or has a virtual clock, and if the
+user has no watch left.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class FolderWatch:
     def __init__(self, loop: asyncio.AbstractEventLoop, on_change: Callable[[], None]) -> None:
         self._loop = loop
         self._on_change = on_change
+        # By ctypes: Python has no inotify, and a package for three system calls is not worth a dependency.
         self._descriptor = call_system("inotify_init1", os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             loop.add_reader(self._descriptor, self._on_readable)
@@ -61,6 +63,7 @@ class FolderWatch:
 
     def _on_readable(self) -> None:
         with contextlib.suppress(BlockingIOError):
+            # The names in the events are not used: `presence` is the only judge of whether the device is back.
             os.read(self._descriptor, READ_SIZE)
         self._on_change()
 

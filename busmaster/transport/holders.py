@@ -40,6 +40,7 @@ def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
         return None
     place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
     for line in table.splitlines():
+        # One line per lock: "1: FLOCK  ADVISORY  WRITE 812 00:05:88 0 EOF" (proc_locks(5)).
         fields = line.split()
         if fields[1:2] == ["FLOCK"] and place in fields:
             pid = int(fields[4])
@@ -49,6 +50,7 @@ def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
 
 def owning_group(path: str) -> str:
     """Return the group of the port, by name if it has one."""
+    # May have no name, for example in a container.
     gid = os.stat(path).st_gid
     try:
         return grp.getgrgid(gid).gr_name
@@ -72,6 +74,7 @@ def how_to_open(path: str) -> str:
 
 def _pids(proc: Path) -> list[int]:
     try:
+        # Without /proc (another system) nothing is found.
         return sorted(int(entry) for entry in os.listdir(proc) if entry.isdigit())
     except OSError:
         return []
@@ -104,6 +107,7 @@ def serves(process: Path, device: str) -> bool:
     for descriptor in process.glob("fdinfo/*"):
         with contextlib.suppress(OSError):
             index = re.search(r"^tty-index:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)
+            # Only a master of a pseudo-terminal has this line in its fdinfo.
             if index is not None and device == f"/dev/pts/{index[1]}":
                 return True
     return False

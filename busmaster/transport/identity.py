@@ -85,6 +85,7 @@ class UsbIdentity:
         text = f"{device.maker} {device.serial}".rstrip()
         if device.interface or device.number:
             text += f" interface {device.interface}" + (f" port {device.number}" if device.number else "")
+        # Cheap adapters have all the same serial number, or none: then only the place distinguishes them.
         return text if device.serial and self.alone else f"{text} at USB port {device.place}"
 
     @property
@@ -97,6 +98,7 @@ class UsbIdentity:
     def accepts(self, found: Identity) -> bool:
         if not isinstance(found, UsbIdentity) or _marks(self.device) != _marks(found.device):
             return False
+        # Both: the second adapter with the same number may have been plugged in since.
         known_by_serial = bool(self.device.serial) and self.alone and found.alone
         return known_by_serial or self.device.place == found.device.place
 
@@ -118,7 +120,9 @@ class PtyIdentity:
 
     def __init__(self, path: str) -> None:
         self._node = os.open(path, os.O_PATH)
+        # A program that makes a new pty and sets its link anew means the new one (socat, for example).
         self._links = tuple(_links(path))
+        # For messages: the name of a pseudo-terminal does not distinguish it from the next one.
         self._made = datetime.fromtimestamp(os.fstat(self._node).st_ctime, UTC)
 
     def __del__(self) -> None:
@@ -137,6 +141,7 @@ class PtyIdentity:
 
     def is_behind(self, descriptor: int) -> bool:
         node = os.fstat(descriptor)
+        # 0 links: its other end was closed, and the node is no longer in its folder.
         return node.st_nlink > 0 and os.path.samestat(os.fstat(self._node), node)
 
 
@@ -181,6 +186,7 @@ def resolve(name: str, scan: Scan | None = None) -> str:
     wanted = name.removeprefix(USB)
     scan = scan or Scan()
     there = scan.devices
+    # Both readings are tried below, the whole text as a serial number first.
     serial, _, interface = wanted.rpartition(":")  # a serial number may contain colons
     numbered = (serial, int(interface)) if interface.isdecimal() else None
     found = [device for device in there if device.serial == wanted] or [
@@ -190,6 +196,7 @@ def resolve(name: str, scan: Scan | None = None) -> str:
         case [device]:
             return device.path
         case []:
+            # The list saves the user a search: serial numbers are seldom printed on adapters.
             others = f"connected: {_listed(there, scan)}" if there else "no USB serial port was found"
             raise LineDown(f"{name} is not plugged in: {others}", hint="plug it in, or use one of the connected ports")
         case _:
@@ -246,6 +253,7 @@ def all_ttys() -> Hashable | None:
         names = sorted(os.listdir(SYS / "class/tty"))
     except OSError:
         return None
+    # The kernel writes "!" for the "/" of a name such as usb/tty0.
     return tuple((name, node_at(f"{DEV}/{name.replace('!', '/')}")) for name in names)
 
 
@@ -255,6 +263,7 @@ def node_at(path: str) -> Hashable | None:
         status = os.stat(path)
     except OSError:
         return None
+    # With the time: a pty that is closed and made again can get the same numbers.
     return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns
 
 
@@ -268,6 +277,7 @@ def folders_to(path: str) -> tuple[str, ...]:
         folder = os.path.realpath(os.path.dirname(path))
         while not os.path.isdir(folder):
             folder = os.path.dirname(folder)
+        # Each link on the path: udev replaces /dev/serial/by-id/NAME, while /dev/ttyUSB0 stays the same name.
         found.append(folder)
         try:
             path = os.path.join(os.path.dirname(path), os.readlink(path))

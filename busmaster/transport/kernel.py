@@ -42,6 +42,7 @@ class OpenPort:
     """The other end can stop the output for any time."""
 
     def __init__(self, transport: asyncio.Transport) -> None:
+        # Looked up once: it is called at every deadline.
         self._buffered = _buffer_of(transport)
 
     def unread(self) -> bool:
@@ -80,6 +81,7 @@ class _Descriptor(OpenPort):
 
     def unread(self) -> bool:
         found = self._input.poll(0)
+        # Not for POLLHUP alone: a lost port is readable for ever, but has no bytes.
         return bool(found) and found[0][1] & select.POLLIN > 0
 
     def _count(self, request: int) -> int:
@@ -107,6 +109,7 @@ class Tty(_Descriptor):
         return (super().unsent(waited) or 0) + self._count(termios.TIOCOUTQ)
 
     def errors(self) -> DriverErrors | None:
+        # TIOCGICOUNT counts from the loading of the driver, also for earlier programs.
         now, before = self._counted(), self._before
         if now is None or before is None:
             return None
@@ -158,11 +161,13 @@ class Socket(_Descriptor):
 
     def unsent(self, waited: float) -> int | None:
         """Count unsent bytes. Bytes on the way count only if their acknowledgement is later than usual on this path."""
+        # Each request would otherwise count as held for 40 ms: the peer delays its acknowledgement until it has data to
+        # send.
         under_way = waited >= DELAYED_ACK and waited >= self._usual_acknowledgement()
         return (super().unsent(waited) or 0) + self._count(termios.TIOCOUTQ if under_way else SIOCOUTQNSD)
 
     def errors(self) -> DriverErrors | None:
-        """Return what the remote port has counted, where the server reports it (RFC 2217)."""
+        """Return the errors counted by the remote port, if the server reports them (RFC 2217)."""
         now = None if self._remote is None else self._remote()
         return now if now is None or self._before is None else now.since(self._before)
 
@@ -177,18 +182,21 @@ class Socket(_Descriptor):
     def _usual_acknowledgement(self) -> float:
         """Return its usual time, in seconds, as the kernel calculates it for retransmissions; 0 if unknown."""
         if not hasattr(socket, "TCP_INFO"):
+            # The port was lost in the meantime. Its transport reports that.
             return 0.0
         try:
             info = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO_TIMES.size)
             mean, variation = TCP_INFO_TIMES.unpack(info)
         except (OSError, struct.error):
             return 0.0
+        # The retransmission timeout of RFC 6298, without its minimum.
         return float(mean + 4 * variation) / 1e6
 
 
 def open_port(transport: asyncio.Transport) -> OpenPort:
     """Return the port object for this transport."""
     device = transport.get_extra_info("serial")
+    # By the transport and not by the endpoint: an application can pass an endpoint of its own.
     if device is not None:
         return Tty(transport, device.fileno(), device.rtscts)
     sock = transport.get_extra_info("socket")

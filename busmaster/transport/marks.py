@@ -38,6 +38,7 @@ class MarkingSerial(serial.Serial):
 def mark_errors(descriptor: int) -> bool:
     """Make the tty mark damaged bytes and pass all others unchanged. Returns False if it does not support marks."""
     settings = termios.tcgetattr(descriptor)
+    # Assigned, not added: a flag left by another program, such as ICRNL, would change bytes of telegrams.
     settings[0] = _INPUT_FLAGS
     with contextlib.suppress(termios.error):
         termios.tcsetattr(descriptor, termios.TCSANOW, settings)
@@ -76,6 +77,7 @@ class Unescape:
         at = 0
         while (escape := data.find(ESCAPE, at)) >= 0:
             sound += data[at:escape]
+            # The two bytes that decide: FF is a data byte FF; 00 and a byte is a mark; less is not decided yet.
             behind = data[escape + 1 : escape + 3]
             if behind in (b"", b"\0"):
                 self.begun = data[escape:]
@@ -84,9 +86,10 @@ class Unescape:
                 if sound:
                     pieces.append((bytes(sound), None))
                     sound.clear()
+                # A damaged byte 00 has the same mark as a break: `Tty.is_break` distinguishes them.
                 pieces.append((behind[1:], Mark.DAMAGED if behind[1] else Mark.BREAK))
                 at = escape + 3
-            else:  # a byte FF: one without its double is one too, where somebody has cleared PARMRK behind our back
+            else:  # a byte FF, also without its double: another program may have cleared PARMRK in the meantime
                 sound.append(ESCAPE)
                 at = escape + (2 if behind[0] == ESCAPE else 1)
         sound += data[at:]

@@ -22,6 +22,7 @@ def in_own_thread(work: Callable[[], T], name: str) -> Future[T]:
             return
         try:
             result = work()
+        # Also SystemExit: the caller that awaits the future must not wait for ever.
         except BaseException as error:
             future.set_exception(error)
         else:

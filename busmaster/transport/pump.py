@@ -100,6 +100,7 @@ class Pump(asyncio.Protocol):
         Without a waiter, the transaction's tag becomes a future for them.
         """
         assert self._loop is not None
+        # An internal waiter needs no future: its result is set without a turn of the loop.
         transaction.tag = self._loop.create_future() if waiter is None else waiter
         # A request that was only queued changes nothing that must be sent, reported or timed.
         if self.arbiter.submit(transaction, self.clock()):
@@ -122,10 +123,12 @@ class Pump(asyncio.Protocol):
             arbiter.transmitted(now)
             if self.tap is not None:
                 self.tap.transmitted(now, data, arbiter.attempt)
+            # Only for a port that held bytes once, or has flow control: otherwise it would cost a timer per request.
             if self._may_hold:
                 self._look_after(now)
         event = arbiter.poll_event()
         while event is not None:
+            # `type` and not `isinstance`: this chain runs for every event, and no event has subclasses.
             if type(event) is Transaction:
                 if event.writes and event.attempts:
                     # before its caller wakes, so that no snapshot comes in between
@@ -148,6 +151,7 @@ class Pump(asyncio.Protocol):
                     self.tap.attempted(event)
             else:
                 self._on_event(event)
+            # After the write: the next request is on the wire before a caller wakes.
             event = arbiter.poll_event() if arbiter.events else None  # a call less on the way of a reply
         due = arbiter.poll_timeout()
         # An early timer changes nothing, so it is never moved to a later time: that saves a system call per reply.
@@ -191,6 +195,7 @@ class Pump(asyncio.Protocol):
         self._may_hold = self._may_hold or self._port.flow_controlled
         self._paused = self._all_has_left = False
         self._held_since = inf
+        # After `_port` is set: the first deadline already queries it.
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
         self.turn()
 
@@ -207,6 +212,7 @@ class Pump(asyncio.Protocol):
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
         """Process a byte that the UART marked as damaged; none if a serial server reports the error separately."""
         now = self.clock()
+        # A tty has one mark for a break and a damaged byte 00.
         if mark is Mark.BREAK and self._port is not None and not self._port.is_break():
             mark = Mark.DAMAGED
         if self.tap is not None and byte:
@@ -226,6 +232,7 @@ class Pump(asyncio.Protocol):
     def connection_lost(self, cause: Exception | None) -> None:
         self._transport = None
         self._port = None
+        # An aborted transport reports no cause: the reason for the abort is more useful.
         what = self._gave_up or cause_text(cause, "it was closed")
         self._gave_up = ""
         self.arbiter.line_down(what, self.clock())
@@ -273,6 +280,7 @@ class Pump(asyncio.Protocol):
 
     def _look_after(self, now: float) -> None:
         """Query the port when the sent bytes should have left, so that a port that holds bytes back is noticed."""
+        # The transport still has bytes that the kernel did not accept: the calculated time does not apply.
         if self._paused:
             self._check_output(now)
         elif self._loop is not None:
@@ -291,6 +299,7 @@ class Pump(asyncio.Protocol):
         if self._port is None:
             return
         count = self._port.unsent(now - self._written)
+        # Unknown: the transport has neither a descriptor nor a buffer size. Windows then count from the write.
         if count is None:
             return
         self.arbiter.unsent(count, now)
@@ -304,6 +313,7 @@ class Pump(asyncio.Protocol):
 
     def _give_up(self, port: OpenPort) -> None:
         """Close the port, which discards its unsent bytes. It is reopened as after any loss."""
+        # A reply window that starts when the bytes leave would never start, so every caller would wait.
         self._gave_up = f"no byte has left {self._name} for {STUCK_AFTER:g} s: {port.stuck_because}"
         self._port = None
         port.discard_unsent()  # before the abort, after which the kernel would continue to send

@@ -32,7 +32,7 @@ class Connection:
     the last once per connection. `connection_lost(None)` means closed locally; else the cause is a LineDown. Between
     attempts it waits `first_delay` seconds, doubled up to `longest_delay` and varied by a quarter (`jitter` is the
     random source). The delay starts again after a connection that lasted longer than that. A device that returns is
-    noticed immediately. Only the device of the first opening is reopened, whatever has its name in the meantime.
+    noticed immediately. Only the device of the first opening is reopened, even if another one has its name by then.
 
     Errors in the background never stop it: the attempt is repeated. `on_failed` gets the cause, once until it changes.
     A cause with a cause of its own is a bug.
@@ -69,6 +69,7 @@ class Connection:
         link = _Link(self.endpoint.name, self._protocol, self._closing)
         transport = await self.endpoint.open(lambda: link, self._device)
         # From this opening: the same device may have returned at another place, and is identified there from now on.
+        # None behind a serial server: its address is its identity.
         self._device = transport.get_extra_info("identity")
         self._link = link
         self._told.clear()  # it was open in the meantime: the same cause is reported again
@@ -84,6 +85,7 @@ class Connection:
 
     def accept_device(self) -> None:
         """Accept any device that has the port's name at the next opening, which follows soon."""
+        # `_seen` too, so that a device that is connected already counts as returned.
         self._device = self._seen = None
         self._stirred.set()
 
@@ -99,6 +101,7 @@ class Connection:
                 if lasted > self._longest_delay:
                     delay = self._first_delay
                 self._follow_folders()
+                # After a return at once: the delay protects a device that is there but does not open.
                 returned = await self._wait(delay)
                 delay = self._first_delay if returned else min(2 * delay, self._longest_delay)
         finally:
@@ -111,6 +114,7 @@ class Connection:
         link = self._link
         if link is None or link.transport is None or link.lost.is_set():
             return
+        # Not `abort`, which does not wait until the device is free for the next program.
         link.transport.close()
         try:
             async with asyncio.timeout(CLOSE_DEADLINE):
@@ -173,6 +177,7 @@ class Connection:
         """Return True if a device has appeared since the last check."""
         before = self._seen
         try:
+            # Also while nothing is open, so that the next change is one against now.
             self._seen = self.endpoint.presence()
         except Exception as error:
             self._tell("look", error)
@@ -181,6 +186,7 @@ class Connection:
     def _tell(self, doing: str, error: Exception) -> None:
         """Report why this failed, unless the cause is the same as at the last attempt."""
         cause = self._cause(error)
+        # R14: a port that is missing for a night would fill the log with an attempt every 5 s.
         if self._on_failed is None or self._told.get(doing) == str(cause):
             return
         self._told[doing] = str(cause)
@@ -197,7 +203,7 @@ class Connection:
             return LineDown(f"cannot open {self.endpoint.name}: {error.strerror or str(error) or type(error).__name__}")
         cause = LineDown(
             f"cannot open {self.endpoint.name}: {type(error).__name__}: {error}",
-            hint="this is a bug: please report it with what the log says",
+            hint="this is a bug: please report it with the text from the log",
         )
         cause.__cause__ = error
         return cause

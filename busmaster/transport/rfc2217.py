@@ -24,15 +24,16 @@ from busmaster.transport.telnet import BINARY, COM_PORT, DO, DONT, SUPPRESS_GO_A
 CONFIRM_DEADLINE = 5.0
 """Seconds for which the server may take to agree to the options, and again to confirm the settings."""
 FASTEST = 0xFFFF_FFFF
-"""The largest baud rate that SET-BAUDRATE can carry."""
+"""The largest baud rate that fits into SET-BAUDRATE."""
 REQUIRED = frozenset({(DO, COM_PORT), (DO, BINARY), (WILL, BINARY)})
-"""What the server must agree to. Without binary transmission it may change CR bytes, and drop the eighth bit."""
+"""The options that the server must agree to. Without binary transmission it may change CR bytes, and drop the eighth
+bit."""
 AGREED = REQUIRED | {(DO, SUPPRESS_GO_AHEAD), (WILL, SUPPRESS_GO_AHEAD)}
-"""Answers to what this side asks for at the beginning: they need no answer."""
+"""The server's replies to the options that this side requests at the beginning. They are not replied to."""
 
 
 AGREEMENT = "options"
-"""The answer that is waited for until the server has agreed to what is required."""
+"""Key of the wait until the server has agreed to all REQUIRED options."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +77,14 @@ class Rfc2217Port(TcpPort):
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> Rfc2217Transport:
         """Connect, and set the remote port. Raises LineDown, also where the server does not confirm the settings."""
+        # A stream of its own until the settings are confirmed: a line must not be used at another baud rate.
         stream = _Stream(self.name)
         tcp = await TcpPort.open(self, lambda: stream, only)
         try:
+            # Each step may take CONFIRM_DEADLINE: a server that does not speak telnet at all fails here, with a hint.
             await stream.agree()
             await stream.configure(self.settings)
+            # After rate and framing: DTR or RTS may switch the device on.
             await stream.control(self._controls())
             transport = Rfc2217Transport(tcp, stream)
             stream.attach(protocol_factory(), transport)
@@ -109,18 +113,20 @@ class ModemLines(NamedTuple):
 
 
 class Rfc2217Transport(asyncio.Transport):
-    """Doubles IAC in what is written, and holds it back while the server asks for that."""
+    """Doubles IAC in sent bytes, and holds them back while the server requests that."""
 
     def __init__(self, tcp: asyncio.Transport, stream: _Stream) -> None:
         super().__init__()
         self._tcp = tcp
         self._stream = stream
+        # The server may have suspended the connection during the opening.
         self._held: bytes | None = b"" if stream.suspended else None
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """Return for `modem_lines` the last ModemLines or None, for `line_errors` what returns the counts of errors.
+        """Return the last ModemLines or None for `modem_lines`, and a function for `line_errors`.
 
-        The latter returns None where the server does not report errors. Other names are those of the TCP transport.
+        The function returns the error counters, or None if the server does not report errors. Other names are those of
+        the TCP transport.
         """
         if name == "modem_lines":
             return self._stream.modem_lines
@@ -137,16 +143,18 @@ class Rfc2217Transport(asyncio.Transport):
             self._tcp.write(telnet.escaped(bytes(data)))
         else:
             self._held += telnet.escaped(bytes(data))
+            # R2: held bytes have not left, so no window may expire.
             self._stream.pause_writing()
 
     def suspend(self, on: bool) -> None:
-        """Hold back what is written from now on; or send what was held back."""
+        """Hold back all bytes written from now on, or send the bytes that were held back."""
         if on:
             self._held = self._held or b""
             return
         held, self._held = self._held, None
         if held:
             self._tcp.write(held)
+            # Otherwise the TCP transport reports it when its buffer is empty.
             if not self._tcp.get_write_buffer_size():
                 self._stream.resume_writing()
 
@@ -178,7 +186,7 @@ class _Stream(asyncio.Protocol):
     def __init__(self, name: str) -> None:
         self.modem_lines: ModemLines | None = None
         self.suspended = False
-        """The server has asked for a pause."""
+        """The server has requested a pause."""
         self._name = name
         self._tcp: asyncio.Transport | None = None
         self._reader = telnet.TelnetReader()
@@ -208,6 +216,7 @@ class _Stream(asyncio.Protocol):
         self._expect(*wanted)
         self._send(
             b"".join(telnet.subnegotiation(command, value) for command, value in wanted.items())
+            # A server reports only the errors in the mask.
             + telnet.subnegotiation(telnet.Set.LINESTATE_MASK, bytes((telnet.LINE_ERRORS,)))
         )
         # All of them before any is checked: none is left over for the next time.
@@ -232,10 +241,11 @@ class _Stream(asyncio.Protocol):
             raise self._cause
         self._protocol, self._transport = protocol, transport
         self._byte_marked = taker_of_marked_bytes(protocol)
+        # Bytes received before this are dropped: they may be a banner, or noise at another baud rate.
         protocol.connection_made(transport)
 
     def line_errors(self) -> DriverErrors | None:
-        """Return how many errors the server has reported; None where it has never said that it reports them."""
+        """Return the errors that the server has reported; None if it has never confirmed that it reports them."""
         if not self._errors_reported:
             return None
         count = self._errors
@@ -244,7 +254,7 @@ class _Stream(asyncio.Protocol):
         )
 
     def _expect(self, *keys: object) -> None:
-        """Be ready for these answers before the question is sent."""
+        """Prepare for these replies before the request is sent."""
         for key in keys:
             self._waiting[key] = asyncio.get_running_loop().create_future()
 
@@ -269,6 +279,7 @@ class _Stream(asyncio.Protocol):
         if found != wanted:
             what, instead = telnet.value_text(command, wanted), telnet.value_text(command, found)
             hint = "use settings that the server and its adapter have"
+            # A server confirms the value that it has set, which is the nearest one that its hardware has.
             raise LineDown(f"{self._name} does not take {what}: it confirms {instead}", hint=hint)
 
     # what asyncio calls
@@ -290,7 +301,7 @@ class _Stream(asyncio.Protocol):
             if isinstance(piece, telnet.Subnegotiation) and piece.code == telnet.Notice.LINESTATE and piece.value:
                 self._take_errors(LineError(piece.value[0] & telnet.LINE_ERRORS))
         for piece in pieces:
-            if self._cause is not None:  # it is being aborted: what follows may not be what was sent
+            if self._cause is not None:  # it is being aborted, and the bytes after the error cannot be trusted
                 return
             if isinstance(piece, bytes):
                 if self._protocol is not None:
@@ -318,6 +329,7 @@ class _Stream(asyncio.Protocol):
         for future in self._waiting.values():
             if not future.done():
                 future.set_exception(self._cause)
+                # Otherwise asyncio would log it as never retrieved.
                 future.exception()  # it may be that none waits for it
         if self._protocol is not None:
             self._protocol.connection_lost(cause or exc)
@@ -336,6 +348,7 @@ class _Stream(asyncio.Protocol):
 
     def _negotiate(self, verb: int, option: int) -> None:
         if (verb, option) in AGREED:
+            # A server may send DO and WILL in any order, and more than once.
             self._missing.discard((verb, option))
             if not self._missing:
                 self._resolve(AGREEMENT, b"")
@@ -343,8 +356,10 @@ class _Stream(asyncio.Protocol):
             what = "RFC 2217 (telnet option 44)" if option == COM_PORT else "binary transmission (telnet option 0)"
             hint = "enable RFC 2217 for this port at the server (ser2net: telnet(rfc2217)), or use socket://"
             self._fail(LineDown(f"{self._name} refuses {what}", hint=hint))
-        elif verb in (WILL, DO) and (verb, option) not in self._answered:  # each once: no loop, whatever it sends
+        # Each option once: two sides that reply to each other's replies would never end (RFC 854).
+        elif verb in (WILL, DO) and (verb, option) not in self._answered:
             self._answered.add((verb, option))
+            # All other options are refused, as telnet requires of a side that does not know them.
             yes = (verb, option) == (WILL, COM_PORT)
             answer = (DO if yes else DONT) if verb == WILL else WONT
             self._send(telnet.negotiation(answer, option))
@@ -356,6 +371,7 @@ class _Stream(asyncio.Protocol):
             case telnet.Notice.LINESTATE | telnet.Notice.LINESTATE_MASK:
                 self._errors_reported = True
             case telnet.Notice.SUSPEND | telnet.Notice.RESUME:
+                # The server's buffer is full, or its port is stopped by flow control.
                 self.suspended = code == telnet.Notice.SUSPEND
                 if self._transport is not None:
                     self._transport.suspend(self.suspended)
@@ -370,6 +386,7 @@ class _Stream(asyncio.Protocol):
         self._errors_reported = True
         for each in errors:
             self._errors[each] += 1
+        # Without the byte: which one it was is not known.
         self._byte_marked(b"", Mark.BREAK if LineError.BREAK in errors else Mark.DAMAGED)
 
     def _resolve(self, key: object, value: bytes) -> None:

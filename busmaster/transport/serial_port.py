@@ -1,10 +1,15 @@
 """A serial port, based on pyserial and pyserial-asyncio, with workarounds for problems of the latter.
 
 pyserial opens and configures the port. From pyserial-asyncio only these parts are used: registering reader and writer
-with the loop, pausing and resuming reading, and the write buffer limits that pause the protocol. Replaced are all parts
-that cost time or hide errors: a write leaves immediately instead of one loop turn later; reading does not use select(),
-which fails above descriptor 1023; every loss is reported once, and never from within a write; bytes with parity or
-framing errors are marked; and calls that can block (open, configure, drain, close) do not run on the loop's thread.
+with the loop, pausing and resuming reading, and the write buffer limits that pause the protocol. All parts that cost
+time or hide errors are replaced:
+
+- A write leaves immediately instead of one loop turn later.
+- Reading does not use select(), which fails above descriptor 1023.
+- Every loss is reported once, and never from within a write.
+- Bytes with parity or framing errors are marked.
+- Calls that can block (open, configure, drain, close) do not run on the loop's thread.
+
 Each method of `PortTransport` gives its reason.
 """
 
@@ -76,8 +81,8 @@ pool. A larger buffer costs a malloc, and a second one to shrink it."""
 class SerialPort:
     """A serial port of this machine, or a pty. Raises InvalidCommand for invalid values.
 
-    `path` is that of the device or of a symbolic link to it; or "usb:SERIAL", the USB adapter with this serial number
-    whatever its name is, or "usb:SERIAL:INTERFACE" where it has several ports.
+    `path`: the path of the device or of a symbolic link to it, or "usb:SERIAL" for the USB adapter with this serial
+    number under any name. If the adapter has several ports, use "usb:SERIAL:INTERFACE".
     """
 
     path: str
@@ -92,12 +97,12 @@ class SerialPort:
     stopbits: float = 1
     """1, 1.5 or 2. In LINE.toml the protocol's by default."""
     rtscts: bool = False
-    """Whether RTS and CTS control the flow of what is sent."""
+    """Whether RTS and CTS control the flow of sent bytes."""
     rs485: RS485Settings | bool | None = None
     """Whether the driver switches the transmitter (RTS high while sending). In Python also pyserial's
     `RS485Settings`, for other polarities and delays."""
     echo: bool = False
-    """Whether what is sent is received too, as on some two-wire adapters. It is compared byte for byte."""
+    """Whether sent bytes are received too, as on some two-wire adapters. They are compared byte for byte."""
     low_latency: bool | None = None
     """Sets or clears the driver's flag of that name. Left alone by default."""
     receive_latency: Annotated[float, Between(0, unit="s", self_checked=True)] = 0.0
@@ -114,6 +119,7 @@ class SerialPort:
             raise InvalidCommand("a USB adapter needs a serial number, such as usb:A500ABC")
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
+        # An adapter would switch its transmitter with the same line that is to stop it.
         if self.rtscts and self.rs485:
             raise InvalidCommand("rtscts and rs485 exclude each other: both drive the RTS line")
         LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
@@ -251,6 +257,7 @@ class PortTransport(_SerialTransport):
         if not self._write_buffer:
             try:
                 sent = os.write(self._fd, data)
+            # The driver's buffer is full, so all bytes are kept.
             except BlockingIOError:
                 sent = 0
             except OSError as error:
@@ -266,12 +273,14 @@ class PortTransport(_SerialTransport):
     def _write_ready(self) -> None:
         data = b"".join(self._write_buffer)
         try:
+            # All buffered pieces in one call: a request in two writes would have a pause in it.
             sent = os.write(self._fd, data)
         except BlockingIOError:
             return
         except OSError as error:
             self._lose(error)
             return
+        # In place: the base class holds the same list.
         self._write_buffer[:] = [data[sent:]] if sent < len(data) else []
         if not self._write_buffer:
             self._remove_writer()
@@ -307,7 +316,9 @@ class PortTransport(_SerialTransport):
         self._closing = True
         self._remove_reader()
         self._remove_writer()
+        # Unsent bytes must not leave later: a request that is that old could move a machine unexpectedly.
         self._write_buffer.clear()
+        # By device number: the next opening may use another name of the same device.
         closing = _Closing(self._port.path, os.fstat(self._fd).st_rdev)
         _closings.add(closing)  # before the thread starts, which removes it
 
@@ -351,6 +362,7 @@ def _still_closing(path: str) -> LineDown:
 def _own_closing(path: str) -> _Closing | None:
     """Return the running closing of the device at this path, or None."""
     with contextlib.suppress(OSError):
+        # The path may be gone, for example after an adapter was unplugged.
         number = os.stat(path).st_rdev
         return next((closing for closing in tuple(_closings) if closing.number == number), None)
     return None
@@ -376,7 +388,9 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
     if not _names_pty(port.path):  # a pty stays at 8N1, and the C library reports a change without effect as an error
         device.bytesize, device.parity = port.bytesize, port.parity
     device.rtscts = port.rtscts
+    # None and not False: pyserial would release a lock that it does not have.
     device.exclusive = True if port.exclusive else None
+    # Non-blocking: only the loop waits for this port.
     device.timeout = device.write_timeout = 0
     device.inter_byte_timeout = 0  # sets VMIN to 1, so that an empty read means a hang-up and nothing else
     try:
@@ -407,6 +421,7 @@ def _open_device(device: MarkingSerial, path: str) -> None:
             device.open()
             return
         except (OSError, termios.error) as error:
+            # Another program's lock is not worth a wait: it may be held for months.
             if closing is None or _code(error) not in IN_USE:
                 raise
         if not closing.over.wait(until - time.monotonic()):
@@ -450,6 +465,7 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
 def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> None:
     wanted: dict[str, object] = {"baudrate": settings.baudrate, "stopbits": settings.stopbits}
     if is_pty(device.fileno()):
+        # See `_open`: the C library reports an error for settings that a pty ignores.
         wanted["parity"] = "O" if settings.parity == "O" else "N"
     else:
         wanted |= {"bytesize": settings.bytesize, "parity": settings.parity}
@@ -484,6 +500,7 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
 
 def _code(error: Exception) -> int | None:
     """Return the errno of a pyserial error, which hides some in its text; None if there is none."""
+    # pyserial raises SerialException without an errno from within the handler of the original error.
     for raised in (error, error.__context__):
         if isinstance(raised, termios.error):
             return int(raised.args[0])
@@ -498,8 +515,11 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
     The flags are restored too, unless another program may be using the port with them.
     """
     with contextlib.suppress(OSError, termios.error):
+        # Otherwise the close waits until the bytes have left: with flow control off, up to 30 s by the driver's
+        # default.
         termios.tcflush(device.fileno(), termios.TCOFLUSH)
     if exclusive:
+        # Only with exclusive use: a second program with the port open still needs its flags.
         stop_marking(device.fileno())
         with contextlib.suppress(OSError):
             fcntl.ioctl(device.fileno(), termios.TIOCNXCL)

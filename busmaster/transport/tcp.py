@@ -40,7 +40,7 @@ class TcpPort:
     receive_latency: Annotated[float, Between(0, unit="s", self_checked=True)] = 0.0
     """How long the server may hold bytes back (ser2net: 0.0033 unless `chardelay: false`)."""
     echo: bool = False
-    """Whether what is sent is received too, as on some two-wire adapters. It is compared byte for byte."""
+    """Whether sent bytes are received too, as on some two-wire adapters. They are compared byte for byte."""
     paced: bool = False
     """Whether the server replies no sooner than the baud rate allows."""
 
@@ -52,6 +52,7 @@ class TcpPort:
             raise InvalidCommand(f"a TCP port number is 1 to 65535, not {number!r}")
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
+        # R4 needs the wire time of the request.
         if self.paced and self.baudrate is None:
             raise InvalidCommand("a paced TCP port needs the baud rate that it is paced by")
         if self.baudrate is not None:

@@ -69,7 +69,7 @@ LINE_ERRORS = LineError.OVERRUN | LineError.PARITY | LineError.FRAMING | LineErr
 
 
 class TelnetError(ValueError):
-    """The stream breaks the rules of telnet, so that data and commands cannot be told apart any more."""
+    """The stream breaks the rules of telnet, so that data and commands cannot be separated any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +139,7 @@ class TelnetReader:
     def _subnegotiation(self, data: bytes, begin: int) -> tuple[Piece, int]:
         body = bytearray()
         at = begin + 2
+        # An IAC at the very end is not decided yet: the next byte may double it.
         while 0 <= (iac := data.find(IAC, at)) < len(data) - 1:
             body += data[at:iac]
             if data[iac + 1] == IAC:
@@ -149,12 +150,14 @@ class TelnetReader:
             if data[iac + 1] == SE:
                 break
         else:
+            # R12: a server that never ends a command must not fill the memory.
             if len(data) - begin > LONGEST_SUBNEGOTIATION:
                 raise TelnetError(f"a telnet subnegotiation is longer than {LONGEST_SUBNEGOTIATION} bytes")
             self._begun = data[begin:]
             return b"", len(data)
         if at - begin > LONGEST_SUBNEGOTIATION:  # the same however the stream is split
             raise TelnetError(f"a telnet subnegotiation is longer than {LONGEST_SUBNEGOTIATION} bytes")
+        # Another option, such as the terminal type: ignored, as telnet requires.
         if len(body) < 2 or body[0] != COM_PORT:
             return b"", at
         return Subnegotiation(body[1], bytes(body[2:])), at
