@@ -89,6 +89,7 @@ class Alarms:
             if sample is None or sample.error is not None or not isinstance(sample.value, int | float):
                 continue
             before = self.states.get(point)
+            # Hysteresis: a value at its limit would otherwise begin and end an alarm with each cycle.
             if before is not None and _holds(before.limit, point, sample.value):
                 continue
             now = _begun(point, sample.value)

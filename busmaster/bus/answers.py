@@ -46,6 +46,7 @@ def composed(command: Command[Any], answers: Iterable[Answer], profile: Profile)
         if isinstance(command, Changing):
             changed = tuple(held[place] for place in command.changes(profile))
             return [changed[0] if len(changed) == 1 else changed]
+    # Some place was not read, or was written since: then nothing is known.
     except KeyError:
         pass
     return []

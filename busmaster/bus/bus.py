@@ -73,6 +73,7 @@ class Bus:
         wait_for_port: bool = False,
     ) -> None:
         capacity = whole_number(capacity, 1, MOST_CAPACITY, "a bus's capacity")
+        # The most frequent wrong call: without this, the error would be one about a missing attribute of str.
         if isinstance(endpoint, str):
             raise InvalidCommand(
                 f"a bus needs an endpoint, not text: Bus(endpoint({endpoint!r})), or SerialPort, TcpPort, Rfc2217Port"
@@ -84,6 +85,7 @@ class Bus:
         settings = endpoint.settings
         self._byte_time_known = settings is not None
         self._arbiter = Arbiter(
+            # Behind a raw TCP port without a baud rate the first node's protocol decides (see `_find_or_add`).
             settings.byte_time if settings is not None else BYTE_TIME_UNTIL_KNOWN,
             echo=endpoint.echo,
             receive_latency=endpoint.receive_latency,
@@ -96,6 +98,8 @@ class Bus:
         line.alarms = Alarms(self._on_event)
         self._pump = line.pump = Pump(
             self._arbiter,
+            # The pump calls these within the turn in which the next request has left: they must be short and must not
+            # raise.
             on_sample=lambda poll, transaction: poll.group.sampled(transaction),
             on_cycle=lambda poll: poll.group.cycle_finished(),
             on_event=self._on_event,
@@ -122,6 +126,7 @@ class Bus:
         self._check_not_closed()
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
+        # None with trio, which anyio supports but asyncio's transports do not.
         loop = running_loop()
         if loop is None:  # a coroutine that runs without asyncio
             raise InvalidCommand(
@@ -161,6 +166,7 @@ class Bus:
         self._pump.turn()
         with anyio.CancelScope(shield=True):  # Task.cancel() comes through all the same
             try:
+                # R8: the reply that is still to come would reach the next master of this line.
                 await self._pump.run_out()
             finally:
                 await self._let_go()  # also after a cancellation, or the port would stay open and be reopened forever
@@ -198,6 +204,7 @@ class Bus:
         to accept all writes again; it is not needed on a line that will be closed.
         """
         self._check_loop()
+        # Before the queued writes are failed: a caller that is woken by that may write again.
         self._line.only_safe += 1
         self._arbiter.supersede_writes(self.now())
         self._pump.turn()
@@ -210,8 +217,8 @@ class Bus:
     ) -> Node:
         """Return the node at this address. Calls with the same protocol and address return the same node.
 
-        Raises InvalidCommand for an address that the protocol does not have, for a protocol that cannot share the line
-        with those on it, and if profile, timings or retries differ from those of the first call. None means not
+        Raises InvalidCommand for an address that the protocol does not have, and for a protocol that cannot share the
+        line with those on it. Also if profile, timings or retries differ from those of the first call. None means not
         specified.
         """
         node = self._find_or_add(profile, address, timings, retries)
@@ -247,6 +254,7 @@ class Bus:
         """Return a lent node. The borrower no longer polls it or sends requests to it."""
         node._borrowers -= 1
         if not (node._kept or node._borrowers):
+            # Otherwise a client that names node after node would fill the line with probes (R11, R12).
             del self._nodes[node.profile.name, node.address]
             self._line.forget_node(node, node._record)
             if not any(other.profile.name == node.profile.name for other in self._nodes.values()):
@@ -437,6 +445,7 @@ class Bus:
             except StopIteration as end:
                 plan: Plan = end.value
                 return plan
+            # 128 units of about a microsecond: a bus with hundreds of points calculates for tens of milliseconds.
             if done >= SLICE:
                 done = 0
                 await asyncio.sleep(pause)
@@ -444,10 +453,10 @@ class Bus:
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
         """Return the longest time, in seconds, until a request of this class, made now, is sent (R9).
 
-        The calculation includes the polls, the queued requests, a probe of each node, each kind of command sent so far,
-        the connected programs, the longest exclusive sequence so far, and dead, late or slow nodes. It does not cover a
-        line that is never silent. Learned reply times do not shorten it, because the documented times can be restored
-        at any moment.
+        The calculation includes the polls, the queued requests, a probe of each node, and each kind of command sent so
+        far. It also includes the connected programs, the longest exclusive sequence so far, and dead, late or slow
+        nodes. It does not cover a line that is never silent. Learned reply times do not shorten it, because the
+        documented times can be restored at any moment.
         """
         self._check_loop()
         return self._outlook.worst_case_wait(checked_priority(priority))
@@ -500,6 +509,7 @@ class Bus:
     def _on_event(self, event: BusEvent) -> None:
         match event:
             case LineChanged(LineChange.DOWN, cause) | PortFailed(cause):
+                # Before the event is passed on, so that `condition` is right for consumers.
                 self._line.losses.lost(self.now(), cause)
             case LineChanged(LineChange.UP):
                 self._line.losses.found(self.now())
@@ -534,10 +544,12 @@ class Bus:
         If the node returns again while its hook is running, the hook runs again afterwards.
         """
         try:
+            # One hook at a time for each node: two of them would write the same parameters in any order.
             async with node._returning:
                 if node.on_return is not None:
                     await node.on_return(node)
         except Exception as error:
+            # A node that never polls again because of a bug in a hook would be worse than one without its parameters.
             self._line.logbook.failed_hook(node.label, error)
         finally:
             self._arbiter.dispatcher.release_node(node._record)

@@ -47,7 +47,7 @@ class GroupLike(Protocol):
         ...
 
     def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+        """Return a consumer that buffers this many snapshots. Close it when it is no longer used."""
         ...
 
     def close(self) -> None:
@@ -60,8 +60,8 @@ class GroupLike(Protocol):
 class BusLike(Protocol):
     """The interface that `Bus` and `RemoteBus` share: a program that takes a `BusLike` runs on both unchanged.
 
-    Handles take one, too. What is awaited here is a request to the line's owner on a `RemoteBus`; on a `Bus` it ends
-    at once, or calculates. docs/service.md has a table of the differences that remain.
+    Handles accept one, too. Each coroutine is a request to the line's owner on a `RemoteBus`. On a `Bus` it ends at
+    once, or calculates. docs/service.md has a table of the remaining differences.
     """
 
     def node(
@@ -97,7 +97,7 @@ class BusLike(Protocol):
         ...
 
     def latest(self, point: Point[T]) -> Sample[T] | None:
-        """Return the youngest good sample of a point, unless a write has made it stale."""
+        """Return the newest good sample of a point, unless a write has made it stale."""
         ...
 
     def now(self) -> float:
@@ -105,15 +105,15 @@ class BusLike(Protocol):
         ...
 
     def events(self) -> Stream[BusEvent]:
-        """Return a stream of what happens to the line and its nodes from now on."""
+        """Return a stream of the events of the line and its nodes from now on."""
         ...
 
     async def plan(self, *more: PlannedGroup) -> Plan:
-        """Calculate what becomes of the groups that run, and of `more`, by the reply times measured so far."""
+        """Calculate the load of the running groups and of `more`, with the reply times measured so far."""
         ...
 
     async def statistics(self) -> LineStatistics:
-        """Return an immutable snapshot of the line's counts."""
+        """Return an immutable snapshot of the line's counters."""
         ...
 
 

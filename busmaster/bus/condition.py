@@ -35,6 +35,7 @@ class LossLog:
 
     def lost(self, now: float, reason: str) -> None:
         """Record that the port is lost. The first time counts, and the latest reason."""
+        # Each failed attempt to reopen is reported here too: the loss began with the first.
         since = self.condition.since if self._lasts else now
         self._lasts = True
         self.condition = LineCondition(True, since, reason or self.condition.reason)

@@ -53,7 +53,7 @@ class Handle(ABC):
 
     profile: ClassVar[Profile]
     _identity: ClassVar[tuple[str, ...]] = ()
-    """Items by which a node says what it is, such as its firmware."""
+    """Items that identify a node, such as its firmware."""
 
     def __init__(
         self,
@@ -99,6 +99,7 @@ class Handle(ABC):
         """
         points = [self.point(name) for name in self._names(item, values)]
         commands = [encoder(point)(value) for point, value in zip(points, values, strict=True)]
+        # All values before the first write: a list must not be stored in part because of its last value.
         self.node.check(*commands, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
         for point, command in zip(points, commands, strict=True):
@@ -111,8 +112,8 @@ class Handle(ABC):
         """Set the probe and the sync reads of the node, by items, if the defaults do not suit this device.
 
         The probe is the read that is sent to a node that may be dead. Sync reads are sent if the line must prove that
-        replies match requests: name several cheap items that the device has and whose replies begin differently. What
-        is left out stays unchanged. The setting applies to all handles of the node. Raises InvalidCommand for an item
+        replies match requests: name several cheap items that the device has and whose replies begin differently.
+        Omitted ones stay unchanged. The setting applies to all handles of the node. Raises InvalidCommand for an item
         that does not exist, and if another handle has set different ones. On the line of another program it has no
         effect.
         """
@@ -125,12 +126,13 @@ class Handle(ABC):
         """Return this handle for an exclusive sequence of requests, for `async with`. Only urgent requests go between
         them.
 
-        The line is held from the first request until the block is left, for at most `max_hold` seconds (up to 5) and to
-        the end of the exchange that is then on the wire. Later requests in the block raise HoldEnded and are not sent.
+        The line is held from the first request until the block is left, for at most `max_hold` seconds (up to 5). An
+        exchange that is then on the wire is finished. Later requests in the block raise HoldEnded and are not sent.
         Only requests of the handle returned for the block belong to the sequence; all other requests, of this program
         too, wait.
         """
         async with self.node.exclusive(max_hold=max_hold) as held:
+            # A copy, so that requests of the original handle wait, as those of all other programs do.
             handle = copy(self)
             handle.node = held
             yield handle
@@ -160,6 +162,7 @@ class Handle(ABC):
                 kind = self.profile.kind_name
                 raise InvalidCommand(f"{kind}: this protocol documents no list of parameters: name the items")
             return listed
+        # By command: the user may write an item in another form than the list does ("1.1" and "1.01").
         known = {self.point(one.item).command: one for one in self._listed()}
         found: dict[Command[Any], Parameter] = {}
         for name in (name for item in items for name in self._counted(item)):
@@ -179,7 +182,7 @@ class Handle(ABC):
         """Read parameters, by default all that the document lists, and return them as a set.
 
         Each is read in the background of other traffic. Parameters that the node does not have are left out; `progress`
-        is called with what came of each. Values are numbers as a handle without decimals reads them. Raises
+        is called with the result of each. Values are numbers as a handle without decimals reads them. Raises
         InvalidCommand as `parameters` does, BusError if the node does not reply.
         """
         wanted = tuple(self.parameters() if parameters is None else parameters)
@@ -200,13 +203,13 @@ class Handle(ABC):
         prepare: Prepare | None = None,
         by: str = "",
     ) -> ParameterLoad:
-        """Compare a set with what the node holds, and return what is to be written: `ParameterLoad.write` writes it.
+        """Compare a set with the values of the node, and return the changes: `ParameterLoad.write` writes them.
 
             load = await drive.prepare_load(wanted)
             async for outcome in load.write(): ...
-            await drive.prepare_load(load.undo)         # what it overwrote
+            await drive.prepare_load(load.undo)         # the overwritten values
 
-        Ask `in_operation` first. `parameters` says more of the node's parameters than its document does; `prepare`
+        Call `in_operation` first. `parameters` adds to the description of the parameters in the document; `prepare`
         replaces how a write is checked and sent. Raises InvalidCommand for a set of another kind of node or an item
         that does not exist, BusError if the node does not reply.
         """
@@ -228,7 +231,7 @@ class Handle(ABC):
         return tuple(differences(cls, one, other))
 
     async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
-        """Return what says that the node is enabled or runs, "" if it does not, None if its protocol does not tell."""
+        """Return the sign that the node is enabled or runs, "" if it is not, None if its protocol has no such sign."""
         return None
 
     def _listed(self) -> Iterable[Parameter]:
@@ -241,7 +244,7 @@ class Handle(ABC):
 
     @classmethod
     def _same(cls, item: str, one: Value, other: Value) -> bool:
-        """Return whether a node cannot tell one value of an item from the other."""
+        """Return True if two values of an item are the same to the node."""
         return one == other
 
     def _written_item(self, item: str, before: Value, value: Value) -> str:
@@ -249,7 +252,7 @@ class Handle(ABC):
         return item
 
     def _counted(self, item: str) -> tuple[str, ...]:
-        """Return the items that "1.01:20" stands for; another item stands for itself."""
+        """Return the items of "1.01:20"; another item stands for itself."""
         first, _, count = item_text(item).rpartition(":")
         if not is_decimal(count) or not first:
             return (item,)

@@ -129,6 +129,8 @@ class Limiter:
         try:
             async with asyncio.timeout(min(patience, default=None)):
                 for one in reached:
+                    # In the order of `_reached`, the same for all writes: two writes to all nodes cannot wait for each
+                    # other.
                     await held.enter_async_context(one.writing)
                 while unknown := _first_unknown(reached, changes):
                     one, limit = unknown
@@ -138,6 +140,7 @@ class Limiter:
             if isinstance(late, NotStarted):
                 raise
             raise NotStarted("the current value was not read in time", node=node, command=str(command)) from None
+        # R7: an urgent write that came meanwhile supersedes the queued writes, and this one is not queued yet.
         if seen != [one.urgent for one in reached]:
             raise Superseded("overtaken by an urgent write to the same node", node=node, command=str(command))
         self.check(node, command)  # other limits may be held by now
@@ -152,6 +155,7 @@ class Limiter:
             if node in self._of:
                 yield self._of[node]
             return
+        # Nodes of other protocols on the line do not understand the broadcast.
         heard_by = {profile.name, *profile.shares_line_with}
         yield from (one for one in self._of.values() if one.node.profile.name in heard_by)
 
@@ -167,7 +171,7 @@ def _first_unknown(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any
 
 def _changes(node: Requester, command: Command[Any]) -> Mapping[Hashable, Any]:
     if not isinstance(command, Changing):
-        raise InvalidCommand(f"{node.label} has limits, and {command} does not say what it changes")
+        raise InvalidCommand(f"{node.label} has limits, and {command} does not declare its changes")
     return command.changes(node.profile)
 
 

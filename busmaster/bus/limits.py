@@ -53,6 +53,7 @@ class Limit:
     def value_after(self, changes: Mapping[Hashable, Any]) -> Any:
         """Return its value after a write. Raises InvalidCommand for a write that changes only a part of it."""
         assert isinstance(self.read, Placed)
+        # Half of a 32-bit value, for example: which value results depends on the other half.
         if any(changes.get(place) is None for place in self.places):
             raise InvalidCommand(f"{self.name} has limits: write it as a whole, and alone, so that they can be held")
         return self.decode(self.read.shown(changes))

@@ -78,6 +78,7 @@ class Logbook:
         logger.error("%s: the exchanges of poll group %r could not be chosen", self._name, group, exc_info=error)
 
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:
+        # R14: by node and state, so that a flapping node does not hide the messages of another one.
         last, more = self._written.get(key, (-PAUSE, 0))
         if now - last < PAUSE:
             self._written[key] = (last, more + 1)

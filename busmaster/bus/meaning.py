@@ -14,7 +14,7 @@ from busmaster.errors import InvalidCommand
 
 
 class MeansNothing(InvalidCommand):
-    """An invalid meaning. `field`: the field concerned; `fault`: what is wrong with it."""
+    """An invalid meaning. `field`: the field concerned; `fault`: its error."""
 
     def __init__(self, field: str, fault: str) -> None:
         self.field = field
@@ -31,7 +31,7 @@ OF_QUANTITIES = {
     "precision": "",
     **dict.fromkeys(("low", "high", "hysteresis"), "; for each of its changes, and these alone, write deadband = 0"),
 }
-"""What numbers that have names cannot have, and what to write in place of it."""
+"""Fields that are not allowed for numbers that have names, and the remedy."""
 
 
 class Named(int):
@@ -76,8 +76,8 @@ class Meaning:
     high: float | None = None
     """A value above it begins an alarm."""
     hysteresis: float | None = None
-    """How far a value must be back for its alarm to end. By default a hundredth of what is between `low` and `high`, or
-    of the one that there is."""
+    """How far a value must be back for its alarm to end. By default a hundredth of the range from `low` to `high`, or
+    of the only limit."""
     alarm_if_set: tuple[str, ...] = ()
     """Bits that begin an alarm while they are 1, by their names in `bits`: `alarm_if_set = ["FAULT"]`."""
     alarm_if_clear: tuple[str, ...] = ()
@@ -189,6 +189,7 @@ class Meaning:
 
     def named(self, value: Any) -> Any:
         """Return the value with its names; unchanged if it has none, or names from its protocol."""
+        # A list, a text or a fraction has no name.
         if not isinstance(value, int | float) or value != value // 1:
             return value
         number = int(value)
@@ -206,6 +207,7 @@ PLAIN = Meaning()
 def bit_of(value: Any, bit: int) -> bool:
     """Return True if a bit of a word is set, or a number is among flags. Raises ValueError for other values."""
     number = value.value if isinstance(value, Enum) else value
+    # Some protocols return flags as a set of numbers.
     if isinstance(number, frozenset | set):
         return bit in number
     if not isinstance(number, int | float) or not isfinite(number) or number != int(number):

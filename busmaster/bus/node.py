@@ -168,7 +168,7 @@ class Node:
 
     @property
     def health(self) -> Health:
-        """Return what is known of the node: up, suspect, down or unknown; offline while the line is lost."""
+        """Return the health of the node: up, suspect, down or unknown; offline while the line is lost."""
         return Health.OFFLINE if self._shared.condition.is_lost else self._record.health
 
     def __repr__(self) -> str:
@@ -197,6 +197,7 @@ class Node:
         own = self.profile
         if profile is own and timings is None and retries is None:
             return
+        # LEARNED alone stands for the times of the profile.
         if isinstance(timings, Learned):
             timings = timings.of(profile.timings)
         wanted = {
@@ -207,8 +208,8 @@ class Node:
         for what, differs in wanted.items():
             if differs:
                 raise InvalidCommand(
-                    f"{self.label} is already in use, and was requested again with {what}: "
-                    "give all handles of an address the same options, or leave them out in all but the first"
+                    f"{self.label} is already in use, and was requested again with {what}. "
+                    "Give all handles of an address the same options, or leave them out in all but the first"
                 )
 
     def merge_reads(self, merge: Merge, /) -> None:
@@ -228,8 +229,8 @@ class Node:
                 raise InvalidCommand(f"{self.label}: a probe or sync read must read, and {command} writes")
         if any(said and said != now for said, now in zip(before, wanted, strict=True)):
             raise InvalidCommand(
-                f"{self.label} is already in use, and was requested again with another probe or other sync reads: "
-                "give all handles of an address the same options, or leave them out in all but the first"
+                f"{self.label} is already in use, and was requested again with another probe or other sync reads. "
+                "Give all handles of an address the same options, or leave them out in all but the first"
             )
         self._sync_reads = wanted
         own = self._record.profile
@@ -240,6 +241,7 @@ class Node:
         """Add a limit: reject every write that violates it, under any name of the quantity, and in writes to all nodes
         too."""
         line = self._shared
+        # Made with the first limit: a line without one has no extra work for a write.
         line.limiter = line.limiter or Limiter()
         line.limiter.add(self, limit)
 
@@ -349,6 +351,7 @@ class Node:
     def _options(self, given: CommandOptions) -> RequestOptions:
         """Return the options of a caller. Raises InvalidCommand with the node's name."""
         options = RequestOptions.of(given, self.label)
+        # One command has no item to read back. A handle knows it.
         if options.verify:
             raise InvalidCommand(f"{self.label}: verify is only available for the write methods of a handle")
         return options
@@ -364,6 +367,7 @@ class Node:
         client, touches = request.client, request.touches
         if client is not None and isinstance(client, Hold) and client.over:
             raise hold_ended(self, client.longest, command)
+        # Before anything is sent: the request would time out, and count as a failure.
         if self._to_all and not command.writes:
             raise InvalidCommand(
                 f"{self.profile.name}: address {self.address} is for writes to all nodes; no node replies to a read"
@@ -374,6 +378,7 @@ class Node:
                 raise line.not_open(record=record, command=str(command))
             line.check_loop()
         if type(command) not in self._kinds:
+            # Checked once per type of command, not per request.
             if not hasattr(command, "open"):
                 raise InvalidCommand(f"{self.label}: {command!r} is not a command; read it through a handle or a point")
             self._kinds[type(command)] = command
@@ -471,7 +476,7 @@ def _windows(asked: Timings | Learned | None, own: Timings | Learned) -> str:
 
 
 def _window(timings: Timings | Learned) -> str:
-    return "what is learned" if isinstance(timings, Learned) else f"{timings.read.window * 1000:g} ms"
+    return "the learned time" if isinstance(timings, Learned) else f"{timings.read.window * 1000:g} ms"
 
 
 class _HeldNode(HeldNode):

@@ -1,4 +1,4 @@
-"""Parameter sets: what a node holds, item by item, to be saved, compared, and written to a node again."""
+"""Parameter sets: the values of a node, item by item, to be saved, compared, and written to a node again."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ ROUNDS = 3
 """How often a request is made that gets no reply while the node replies to others, each time with its retries. On a
 line that loses 2 % of all telegrams one request in some 10 000 fails, and a list may have as many parameters."""
 AT_A_TIME = 128
-"""Reads among which cheaper exchanges are looked for."""
+"""Number of reads that are merged together into cheaper exchanges."""
 ROUNDING = 1e-12
-"""Relative difference of two numbers that are the same but for their conversion to and from a unit."""
+"""Relative difference of two numbers that is caused only by the conversion to and from a unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
     """One parameter of a node.
 
-    `item` names it as the handle's `point` does, `name` is what people call it. `access` is what the document says,
-    empty where it says nothing. A number on the line stands for number / 10**decimals * factor + offset in `unit`;
-    `minimum` and `maximum` are in that unit. `kept` is the reason why a load never writes it, empty if it does.
-    `stage` says when a load writes it: FIRST, USUAL or LAST.
+    `item`: its item for the handle's `point`. `name`: its name in the document. `access`: the access that the document
+    states, or empty. A number on the line means number / 10**decimals * factor + offset in `unit`; `minimum` and
+    `maximum` are in that unit. `kept`: the reason why a load never writes it, or empty. `stage`: when a load writes it,
+    FIRST, USUAL or LAST.
     """
 
     item: str
@@ -84,8 +84,8 @@ class Difference(NamedTuple):
 class ParameterSet:
     """The parameters of one node at one time, by item, in the order of the document.
 
-    `protocol` is the name of the kind of node, as LINE.toml has it; `line` the name of the port; `identity` what the
-    node says of itself, by item, where its protocol has such items. `by` is who saved it.
+    `protocol`: the kind of node, as in LINE.toml. `line`: the name of the port. `identity`: the items that identify the
+    node, if its protocol has any. `by`: the user who saved it.
     """
 
     protocol: str
@@ -99,7 +99,7 @@ class ParameterSet:
 
 
 class Found(NamedTuple):
-    """What came of reading one parameter: its value, or why there is none. `gap`: the node says that it has none."""
+    """The result of reading one parameter: its value, or the reason. `gap`: the node reports that it does not exist."""
 
     parameter: Parameter
     value: Value | None = None
@@ -108,7 +108,7 @@ class Found(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What a load writes to one parameter."""
+    """One write of a load: the value before, and the value to be written."""
 
     parameter: Parameter
     before: Value
@@ -118,7 +118,7 @@ class Change(NamedTuple):
 class Left(NamedTuple):
     """A parameter that a load does not write, and why. `before` is None if it could not be read.
 
-    `expected`: the document or LINE.toml says that it is not written.
+    `expected`: it is not written according to the document or LINE.toml.
     """
 
     parameter: Parameter
@@ -129,7 +129,7 @@ class Left(NamedTuple):
 
 
 class Result(Enum):
-    """What became of one change."""
+    """Result of one change."""
 
     WRITTEN = "written"
     """It was written and read back."""
@@ -138,13 +138,13 @@ class Result(Enum):
     DIFFERS = "differs"
     """It was written, but something else was read back."""
     UNCONFIRMED = "unconfirmed"
-    """It was sent, and it is not known what the node holds now."""
+    """It was sent, and the value in the node is not known."""
     NOT_WRITTEN = "not written"
     """Nothing was sent."""
 
 
 class Outcome(NamedTuple):
-    """A change, what became of it, and why."""
+    """A change, its result, and the reason."""
 
     change: Change
     result: Result
@@ -152,14 +152,14 @@ class Outcome(NamedTuple):
 
 
 Prepare: TypeAlias = Callable[[Change, str], Callable[[], Awaitable[None]]]
-"""Returns what carries out a change, by the item that the node is written by. Raises InvalidCommand for a value that
-may not be written."""
+"""Returns the function that carries out a change, for the item to write to. Raises InvalidCommand for a value that must
+not be written."""
 Around: TypeAlias = Callable[[Change], AbstractContextManager[object]]
-"""What a change is written in: a record is kept of it."""
+"""Returns the context in which a change is written, for example one that keeps an audit log."""
 
 
 class Holder(Protocol):
-    """What parameter sets need of a handle."""
+    """The part of a handle that parameter sets use."""
 
     profile: ClassVar[Profile]
     node: Requester
@@ -176,12 +176,12 @@ class Holder(Protocol):
 
 
 def alike(handle: type[Holder], item: str, one: Value, other: Value) -> bool:
-    """Return whether two values of an item are the same to a node of this kind."""
+    """Return True if two values of an item are the same to a node of this kind."""
     return isclose(one, other, rel_tol=ROUNDING) or handle._same(item, one, other)
 
 
 def differences(handle: type[Holder], one: ParameterSet, other: ParameterSet) -> Iterator[Difference]:
-    """Yield the parameters that are not alike in two sets of this kind of node, in the order of the first set.
+    """Yield the parameters that differ in two sets of this kind of node, in the order of the first set.
 
     Raises InvalidCommand for a set of another kind.
     """
@@ -199,10 +199,10 @@ def differences(handle: type[Holder], one: ParameterSet, other: ParameterSet) ->
 
 
 async def walk(handle: Holder, parameters: Sequence[Parameter]) -> AsyncIterator[Found]:
-    """Read parameters one after the other, and yield what comes of each, in the background of other traffic.
+    """Read parameters one after the other in the background of other traffic, and yield the result of each.
 
-    Where the node's profile merges reads, those that are merged come together. What the node refuses is a gap. Raises
-    the BusError of a node that does not reply any more, InvalidCommand for an item that does not exist.
+    If the node's profile merges reads, merged ones are read together. A refused parameter is a gap. Raises the BusError
+    of a node that does not reply any more, InvalidCommand for an item that does not exist.
     """
     handle = handle._plain()
     merge = handle.node.profile.merge
@@ -210,6 +210,7 @@ async def walk(handle: Holder, parameters: Sequence[Parameter]) -> AsyncIterator
     for start in range(0, len(parameters), AT_A_TIME):
         part = commands[start : start + AT_A_TIME]
         left = dict.fromkeys(range(len(part)))
+        # The largest first: it saves most, and those that overlap with it are skipped.
         for batch in sorted(merge(part) if merge else (), key=lambda batch: -len(batch.serves)):
             if not left.keys() >= set(batch.serves):
                 continue
@@ -239,12 +240,13 @@ async def read_one(handle: Holder, parameter: Parameter, command: Command[Any] |
 
 
 async def _answer(node: Requester, command: Command[Any]) -> Any:
-    """Return what a read returns. Raises NoReply or GarbledReply only of a node that replies to its probe."""
+    """Return the value of a read. Raises NoReply or GarbledReply only if the node replies to its probe."""
     for turn in range(ROUNDS):
         try:
             return await node.request(command, priority=BACKGROUND)
         except (NoReply, GarbledReply):
             try:
+                # A dead node would otherwise take three rounds for each of hundreds of parameters.
                 await node.request(node.profile.probe, priority=BACKGROUND)
             except Refused:
                 pass  # it replies
@@ -261,18 +263,18 @@ def _found(handle: Holder, parameter: Parameter, raw: Any) -> Found:
     if isinstance(value, bool):
         return Found(parameter, value)
     if isinstance(value, int):
-        return Found(parameter, int(value))  # of a word the number
+        return Found(parameter, int(value))  # the number of a word, without its names
     if isinstance(value, float) and isfinite(value):
         return Found(parameter, value)
     return Found(parameter, why=f"it holds {value!r}, which is not one finite number")
 
 
 class ParameterLoad:
-    """What writing a set to a node comes to; nothing is written yet.
+    """The writes that would give a node the values of a set. Nothing is written yet.
 
-    `changes` are the differences that `write` writes, in that order; `left` those that it does not write, each with the
-    reason. `equal` counts the parameters that the node holds already. `undo` has what the changes overwrite. Changes
-    are checked by `prepare` before the first is written.
+    `changes`: the differences that `write` writes, in that order. `left`: those that it does not write, with reasons.
+    `equal`: number of parameters that have the value already. `undo`: the values that the changes overwrite. `prepare`
+    checks all changes before the first is written.
     """
 
     def __init__(self, handle: Holder, before: ParameterSet, prepare: Prepare) -> None:
@@ -284,7 +286,7 @@ class ParameterLoad:
         self._prepare = prepare
 
     def _take(self, found: Iterable[tuple[Entry, Found]]) -> None:
-        """Sort what was read: into what is equal, what is to be written, and what cannot be."""
+        """Sort the values that were read: equal, to be written, or not writable."""
         changes, left = [], []
         for (own, value), now in found:
             if now.value is None:
@@ -320,10 +322,10 @@ class ParameterLoad:
         return self._prepare(change, item)
 
     async def write(self, *, around: Around = lambda change: nullcontext()) -> AsyncIterator[Outcome]:
-        """Write the changes one after the other, each verified by reading it back, and yield what became of each.
+        """Write the changes one after the other, verify each by reading it back, and yield the result of each.
 
-        What the node refuses does not stop the others. Once it is not known what became of a write, or nothing can be
-        sent, nothing more is written. `around` makes the context in which each change is written.
+        A refusal does not stop the others. After a write with an unknown outcome, or if nothing can be sent, nothing
+        more is written. `around` returns the context in which each change is written.
         """
         stopped = ""
         for change in self.changes:
@@ -331,6 +333,7 @@ class ParameterLoad:
                 yield Outcome(change, Result.NOT_WRITTEN, stopped)
                 continue
             outcome = await self._outcome(change, around)
+            # Later parameters may depend on this one, for example on a mode.
             if outcome.result in (Result.UNCONFIRMED, Result.NOT_WRITTEN):
                 stopped = f"nothing is written after {change.parameter.item}, whose write did not succeed"
             yield outcome
@@ -350,8 +353,8 @@ class ParameterLoad:
         return Outcome(change, Result.WRITTEN)
 
     async def _write(self, change: Change) -> None:
-        """Write and read back. A write of which it is not known what became of it is repeated if the old value is read:
-        it was not carried out, and may be."""
+        """Write and read back. A write with an unknown outcome is repeated if the old value is read back: then it was
+        not carried out."""
         unconfirmed: BusError | None = None
         for _ in range(ROUNDS):
             try:
@@ -362,6 +365,7 @@ class ParameterLoad:
             found = await self._read_back(change, unconfirmed)
             if alike(type(self._handle), change.parameter.item, found, change.value):
                 return
+            # A third value: something else writes to this parameter.
             if unconfirmed is None or not alike(type(self._handle), change.parameter.item, found, change.before):
                 raise VerifyFailed(f"it reads {found!r} after {change.value!r} was written", node=self._handle.node)
         assert unconfirmed is not None
@@ -379,13 +383,13 @@ class ParameterLoad:
 
 
 async def identity_of(handle: Holder) -> dict[str, Value]:
-    """Return what a node says of itself, by item; without what it does not have. Raises as `walk`."""
+    """Return the values that identify a node, by item, without items that it does not have. Raises as `walk`."""
     found = [await read_one(handle, Parameter(item=item)) for item in handle._identity]
     return {one.parameter.item: one.value for one in found if one.value is not None}
 
 
 async def empty_set(handle: Holder, by: str = "") -> ParameterSet:
-    """Return a set of a node without parameters, with what it says of itself. Raises as `walk`."""
+    """Return a set of a node without parameters, with the values that identify it. Raises as `walk`."""
     node = handle.node
     return ParameterSet(
         protocol=handle.profile.kind_name,
@@ -401,9 +405,9 @@ async def empty_set(handle: Holder, by: str = "") -> ParameterSet:
 async def prepared(
     handle: Holder, wanted: ParameterSet, own: Mapping[str, Parameter], prepare: Prepare, by: str
 ) -> ParameterLoad:
-    """Read what a node holds of a set, and return what writing the set comes to.
+    """Read the parameters of a set from a node, and return the load that writes the differences.
 
-    `own` are the parameters of the node. `handle` is a plain one.
+    `own`: the parameters of the node. `handle`: a plain one.
 
     Raises InvalidCommand for a set of another kind of node, BusError for a node that does not reply.
     """
@@ -414,7 +418,7 @@ async def prepared(
     asked = [own.get(item, entry.parameter) for item, entry in wanted.entries.items()]
     found = {one.parameter.item: one async for one in walk(handle, asked)}
     order = {item: number for number, item in enumerate(own)}
-    # In the document's order; what the document does not list comes behind that, as the set has it.
+    # In the document's order. Parameters that the document does not list follow, in the order of the set.
     items = sorted(wanted.entries, key=lambda item: order.get(item, len(order)))
     load._take((Entry(found[item].parameter, wanted.entries[item].value), found[item]) for item in items)
     return load

@@ -87,6 +87,7 @@ class Point(Generic[T]):
             return bit_of(raw if of_word is None else of_word(raw), number)
 
         told = self.meaning.of_bit(name)
+        # For the type checker: `replace` would return a Point[T].
         word: Any = self
         bit: Point[bool] = replace(word, item=f"{self.item}.{name}", unit="", decode=decode, encode=None, meaning=told)
         return bit
@@ -125,6 +126,7 @@ class Point(Generic[T]):
         The other options are those of `RequestOptions`.
         """
         if max_age is not None:
+            # Infinity is allowed here, unlike for other times: any value of a poll group is new enough.
             if max_age != inf:
                 max_age = seconds(max_age, f"{self.node.label}: max_age")
             # from any group: two groups may read one quantity, and a write makes the samples of both stale

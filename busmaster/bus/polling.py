@@ -89,6 +89,7 @@ class PollGroup(Cycles):
         self._merge = tuple(merge)
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
+        # With a group, the arbiter reports each exchange when it ends, and not only the whole cycle.
         self._poll.group = self
         self._points: dict[Point[Any], Node] = {}
         self._watched: tuple[Point[Any], ...] = ()
@@ -174,6 +175,7 @@ class PollGroup(Cycles):
         """Continue on the grid. The paused time does not count as a period."""
         if self._poll.paused:
             self._poll.paused = False
+            # The period that spans the pause is not measured.
             self._tally.last = None
 
     def demand(self) -> None:
@@ -186,6 +188,7 @@ class PollGroup(Cycles):
         # close() may be called again by the bus that closes, or by `async with`.
         if self._poll.active:
             self._on_close(self)
+            # First: an alarm of a point that is no longer polled would stay active for ever.
             self._watch(())
             self._line.latest_of.pop(self.name, None)
             self._line.answers_of.pop(self.name, None)
@@ -218,6 +221,7 @@ class PollGroup(Cycles):
     def planned(self) -> PlannedGroup:
         """Return the group as the planner uses it, with reply times measured so far."""
         # Refused merges are left out: the plan must use the exchanges that are really sent.
+        # Once per node: a plan of a node copies its profile.
         nodes = {node: node.planned() for node in set(self._points.values())}
         for node, plan in nodes.items():
             if self._refused and plan.profile.merge is not None:
@@ -241,7 +245,7 @@ class PollGroup(Cycles):
         self._line_time += read.line_time
         if transaction.error is None:
             _measure(transaction, read)
-        # A refused batch says nothing about its items: they are read one by one instead.
+        # The refusal of a batch does not show which item was refused: they are read one by one instead.
         elif read.served.batch and isinstance(transaction.error, Refused):
             self._refusals.append(read)
         for point, place in read.points:
@@ -259,6 +263,7 @@ class PollGroup(Cycles):
         if self._refusals:
             self._fall_back()  # no snapshot yet: the single reads follow in the same period
             return
+        # A write may have ended since the first exchange of this cycle.
         self._age()
         self._use_readings()
         self._tally.note(poll, self._qualities)
@@ -283,6 +288,7 @@ class PollGroup(Cycles):
         value = None
         quality = Quality.BAD
         if error is None:
+            # R2: a late reply is as right as any other. Only its time is unusual.
             quality = Quality.LATE if transaction.late else Quality.GOOD
             # One comparison on a line without writes; only then the search for the relevant write.
             if self._line.last_touched > transaction.started and self._line.is_stale(point, transaction.started):
@@ -315,6 +321,7 @@ class PollGroup(Cycles):
 
     def _age(self) -> None:
         """Mark samples as stale that were read before a write to their point that has ended in the meantime."""
+        # The usual case: no write on the whole line during the cycle.
         if self._line.last_touched <= self._poll.started:
             return
         for transaction in self._poll.results:
@@ -348,6 +355,7 @@ class PollGroup(Cycles):
         if not fresh:
             return
         self._between |= fresh
+        # A copy: consumers may still hold the snapshot of the cycle, which must not change.
         self._line.latest_of[self.name] = self.latest = replace(latest, samples={**latest.samples, **fresh})
         answer = Answer(read.node, read.command, [(point, None) for point in fresh], reading.value, reading.started)
         self._line.answers_of[self.name] = [*self._line.answers_of.get(self.name, ()), answer]
@@ -363,6 +371,7 @@ class PollGroup(Cycles):
         # Calculated only if there are consumers of changes: this runs for every confirmed write.
         if latest is None or not self._consumers_of_changes:
             return
+        # The instant before the write: a sample is stale if it was read before it.
         to_all, before = record.address == record.profile.broadcast, nextafter(when, -inf)
         wall = when + self._wall_offset
         outdated = {}
@@ -384,6 +393,7 @@ class PollGroup(Cycles):
             if sample is None or reading.started is None or not _is_older(sample, reading.started):
                 continue
             if self._line.is_stale(point, reading.started):
+                # Another write has ended since that read.
                 reading = reading._replace(quality=Quality.STALE)
             self._qualities[sample.quality] -= 1
             self._qualities[reading.quality] += 1
@@ -406,6 +416,7 @@ class PollGroup(Cycles):
 
     def _choose(self) -> None:
         """Choose the exchanges again, in slices, so that the line continues (see Schedule.prepare)."""
+        # Replaces an unfinished one: with several changes in a row only the last choice counts.
         self._poll.preparation = self._choosing()
         self._line.prepare(self._poll)
 
@@ -427,6 +438,7 @@ class PollGroup(Cycles):
         fresh = []
         for read in reads:
             fresh.append(Transaction(read.node._record, read.served.command, tag=read, client=self._client))
+            # All points in order, so that a snapshot has the group's order, whichever exchange ends first.
             read.blank.update((point, None) for point, _ in read.points)
             yield 5
         set_members(poll, fresh, self._priority)
@@ -479,7 +491,8 @@ class PollGroup(Cycles):
         return sound if refused else merge
 
     def _fall_back(self) -> None:
-        """Send the commands of a refused batch now, one by one: the refusal says nothing about them."""
+        """Send the commands of a refused batch now, one by one: each of them may still be accepted."""
+        # For good: a node that lacks one item of a run would refuse it in each cycle.
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
         self._line.demand(self._poll)

@@ -61,6 +61,7 @@ class ReadsAfterWrites:
         if point.quantity in self._waiting:
             self.shared += 1
             return
+        # Until its read has ended: a read that is on the wire may have been answered before the next write.
         self._waiting.add(point.quantity)
         self._start(self._read(point, node, within))
 

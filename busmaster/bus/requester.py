@@ -73,13 +73,13 @@ class RequestOptions:
     """Options of a request. Raises InvalidCommand for invalid values.
 
     `priority`: its class, a Priority or its number. `start_within`: seconds after which an unsent request fails with
-    NotStarted; applies to each exchange if a call takes several. `finish_within`: seconds for the whole call. Then the
-    caller gets NotStarted if nothing was sent, WriteUnconfirmed if a write or a part of it was sent and its outcome is
-    unknown, or NoReply if a read was sent and not answered yet. An exchange on the wire is finished without its caller
-    and not repeated. `retries`: 0 to 100, instead of the node's. `idempotent`: a write may be repeated after an unknown
-    outcome (R7), instead of the command's own setting. `verify`: a handle's `write` reads the value back and raises
-    VerifyFailed if it differs. `safe`: the write belongs to the safe state in which a line is left. It is accepted when
-    other writes are not (`ext.take_only_safe_writes`) and is not limited.
+    NotStarted; applies to each exchange if a call takes several. `finish_within`: seconds for the whole call. After
+    that the caller gets NotStarted if nothing was sent, or NoReply if a read was sent and has no reply yet. If a write
+    or a part of it was sent, the outcome is unknown, and the caller gets WriteUnconfirmed. An exchange on the wire is
+    finished without its caller and not repeated. `retries`: 0 to 100, instead of the node's. `idempotent`: a write may
+    be repeated after an unknown outcome (R7), instead of the command's own setting. `verify`: a handle's `write` reads
+    the value back and raises VerifyFailed if it differs. `safe`: the write belongs to the safe state in which a line is
+    left. It is accepted when other writes are not (`ext.take_only_safe_writes`) and is not limited.
     """
 
     priority: Priority = COMMAND
@@ -198,8 +198,8 @@ class Requester(Protocol):
         """Return this node for an exclusive sequence of requests, for `async with`. Only urgent requests go between
         them.
 
-        The line is held from the first request until the block is left, for at most `max_hold` seconds (up to 5) and to
-        the end of the exchange that is then on the wire. Later requests in the block raise HoldEnded and are not sent.
+        The line is held from the first request until the block is left, for at most `max_hold` seconds (up to 5). An
+        exchange that is then on the wire is finished. Later requests in the block raise HoldEnded and are not sent.
         Only requests to the node returned for the block belong to the sequence; all other requests, of this program
         too, wait.
         """
@@ -226,6 +226,7 @@ class SeveralRequests:
     def __init__(self, node: Requester, given: WriteOptions | ReadOptions) -> None:
         self._node = node
         chosen = RequestOptions.of(given, node.label) if given else ORDINARY
+        # Before the first write: an error after it would leave the caller with written values.
         if chosen.verify and node.address == node.profile.broadcast:
             raise InvalidCommand(f"{node.profile.name}: a write to all cannot be verified: no node replies to a read")
         self.verify = chosen.verify
@@ -254,6 +255,7 @@ class SeveralRequests:
             return await self._node.request(command, touches=touches, **options)
         except (NotStarted, NoReply) as error:
             in_time = self._finish_by is None or self._node.now() < self._finish_by
+            # The first request's error is exact. A later NotStarted would mean that nothing at all was sent.
             if not self._written or (in_time and isinstance(error, NoReply)):
                 raise
             what = f"{so_far}, then: {error.what}"

@@ -100,13 +100,14 @@ class SharedLine:
     @property
     def condition(self) -> LineCondition:
         """Return whether the line is lost while the bus is open, since when, and why. Thread-safe."""
+        # A bus that was never opened, or is closed, has lost nothing.
         lost = self.running and self.arbiter.state is LineState.OFFLINE
         return self.losses.condition if lost else PRESENT
 
     def as_of_now(self, point: Point[Any], sample: Sample[Any]) -> Sample[Any]:
         """Return a sample with its current quality, possibly long after it was read.
 
-        While the line is lost it is bad, with an error that says why. After a write to its quantity it is stale. Every
+        While the line is lost it is bad, with the reason as its error. After a write to its quantity it is stale. Every
         consumer that shows a value later than its cycle uses this. Thread-safe.
         """
         if sample.error is not None:
@@ -210,7 +211,7 @@ class SharedLine:
         return self.arbiter.add_client(share, owner_time, user)
 
     def remove_client(self, client: LineClient) -> None:
-        """Forget a client: nothing is asked for it any more."""
+        """Remove a client: no further request is made for it."""
         self.clients -= 1
         self.arbiter.remove_client(client)
 
@@ -223,6 +224,7 @@ class SharedLine:
         """Return how many queued requests of this program go before another one of this class."""
         dispatcher = self.arbiter.dispatcher
         queues = dispatcher.writes.queues.values()
+        # Parked writes are in no class queue, but go before a new request of this program.
         parked = sum(write.phase is Phase.PARKED and write.client is None for queue in queues for write in queue)
         return dispatcher.backlog.waiting_of(priority, None) + parked
 

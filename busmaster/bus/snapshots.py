@@ -121,11 +121,13 @@ class Tally:
         """
         for quality, number in qualities.items():
             self.samples[quality] += number
+        # No exchange of the cycle was sent, for example because all its nodes are DOWN.
         begun = poll.started if poll.started > -inf else poll.due
         if self.last is not None:
             self.spanned += begun - self.last
             self.periods += 1
             self.recent.append(begun - self.last)
+        # A pause is not a period: it would be counted as one long period.
         self.last = None if poll.paused else begun
         self.cycles += 1
         self.cycle_time.record(poll.finished - poll.due)
@@ -182,6 +184,7 @@ class Stream(Generic[T]):
 
     def close(self, cause: Exception | None = None) -> None:
         """Add no further items. Items in the buffer can still be read; then iteration ends, or raises the cause."""
+        # The first cause counts: a stream may be closed again by the `finally` of its consumer.
         if not self._closed:
             self._cause = cause
         self._closed = True

@@ -29,6 +29,7 @@ def check_settings(profile: Profile, endpoint: Endpoint) -> None:
     A line in memory has no settings; behind a port of raw TCP the serial server sets the framing.
     """
     settings = endpoint.settings
+    # A warning and not an error: the documents leave some settings to the user, and adapters differ.
     if settings is None or not isinstance(endpoint, SerialPort | TcpPort):
         return
     framings = dict.fromkeys(line.framing for line in (profile.line, *profile.other_lines))

@@ -18,6 +18,7 @@ class Taps:
     def add(self, tap: Tap) -> None:
         """Pass all traffic to `tap` from now on. Of the exchange on the wire it may see only the end."""
         self._taps.append(tap)
+        # Only for the first and the last tap: the arbiter numbers the attempts while it is tapped.
         if len(self._taps) == 1:
             self._pump.arbiter.set_tapped(True)
         self._set()
