@@ -259,13 +259,12 @@ class Dispatcher:
     def next(self, now: float) -> Transaction | None:
         """Remove and return the transaction to send now, or None."""
         while (transaction := self.backlog.pop(now)) is not None:
-            # The usual verdict, without the call of `_admitted`: this runs for every request (benchmark `turnaround`).
-            if self.fault is None and eligibility(transaction, now, self.writes) is OK:
+            fault = self.fault
+            # same as `eligibility`, written out: this runs for every request (benchmark `turnaround`)
+            verdict = eligibility(transaction, now, self.writes, None if fault is None else fault())
+            if verdict is OK or (acted := self._act_on(verdict, transaction, now)) is OK:
                 return transaction
-            verdict = self._admitted(transaction, now)
-            if verdict is OK:
-                return transaction
-            if verdict is WAITS:
+            if acted is WAITS:
                 self.writes.park(transaction)
             self.backlog.keep_turn(transaction)
         return None
@@ -285,7 +284,9 @@ class Dispatcher:
     def _admitted(self, transaction: Transaction, now: float) -> Eligible | None:
         """Return OK or WAITS, or end the transaction and return None. A request to a dead node is charged to the probe
         budget."""
-        verdict = self.eligibility(transaction, now)
+        return self._act_on(self.eligibility(transaction, now), transaction, now)
+
+    def _act_on(self, verdict: Eligible | Rejected, transaction: Transaction, now: float) -> Eligible | None:
         if verdict is IF_PAID:
             cost = transaction.node.max_reply_delay
             if self.probes.spare(cost, now):

@@ -275,8 +275,7 @@ class InSync:
                 payers.append(overdue)
                 self._pay(overdue)
                 rest = rest[:place] + rest[place + len(overdue.key) :]
-        # All bytes are accounted for: no duplicate is suspected.
-        # Without bytes left over, the run is explained by overdue replies.
+        # Overdue replies account for all bytes: no duplicate is suspected.
         if payers and not rest:
             return payers[0]
         if not payers and any(until > now and _is(run, key) for key, until in (*self._ambiguous, *self._forgiven)):
