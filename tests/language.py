@@ -16,10 +16,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
-CLEAN = """README.md CONTRIBUTING.md SECURITY.md CODE_OF_CONDUCT.md benchmarks/README.md docs/README.md docs/howto
-docs/adding-a-protocol.md docs/adding-an-interface.md docs/adding-an-output.md docs/explanation/words.md
-docs/explanation/how-the-arbiter-thinks.md docs/protocols docs/public-api.md docs/questions.md docs/tutorial.md
-docs/upgrading.md"""
+CLEAN = """busmaster/arbiter busmaster/bus busmaster/transport README.md CONTRIBUTING.md SECURITY.md CODE_OF_CONDUCT.md
+benchmarks/README.md docs/README.md docs/howto docs/adding-a-protocol.md docs/adding-an-interface.md
+docs/adding-an-output.md docs/explanation/words.md docs/explanation/how-the-arbiter-thinks.md docs/protocols
+docs/public-api.md docs/questions.md docs/tutorial.md docs/upgrading.md"""
 LONGEST = 30
 RULES = {  # name: what to look for, in any case
     "person": r"\b(?:no|some)(?:body| one)\b|\bwho(?:m|ever)\b|\bhis\b|\bhe\b|\bhim\b",
@@ -59,9 +59,8 @@ def markdown(text: str) -> Iterator[tuple[int, str]]:
 
 def python(text: str) -> Iterator[tuple[int, str]]:
     """Docstrings, comments, and strings of three words and more, without literal blocks and tables."""
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string.lstrip("# ")
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    yield from ((one.start[0], one.string.lstrip("# ")) for one in tokens if one.type == tokenize.COMMENT)
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and len(node.value.split()) > 2:
             for paragraph in re.split(r"\n\s*\n", re.sub(r"`[^`]+`", "CODE", inspect.cleandoc(node.value))):

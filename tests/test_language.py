@@ -74,3 +74,12 @@ def test_docstrings_comments_and_messages_are_checked(tmp_path: Path, monkeypatc
     (tmp_path / "module.py").write_text(source)
     found = {(number, rule) for number, rule, _ in findings(tmp_path / "module.py")}
     assert found == {(1, "owe"), (1, "what"), (3, "person"), (4, "say")}
+
+
+def test_tables_and_literal_blocks_of_a_docstring_are_not_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(language, "ROOT", tmp_path)
+    source = '"""Two of them.\n\n    nobody asks it\n\n====  ====\nit is told\n====  ====\n\nIt is owed.\n"""\n'
+    (tmp_path / "module.py").write_text(source)
+    assert [rule for _, rule, _ in findings(tmp_path / "module.py")] == ["owe"]

@@ -242,3 +242,15 @@ def test_r7_a_write_that_was_on_the_wire_never_ends_as_if_it_had_not_been() -> N
     assert "gone" in str(write.error)
     assert write.attempts == 1
     assert desk.on_wire is other
+
+
+def test_r13_a_queued_request_is_not_sent_while_the_line_is_unusable() -> None:
+    desk = Desk()
+    first, queued = desk.submit(), desk.submit(node=1, write=True)
+    desk.dispatcher.fault = lambda: BusError("gone")
+    desk.finish()
+    assert first.error is None
+    assert desk.on_wire is None
+    assert queued.error is not None
+    assert queued.error.what == "gone"
+    assert not queued.attempts

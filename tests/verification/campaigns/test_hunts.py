@@ -214,3 +214,10 @@ def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_faul
     assert ledger.disguised(10.0, 11.0)
     assert not ledger.disguised(10.0, 10.5), "it still lasts"
     assert not ledger.disguised(7.0, 11.0), "it replies to this request"
+
+
+@pytest.mark.slow
+def test_a_hunt_in_which_noise_makes_such_a_reply_breaks_no_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning, "TRUSTED_AFTER", 3)
+    monkeypatch.setattr(learning, "EPOCH", 10)
+    assert Hunt("ei-bisynch", "wrong", 60200, learned=True).run(5000).problems == []
