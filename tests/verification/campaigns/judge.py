@@ -145,10 +145,11 @@ class Judge:
             return
         if self.mix.edges is not None and self.line.echo is None and self.line.held_back(now):
             self.problem("R3: a request leaves while bytes of a reply lie in the adapter")
-        if last.start > now + ROUNDING:
+        disguised = self.ledger.disguised(self.line.asked_at, now)
+        if last.start > now + ROUNDING and not disguised:
             self.problem(f"R3: a request leaves while a reply is still to come, at {last.start:.6f}")
         calm = self.mix.edges is not None and not self.mix.device  # then whatever noise did to it, its end is known
-        spared = self.ledger.damaged(last.start, now) or self.ledger.disguised(last.cause, now)
+        spared = self.ledger.damaged(last.start, now) or disguised
         if last.end > now + ROUNDING and (calm or not spared):
             self.problem(f"R1: a request leaves into a reply that lasts until {last.end:.6f}")
 
@@ -275,10 +276,14 @@ class Judge:
 
     def _wrong(self, transaction: Transaction, what: str) -> None:
         ledger, begin, end = self.ledger, transaction.started, transaction.ended_at
-        confused = ledger.overdue_reply_in(begin, end) or not ledger.damaged(begin, end)
-        if not transaction.writes and transaction.error is None:
+        command, address = transaction.command, transaction.node.address
+        read = not transaction.writes and transaction.error is None
+        confused = not ledger.damaged(begin, end)
+        for frame in ledger.overdue_replies(begin, end):
+            confused = confused or not read or echoed(command, address, frame.data)
+        if read:
             heard = b" ".join(bytes(spoken.heard) for spoken in self.line.during(begin, end))
-            confused = confused or not echoed(transaction.command, transaction.node.address, heard)
+            confused = confused or not echoed(command, address, heard)
         self._count_wrong(confused, what)
 
     def _count_wrong(self, confused: bool, what: str) -> None:

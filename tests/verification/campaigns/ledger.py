@@ -46,6 +46,7 @@ class Frame(NamedTuple):
     cause: float
     start: float
     end: float
+    data: bytes = b""
 
 
 NOTHING = Frame(-inf, -inf, -inf)
@@ -170,10 +171,10 @@ class Ledger:
                 self.problem(f"R7: device {node} took the write of {number} after a later one")
             self._orders[node, written.by] = written.order
 
-    def said(self, start: float, end: float, asked: bool, talker: object = None) -> None:
+    def said(self, start: float, end: float, asked: bool, talker: object = None, data: bytes = b"") -> None:
         """A device is going to say something; `asked`: the last request was for it."""
         now = self.now()
-        frame = Frame(now, start, end)
+        frame = Frame(now, start, end, data)
         self._frames.append(frame)
         if asked:
             self._asked.append((talker, frame))
@@ -209,9 +210,15 @@ class Ledger:
         """A device spoke unexpected a short while ago."""
         return self.now() - self._unexpected_at < RECENT
 
-    def overdue_reply_in(self, begin: float, end: float) -> bool:
-        """Something that was caused before `begin` was still being said in that time."""
-        return any(frame.cause < begin < frame.end - ROUNDING and frame.start < end for frame in self._frames)
+    def overdue_replies(self, begin: float, end: float) -> Iterator[Frame]:
+        """Replies to requests before `begin` that were still on the line in that time, and that noise did not change.
+
+        Nothing can tell one that noise has changed from the reply to the present request, if it looks like that one.
+        """
+        for frame in self._frames:
+            late = frame.cause < begin < frame.end - ROUNDING and frame.start < end
+            if late and not self.damaged(frame.start, frame.end):
+                yield frame
 
 
 class LedgerMemory(TraceableMemory):
@@ -246,12 +253,17 @@ class WatchedLine(Line):
         """The devices that have said something since the last request."""
         self._exchanges: deque[Spoken] = deque([Spoken(-inf, -inf)], maxlen=REMEMBERED)
 
+    @property
+    def asked_at(self) -> float:
+        """When the latest exchange began."""
+        return self._exchanges[-1].asked_at
+
     def send(self, data: bytes, now: float) -> None:
         if len(data) > 1:
             self.on_request(now)
             self._request = data
-            self._replied.clear()
             self._exchanges.append(Spoken(now, now))
+        self._replied.clear()  # one byte requests the next parameter of an exchange: the same node replies once more
         super().send(data, now)
         self._exchanges[-1].asked_until = now + len(data) * self.settings.byte_time
 
@@ -287,7 +299,7 @@ class WatchedLine(Line):
             self._replied.append(talker)
         if self.record is not None:
             self.record(f"{self.ledger.now():.6f} {talker!r} says {data.hex(' ')} from {start:.6f} to {end:.6f}")
-        self.ledger.said(start, end, asked, talker)
+        self.ledger.said(start, end, asked, talker, data)
 
     def _take_back(self, talker: Device, now: float) -> None:
         super()._take_back(talker, now)

@@ -16,7 +16,7 @@ from busmaster.emulator.line import Talk
 from tests.tiers import in_turn_by_default, one_by_default
 from tests.verification.campaigns.__main__ import main
 from tests.verification.campaigns.hunt import Hunt
-from tests.verification.campaigns.judge import Totals
+from tests.verification.campaigns.judge import BrokenRuleError, Totals
 from tests.verification.campaigns.kinds import KINDS
 from tests.verification.campaigns.ledger import Frame, Ledger
 from tests.verification.campaigns.mixes import BEYOND, IN_SYNC, STANDING_LONG, WITHIN
@@ -216,8 +216,44 @@ def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_faul
     assert not ledger.disguised(7.0, 11.0), "it replies to this request"
 
 
+def test_an_overdue_reply_that_noise_changed_blames_nobody() -> None:
+    """Seed 92000 of DC104: noise turned the reply to parameter 2 into one of parameter 3, which was requested then."""
+    ledger = Ledger(97, 5)
+    changed, whole = Frame(8.0, 9.0, 11.0, b"\x02\x02"), Frame(8.5, 11.0, 12.0, b"\x02\x15")
+    ledger._frames.extend((changed, whole))
+    assert list(ledger.overdue_replies(10.0, 12.0)) == [changed, whole]
+    ledger.spoiled(changed.start, changed.end)
+    assert list(ledger.overdue_replies(10.0, 12.0)) == [whole]
+    assert list(ledger.overdue_replies(10.0, 11.0)) == [], "it begins later"
+    assert list(ledger.overdue_replies(8.0, 12.0)) == [], "they reply to this request"
+
+
+def test_a_reply_to_a_request_of_one_byte_was_requested() -> None:
+    """Seed 91000 of EI-Bisynch: the host's NAK has a node send its parameter again."""
+    line = Hunt("ei-bisynch", "wrong", 1).line
+    node = line.devices[0]
+    line._request = node.routes[0]
+    line.ledger.spoiled(4.9, 5.0)
+    line.tell(node, 5.1, 5.2, b"\x04")
+    line.send(b"\x15", 5.3)
+    line.tell(node, 5.4, 5.5, b"\x04")
+    with pytest.raises(BrokenRuleError):  # nothing requested a third reply
+        line.tell(node, 5.6, 5.7, b"\x04")
+
+
 @pytest.mark.slow
-def test_a_hunt_in_which_noise_makes_such_a_reply_breaks_no_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("protocol", "mix", "seed"),
+    [
+        ("ei-bisynch", "wrong", 60200),
+        ("dc104", "wrong", 92000),
+        ("ei-bisynch", "wrong", 91000),
+        ("ei-bisynch", "shared, everything", 93000),
+    ],
+)
+def test_a_hunt_in_which_noise_makes_such_a_reply_breaks_no_rule(
+    protocol: str, mix: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(learning, "TRUSTED_AFTER", 3)
     monkeypatch.setattr(learning, "EPOCH", 10)
-    assert Hunt("ei-bisynch", "wrong", 60200, learned=True).run(5000).problems == []
+    assert Hunt(protocol, mix, seed, learned=True).run(5000).problems == []
