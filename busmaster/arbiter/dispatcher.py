@@ -259,9 +259,8 @@ class Dispatcher:
     def next(self, now: float) -> Transaction | None:
         """Remove and return the transaction to send now, or None."""
         while (transaction := self.backlog.pop(now)) is not None:
-            fault = self.fault
             # same as `eligibility`, written out: this runs for every request (benchmark `turnaround`)
-            verdict = eligibility(transaction, now, self.writes, None if fault is None else fault())
+            verdict = eligibility(transaction, now, self.writes, self.fault)
             if verdict is OK or (acted := self._act_on(verdict, transaction, now)) is OK:
                 return transaction
             if acted is WAITS:
@@ -275,7 +274,7 @@ class Dispatcher:
 
     def eligibility(self, transaction: Transaction, now: float) -> Eligible | Rejected:
         """Return whether a transaction may be sent now. Changes nothing."""
-        return eligibility(transaction, now, self.writes, None if self.fault is None else self.fault())
+        return eligibility(transaction, now, self.writes, self.fault)
 
     def proves(self, read: Transaction, now: float) -> bool:
         """Return True if a queued read can replace a sync read: it may be sent, and its node is not DOWN."""

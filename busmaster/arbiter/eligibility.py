@@ -8,6 +8,7 @@ could be mistaken for an overdue one (`Choice`).
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from typing import NamedTuple
 
 from busmaster.arbiter.backlog import Writes
@@ -42,12 +43,12 @@ class Rejected(NamedTuple):
 
 
 def eligibility(
-    transaction: Transaction, now: float, writes: Writes, fault: BusError | None = None
+    transaction: Transaction, now: float, writes: Writes, fault: Callable[[], BusError] | None = None
 ) -> Eligible | Rejected:
-    """Return whether the transaction may be sent now. Changes nothing. `fault`: why the line is unusable."""
+    """Return whether the transaction may be sent now. Changes nothing. `fault` returns why the line is unusable."""
     node = transaction.node
     if fault is not None:
-        return Rejected(name_error(fault, transaction))
+        return Rejected(name_error(fault(), transaction))
     # `start_by` limits only the first attempt: a retry belongs to a request that was sent in time.
     if transaction.start_by < now and (  # a request queued now is in time: its caller read the clock earlier
         transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)

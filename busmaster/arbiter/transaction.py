@@ -20,6 +20,8 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NoReply, NotStarted, WriteUnconfirmed
 
+BEFORE_ALL = -inf
+"""A time before all others. A constant, because `-inf` is calculated anew each time."""
 LONGEST_PATIENCE = 10.0
 """Longest time in seconds from a cycle's due time to its deadline, however long the poll's period is."""
 
@@ -181,7 +183,7 @@ class Transaction:
         self.check = False
         self.touches = touches
         # Not part of `reset`: a poll must remember over its cycles that a point is refused.
-        self.refused_until = -inf
+        self.refused_until = BEFORE_ALL
         self.refused_cycles = 0
         self.reset()
 
@@ -198,7 +200,7 @@ class Transaction:
         self.unsure = False
         self.value: Any = None
         self.error: BusError | None = None
-        self.started = self.first_byte = self.last_byte = self.ended_at = -inf
+        self.started = self.first_byte = self.last_byte = self.ended_at = BEFORE_ALL
 
     def timings(self) -> Timings:
         """Return the times for the next attempt. A learned window is used only for a read that can be repeated."""

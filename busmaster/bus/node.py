@@ -322,23 +322,17 @@ class Node:
         self._shared.check_loop()
         return self._shared.arbiter.exclusive(self._record, client, checked_hold(max_hold, self.label))
 
-    def _run(self, request: Request[T]) -> Coroutine[Any, Any, T]:
-        """Return the run of a request that keeps its progress, also after a cancellation.
+    async def _run(self, request: Request[T], checked: bool = False) -> T:
+        """Run a request that keeps its progress, also after a cancellation. `checked`: its limits were checked.
 
-        Its coroutine raises HoldEnded if the request's sequence has ended.
+        Raises HoldEnded if the request's sequence has ended.
         """
         # Most requests are reads, and most lines have no limits: neither needs a check.
         limiter = self._shared.limiter
-        if limiter is None or not getattr(request.command, "writes", False):
-            return self._value(request)
-        return self._limited(request, limiter)
-
-    async def _limited(self, request: Request[T], limiter: Limiter) -> T:
-        free, within = request.stop or request.options.safe, self._within(request)
-        async with limiter.passing(self, request.command, request.options, free, within) as request.options:
-            return await self._value(request)
-
-    async def _value(self, request: Request[T]) -> T:
+        if limiter is not None and not checked and getattr(request.command, "writes", False):
+            free, within = request.stop or request.options.safe, self._within(request)
+            async with limiter.passing(self, request.command, request.options, free, within) as request.options:
+                return await self._run(request, checked=True)
         transaction = self._start(request)
         try:
             value: T = await transaction.tag
