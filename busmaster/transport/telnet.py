@@ -138,25 +138,21 @@ class TelnetReader:
 
     def _subnegotiation(self, data: bytes, begin: int) -> tuple[Piece, int]:
         body = bytearray()
-        at = begin + 2
+        at, is_complete = begin + 2, False
         # An IAC at the very end is not decided yet: the next byte may double it.
-        while 0 <= (iac := data.find(IAC, at)) < len(data) - 1:
+        while not is_complete and 0 <= (iac := data.find(IAC, at)) < len(data) - 1:
             body += data[at:iac]
+            at, is_complete = iac + 2, data[iac + 1] == SE
             if data[iac + 1] == IAC:
                 body.append(IAC)
-            elif data[iac + 1] != SE:
+            elif not is_complete:
                 raise TelnetError("a telnet subnegotiation is broken off by another command")
-            at = iac + 2
-            if data[iac + 1] == SE:
-                break
-        else:
-            # R12: a server that never ends a command must not fill the memory.
-            if len(data) - begin > LONGEST_SUBNEGOTIATION:
-                raise TelnetError(f"a telnet subnegotiation is longer than {LONGEST_SUBNEGOTIATION} bytes")
+        # R12: a server that never ends a command must not fill the memory. The same however the stream is split.
+        if (at if is_complete else len(data)) - begin > LONGEST_SUBNEGOTIATION:
+            raise TelnetError(f"a telnet subnegotiation is longer than {LONGEST_SUBNEGOTIATION} bytes")
+        if not is_complete:
             self._begun = data[begin:]
             return b"", len(data)
-        if at - begin > LONGEST_SUBNEGOTIATION:  # the same however the stream is split
-            raise TelnetError(f"a telnet subnegotiation is longer than {LONGEST_SUBNEGOTIATION} bytes")
         # Another option, such as the terminal type: ignored, as telnet requires.
         if len(body) < 2 or body[0] != COM_PORT:
             return b"", at
