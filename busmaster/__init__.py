@@ -38,6 +38,7 @@ from busmaster.errors import (
 from busmaster.renames import ROOT
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.rfc2217 import Rfc2217Port
+from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -94,6 +95,7 @@ __all__ = [
     "RemoteBus",
     "ReplyTiming",
     "Rfc2217Port",
+    "Rs485",
     "Sample",
     "SerialPort",
     "Service",

@@ -14,6 +14,7 @@ from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.identity import USB, Identity
 from busmaster.transport.rfc2217 import Rfc2217Port
+from busmaster.transport.rs485 import LEVELS, SWITCHES, Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -82,6 +83,7 @@ def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
 def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
     """Return the endpoint for a URL: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
 
+    The keys of a table have its name in front, as in LINE.toml: "/dev/ttyS1?rs485.level=low&rs485.by=software".
     `defaults`: line settings for a serial port or an RFC 2217 port whose URL leaves them out; behind a TCP port the
     server sets them. Raises InvalidCommand, with the nearest option, for an invalid URL.
     """
@@ -97,7 +99,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
         path, _, query = url.partition("?")
         if HOST_PORT.fullmatch(path) and not path.startswith(USB):  # usb:12345678 looks like a host and its port
             raise InvalidCommand(f"{path!r} is not a device path; write a TCP port as socket://{path}")
-        return SerialPort(path, **_with_line(path, _options(query, SERIAL_OPTIONS), defaults))
+        return SerialPort(path, **_with_line(path, _with_rs485(_options(query, SERIAL_OPTIONS)), defaults))
     scheme = url.partition("://")[0]
     if scheme == "rfc2217":
         host, port, query = _address(url)
@@ -123,6 +125,14 @@ def _with_line(name: str, options: dict[str, Any], defaults: LineSettings | None
     if "baudrate" not in options:
         raise InvalidCommand(f"{name}: no baud rate given; write for example {name.partition('?')[0]}?baudrate=57600")
     return options
+
+
+def _with_rs485(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options with those of RS-485 as one. Raises InvalidCommand."""
+    parts = {key.removeprefix(RS485): options.pop(key) for key in tuple(options) if key.startswith(RS485)}
+    if parts and "rs485" in options:
+        raise InvalidCommand(f"port options rs485 and {RS485}{next(iter(parts))} exclude each other: leave rs485 out")
+    return options | {"rs485": Rs485(**parts)} if parts else options
 
 
 def _address(url: str) -> tuple[str, int, str]:
@@ -166,6 +176,17 @@ def _stopbits(text: str) -> float:
     return {"1": 1, "1.5": 1.5, "2": 2}[text]
 
 
+def _switch(text: str) -> str:
+    return {name: name for name in SWITCHES}[text]
+
+
+def _level(text: str) -> str:
+    return {name: name for name in LEVELS}[text]
+
+
+RS485 = "rs485."
+"""What the options that stand for the keys of the table `rs485` begin with."""
+
 SERIAL_OPTIONS: dict[str, Callable[[str], object]] = {
     "baudrate": int,
     "bytesize": int,
@@ -173,6 +194,11 @@ SERIAL_OPTIONS: dict[str, Callable[[str], object]] = {
     "stopbits": _stopbits,
     "rtscts": _flag,
     "rs485": _flag,
+    "rs485.by": _switch,
+    "rs485.level": _level,
+    "rs485.delay_before": float,
+    "rs485.delay_after": float,
+    "rs485.rx_during_tx": _flag,
     "echo": _flag,
     "low_latency": _flag,
     "receive_latency": float,
@@ -206,4 +232,6 @@ MEANT: dict[Callable[[str], object], str] = {
     _flag: "use 1 or 0, true or false",
     _parity: "use N, E, O, M or S",
     _stopbits: "use 1, 1.5 or 2",
+    _switch: f"use {' or '.join(SWITCHES)}",
+    _level: f"use {' or '.join(LEVELS)}",
 }

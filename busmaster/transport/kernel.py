@@ -39,7 +39,7 @@ class OpenPort:
 
     stuck_because = "the port does not take it; open it again"
     flow_controlled = False
-    """The other end can stop the output for any time."""
+    """Written bytes can stay in the driver for a time: flow control, or a delay of its RS-485 mode."""
 
     def __init__(self, transport: asyncio.Transport) -> None:
         # Looked up once: it is called at every deadline.
@@ -198,7 +198,7 @@ def open_port(transport: asyncio.Transport) -> OpenPort:
     device = transport.get_extra_info("serial")
     # By the transport and not by the endpoint: an application can pass an endpoint of its own.
     if device is not None:
-        return Tty(transport, device.fileno(), device.rtscts)
+        return Tty(transport, device.fileno(), device.rtscts or bool(transport.get_extra_info("delayed")))
     sock = transport.get_extra_info("socket")
     return OpenPort(transport) if sock is None else Socket(transport, sock)
 

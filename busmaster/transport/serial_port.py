@@ -25,6 +25,7 @@ import os
 import termios
 import threading
 import time
+import warnings
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -40,6 +41,7 @@ from busmaster.transport import holders, identity
 from busmaster.transport.identity import Identity, identify, is_pty, resolve
 from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
 from busmaster.transport.own_thread import in_own_thread
+from busmaster.transport.rs485 import Rs485, RtsSwitch, keep_lines_at_close, set_driver, set_rts, settings_of
 
 if TYPE_CHECKING:
 
@@ -98,9 +100,9 @@ class SerialPort:
     """1, 1.5 or 2. In LINE.toml the protocol's by default."""
     rtscts: bool = False
     """Whether RTS and CTS control the flow of sent bytes."""
-    rs485: RS485Settings | bool | None = None
-    """Whether the driver switches the transmitter (RTS high while sending). In Python also pyserial's
-    `RS485Settings`, for other polarities and delays."""
+    rs485: Rs485 | RS485Settings | bool | None = None
+    """Whether RTS switches the transmitter. `true`: the driver sets RTS high while sending. A table (in Python `Rs485`,
+    or pyserial's `RS485Settings`) has levels and delays, and can have it switched by software."""
     echo: bool = False
     """Whether sent bytes are received too, as on some two-wire adapters. They are compared byte for byte."""
     low_latency: bool | None = None
@@ -120,6 +122,9 @@ class SerialPort:
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
         # An adapter would switch its transmitter with the same line that is to stop it.
+        if not isinstance(self.rs485, bool):
+            # pyserial's settings have no value of their own: two ports with the same ones would differ.
+            object.__setattr__(self, "rs485", settings_of(self.rs485))
         if self.rtscts and self.rs485:
             raise InvalidCommand("rtscts and rs485 exclude each other: both drive the RTS line")
         LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
@@ -133,6 +138,11 @@ class SerialPort:
     def settings(self) -> LineSettings:
         """Return baud rate and framing."""
         return LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
+
+    @property
+    def rts(self) -> Rs485 | None:
+        """Return how RTS switches the transmitter; None if it does not."""
+        return settings_of(self.rs485)
 
     def presence(self) -> Hashable | None:
         """Return a value that changes when the node at the path (possibly a symlink) changes.
@@ -153,6 +163,14 @@ class SerialPort:
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> PortTransport:
         """Open and configure the port in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
+        if self.rts is not None and self.rts.by == "software":
+            # Python shows it once for each port, however often that is opened again.
+            warnings.warn(
+                f"{self.path}: RTS is switched by software, which releases the line late on a busy machine: a reply "
+                "that begins before that is damaged. `busmaster doctor` measures it; an adapter that switches by "
+                "itself is safer",
+                stacklevel=1,
+            )
         # In a thread: an open() that hangs on a USB adapter would block every line of this loop.
         opening = in_own_thread(functools.partial(_open, self, only), f"open {self.path}")
         try:
@@ -200,19 +218,36 @@ class PortTransport(_SerialTransport):
         self._paced = paced
         self._identity = found
         self._lost = False
+        self._switch: RtsSwitch | None = None
         self._deadline: asyncio.TimerHandle | None = None
         device.is_open = False  # the base class sets timeouts, which would reconfigure an open port on the loop
         super().__init__(loop, protocol, device)
         # From here on settings may be changed: `tune` relies on it.
         device.is_open = True
+        if port.rts is not None and port.rts.by == "software":
+            self._switch = RtsSwitch(
+                self._fd,
+                port.rts,
+                self._byte_time(port.settings),
+                sent=lambda: self._call_soon(self._note_sent),
+                lost=lambda error: self._call_soon(self._lose_once, error),
+            )
         self.set_write_buffer_limits(high=0)  # R2: buffered bytes have not left, so any of them pauses the protocol
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
         """Return pyserial's object for `serial`, the device's identity for `identity`.
 
-        For `paced`, return whether bytes leave at the baud rate.
+        For `paced`, return whether bytes leave at the baud rate. For `delayed`, return whether RS-485 switching delays
+        them. For `released`, return the seconds after which software released the line (see `RtsSwitch`), or None.
         """
-        return {"serial": self._serial, "paced": self._paced, "identity": self._identity}.get(name, default)
+        extra: dict[str, Any] = {
+            "serial": self._serial,
+            "paced": self._paced,
+            "identity": self._identity,
+            "delayed": self._port.rts is not None and self._port.rts.delay_before > 0,
+            "released": None if self._switch is None else tuple(self._switch.released),
+        }
+        return extra.get(name, default)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._port.name}{' closing' if self._closing else ''}>"
@@ -224,6 +259,12 @@ class PortTransport(_SerialTransport):
         """
         change = functools.partial(_tune, self._port, self._serial, settings)
         await asyncio.wrap_future(in_own_thread(change, f"tune {self._port.path}"))
+        if self._switch is not None:
+            self._switch.byte_time = self._byte_time(settings)
+
+    def get_write_buffer_size(self) -> int:
+        """Return the number of bytes that the driver does not have yet."""
+        return super().get_write_buffer_size() if self._switch is None else self._switch.unwritten
 
     def _read_ready(self) -> None:
         """Read from the descriptor: pyserial's read uses select(), which fails above descriptor 1023."""
@@ -253,6 +294,10 @@ class PortTransport(_SerialTransport):
         stamp."""
         if self._closing:
             return  # the loss was already reported, or the port is being closed
+        if self._switch is not None:
+            self._switch.send(bytes(data))
+            self._maybe_pause_protocol()
+            return
         # Bytes must not overtake buffered ones.
         if not self._write_buffer:
             try:
@@ -312,8 +357,26 @@ class PortTransport(_SerialTransport):
         # Deferred: the protocol may be inside its own write(), during which its state must not change.
         self._loop.call_soon(self._report, cause)
 
+    def _byte_time(self, settings: LineSettings) -> float:
+        return settings.byte_time if self._paced else 0.0
+
+    def _call_soon(self, call: Callable[..., None], *arguments: object) -> None:
+        """Call it on the loop, from the thread of the switch."""
+        with contextlib.suppress(RuntimeError):  # the loop was closed
+            self._loop.call_soon_threadsafe(call, *arguments)
+
+    def _note_sent(self) -> None:
+        if not self._closing:
+            self._maybe_resume_protocol()
+
+    def _lose_once(self, error: OSError) -> None:
+        if not self._closing:
+            self._lose(error)
+
     def _detach(self) -> Future[None]:
         self._closing = True
+        if self._switch is not None:
+            self._switch.stop()
         self._remove_reader()
         self._remove_writer()
         # Unsent bytes must not leave later: a request that is that old could move a machine unexpectedly.
@@ -324,6 +387,10 @@ class PortTransport(_SerialTransport):
 
         def release() -> None:
             try:
+                if self._switch is not None:
+                    # Otherwise its last query could reach a port that gets this descriptor next.
+                    _discard_output(self._fd)
+                    self._switch.join()
                 _release(self._serial, self._port.exclusive)
             finally:
                 _closings.discard(closing)
@@ -388,6 +455,9 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
     if not _names_pty(port.path):  # a pty stays at 8N1, and the C library reports a change without effect as an error
         device.bytesize, device.parity = port.bytesize, port.parity
     device.rtscts = port.rtscts
+    if port.rts is not None:
+        # pyserial raises RTS when it opens a port: the transmitter would block the line until the first request.
+        device.rts = not port.rts.rts_while_sending
     # None and not False: pyserial would release a lock that it does not have.
     device.exclusive = True if port.exclusive else None
     # Non-blocking: only the loop waits for this port.
@@ -444,14 +514,8 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
     if port.exclusive:  # flock is advisory, and TIOCEXCL does not stop root: only both together exclude other programs
         fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
     # Only if the user sets it: most adapters reject the ioctl, and a pty has none (ENOTTY).
-    if port.rs485:
-        try:
-            device.rs485_mode = RS485Settings() if port.rs485 is True else port.rs485
-        except ValueError:
-            raise LineDown(
-                f"the driver of {port.path} has no RS-485 mode",
-                hint="leave rs485 out: most adapters switch direction by themselves",
-            ) from None
+    if port.rts is not None:
+        _equip_rts(port.path, port.rts, device.fileno())
     if port.low_latency is not None:
         try:
             device.set_low_latency_mode(port.low_latency)
@@ -460,6 +524,29 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
                 f"the driver of {port.path} has no low-latency flag",
                 hint="leave low_latency out; `busmaster doctor` shows what the adapter does",
             ) from None
+
+
+def _equip_rts(path: str, rts: Rs485, descriptor: int) -> None:
+    if rts.by == "software":
+        try:
+            set_rts(descriptor, not rts.rts_while_sending)
+        except OSError:
+            hint = "leave rs485 out: without RTS only the adapter itself can switch direction"
+            raise LineDown(f"the driver of {path} has no RTS line", hint=hint) from None
+        if not rts.rts_while_sending:
+            # A closed port has RTS low, which would leave the transmitter on.
+            keep_lines_at_close(descriptor)
+        return
+    hint = 'leave rs485 out: most adapters switch direction by themselves; for one that needs RTS: by = "software"'
+    try:
+        refused = set_driver(descriptor, rts)
+    except OSError:
+        raise LineDown(f"the driver of {path} has no RS-485 mode", hint=hint) from None
+    if refused:
+        raise LineDown(
+            f"the driver of {path} does not take this setting of its RS-485 mode: {refused}",
+            hint='leave that setting out, or use by = "software"',
+        )
 
 
 def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> None:
@@ -514,10 +601,9 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
 
     The flags are restored too, unless another program may be using the port with them.
     """
-    with contextlib.suppress(OSError, termios.error):
-        # Otherwise the close waits until the bytes have left: with flow control off, up to 30 s by the driver's
-        # default.
-        termios.tcflush(device.fileno(), termios.TCOFLUSH)
+    # Otherwise the close waits until the bytes have left: with flow control off, up to 30 s by the driver's default.
+    with contextlib.suppress(serial.SerialException):
+        _discard_output(device.fileno())
     if exclusive:
         # Only with exclusive use: a second program with the port open still needs its flags.
         stop_marking(device.fileno())
@@ -527,6 +613,11 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
             fcntl.flock(device.fileno(), fcntl.LOCK_UN)
     with contextlib.suppress(OSError):
         device.close()
+
+
+def _discard_output(descriptor: int) -> None:
+    with contextlib.suppress(OSError, termios.error):
+        termios.tcflush(descriptor, termios.TCOFLUSH)
 
 
 def _drop(opening: Future[tuple[MarkingSerial, bool, Identity]]) -> None:

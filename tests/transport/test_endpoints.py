@@ -8,6 +8,7 @@ from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.rfc2217 import Rfc2217Port
+from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -34,6 +35,18 @@ MENTOR = LineSettings(9600, 7, "E", 1)
                 exclusive=False,
                 paced=True,
             ),
+        ),
+        (
+            "/dev/ttyS0?baudrate=9600&rs485.level=low&rs485.delay_before=0.001&rs485.delay_after=0.002&rs485.rx_during_tx=1",
+            SerialPort(
+                "/dev/ttyS0",
+                baudrate=9600,
+                rs485=Rs485(level="low", delay_before=0.001, delay_after=0.002, rx_during_tx=True),
+            ),
+        ),
+        (
+            "usb:A500ABC?baudrate=9600&rs485.by=software&rs485.delay_after=0.0004",
+            SerialPort("usb:A500ABC", baudrate=9600, rs485=Rs485(by="software", delay_after=0.0004)),
         ),
         ("usb:A500ABC?baudrate=9600", SerialPort("usb:A500ABC", baudrate=9600)),
         ("usb:12345678:1?baudrate=9600", SerialPort("usb:12345678:1", baudrate=9600)),
@@ -96,6 +109,16 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
         ("/dev/ttyUSB0?baudrate=9600&echo=maybe", "echo='maybe': use 1 or 0, true or false"),
         ("/dev/ttyUSB0?baudrate=9600&stopbits=3", "stopbits='3': use 1, 1.5 or 2"),
         ("/dev/ttyUSB0?baudrate=9600&receive_latency=16ms", "use a number of seconds, such as 0.016"),
+        ("/dev/ttyS0?baudrate=9600&rs485.by=hardware", "option rs485.by='hardware': use driver or software"),
+        ("/dev/ttyS0?baudrate=9600&rs485.level=1", "option rs485.level='1': use high or low"),
+        ("/dev/ttyS0?baudrate=9600&rs485.delay_before=1ms", "delay_before='1ms': use a number of seconds"),
+        ("/dev/ttyS0?baudrate=9600&rs485.delay_after=1", "rs485: delay_after must be 0 to 0.1 s, not 1"),
+        ("/dev/ttyS0?baudrate=9600&rs485.delay=1", "no such port option 'rs485.delay'; did you mean 'rs485.delay_"),
+        (
+            "/dev/ttyS0?baudrate=9600&rs485.level=low&rs485=1",
+            "rs485 and rs485.level exclude each other: leave rs485 out",
+        ),
+        ("/dev/ttyS0?baudrate=9600&rs485.level=low&rtscts=1", "rtscts and rs485 exclude each other"),
         ("?baudrate=9600", "a serial port needs a path"),
         ("usb:?baudrate=9600", "a USB adapter needs a serial number, such as usb:A500ABC"),
         ("socket://server:4001?parity=E", "no such port option 'parity'; there are baudrate, echo"),

@@ -18,7 +18,6 @@ from typing import Any
 
 import pytest
 import serial
-from serial.rs485 import RS485Settings
 
 from busmaster.errors import LineDown
 from busmaster.transport import serial_port
@@ -410,19 +409,12 @@ async def test_driver_extras_are_touched_only_when_asked_for(
     pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    monkeypatch.setattr(serial.Serial, "_set_rs485_mode", lambda _, settings: asked.append(settings))
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda _, flag: asked.append(flag))
     await closed(*await opened(pty_master.path))
     assert asked == []
-    settings = RS485Settings(rts_level_for_tx=False, rts_level_for_rx=True)
-    recorder = Recorder()
-    port = SerialPort(pty_master.path, baudrate=57600, rs485=settings, low_latency=False)
-    await closed(await port.open(lambda: recorder), recorder)
-    assert asked == [settings, False]
-    asked.clear()
-    await closed(*await opened(pty_master.path, rs485=True, low_latency=True))
-    assert asked[0].rts_level_for_tx is True
-    assert asked[1] is True
+    await closed(*await opened(pty_master.path, low_latency=False))
+    await closed(*await opened(pty_master.path, low_latency=True))
+    assert asked == [False, True]
 
 
 # -- refusals --------------------------------------------------------------------------------------------------------

@@ -154,6 +154,8 @@ def form_of(hint: Any) -> Form:
 def _plain(hint: Any, between: Between) -> Form:
     members = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     for member in members:
+        if bool in members and dataclasses.is_dataclass(member) and isinstance(member, type):
+            return flag_or_table(member)
         if get_origin(member) is Literal:
             return choice(get_args(member))
         if isinstance(member, type) and issubclass(member, Enum):
@@ -234,6 +236,28 @@ def ranged(name: str, between: Between) -> str:
 def table_of(name: str) -> Form:
     """Return the form of a table. `name` is that of its JSON Schema."""
     return Form("table", {"$ref": f"#/$defs/{name}"})
+
+
+def flag_or_table(section: type) -> Form:
+    """Return the form of true or false, or of a table whose keys this dataclass declares.
+
+    The table's JSON Schema has the name of the class in lower case.
+    """
+
+    def read(table: Table, key: str) -> Any:
+        value = table.data[key]
+        if isinstance(value, bool):
+            return value
+        if not isinstance(value, dict):
+            known = ", ".join(names_of(keys_of(section)))
+            raise table.error(f"must be true, false or a table of {known}, not {shown(value)}", key)
+        inner = table.table(key)
+        values = read_section(inner, section)
+        with inner.at():
+            return section(**values)
+
+    schema = {"anyOf": [{"type": "boolean"}, {"$ref": f"#/$defs/{section.__name__.lower()}"}]}
+    return Form("true or false, or table", schema, read)
 
 
 def tables_of(name: str, *, required: bool = False) -> Form:

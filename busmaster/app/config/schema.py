@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
-from busmaster import Meaning, Rfc2217Port, SerialPort, TcpPort
+from busmaster import Meaning, Rfc2217Port, Rs485, SerialPort, TcpPort
 from busmaster.app.config.emulator import EmulatedSection, EmulatorSection
 from busmaster.app.config.keys import Key, keys_of, names_of
 from busmaster.app.config.options import keys_of_options
@@ -44,6 +44,8 @@ def tables() -> Iterator[TableKeys]:
     yield _table("The top", "What stands at the top of the file, before the first table.", LineFile, "")
     serial = _described(serial_keys(), SerialPort)
     yield TableKeys("[port]", "A serial port as a table.", serial, "serial_port")
+    switched = "How RTS switches the transmitter of a serial port, in [port]."
+    yield _table("rs485 = {}", switched, Rs485, "rs485")
     tcp = _described(tcp_keys(), TcpPort, ByRfc2217)
     yield TableKeys("[port] with host", "A serial server as a table.", _required_first(tcp), "tcp_port")
     remote = _described(rfc2217_keys(), Rfc2217Port, ByRfc2217)

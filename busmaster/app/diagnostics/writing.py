@@ -9,8 +9,9 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from statistics import median
+from typing import Any
 
-from busmaster import LineSettings, Rfc2217Port, SerialPort, TcpPort
+from busmaster import LineSettings, Rfc2217Port, Rs485, SerialPort, TcpPort
 from busmaster.app.config.rewriting import toml_text
 from busmaster.app.diagnostics.diagnosis import milliseconds, percentile, rounded_up, speed
 from busmaster.app.diagnostics.search import Discovery, Found
@@ -87,11 +88,9 @@ def _name(node: Found, found: Sequence[Found]) -> str:
 
 def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
     """Yield the lines of [port]: what was found, and of what the user said all that is not as usual."""
-    said = {
-        field.name: getattr(port, field.name)
-        for field in dataclasses.fields(port)
-        if field.default is dataclasses.MISSING or getattr(port, field.name) != field.default
-    }
+    said = _set(port)
+    if isinstance(said.get("rs485"), Rs485):
+        said["rs485"] = _set(said["rs485"])
     if discovery.settings is not None and isinstance(port, SerialPort | Rfc2217Port):
         said |= dataclasses.asdict(discovery.settings)
     if discovery.echo:
@@ -100,6 +99,12 @@ def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
         said = {"rfc2217": True} | said
     yield "[port]"
     yield from (f"{key} = {toml_text(value)}" for key, value in said.items())
+
+
+def _set(settings: SerialPort | TcpPort | Rs485) -> dict[str, Any]:
+    """Return the values that are not the defaults, by their names."""
+    values = {field: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    return {field.name: value for field, value in values.items() if value != field.default}
 
 
 def _node(name: str, node: Found) -> Iterator[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import Priority, Rfc2217Port, SerialPort, TcpPort
+from busmaster import Priority, Rfc2217Port, Rs485, SerialPort, TcpPort
 from busmaster.app.config import FileError, LineFile, emulated_line, load
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
@@ -68,6 +68,45 @@ def test_a_usb_adapter_is_named_by_its_serial_number() -> None:
     wanted = SerialPort("usb:A500ABC", baudrate=57600)
     assert parse(f'port = "usb:A500ABC"\n{NODE}').port == wanted
     assert parse(f'[port]\npath = "usb:A500ABC"\n{NODE}').port == wanted
+
+
+def test_rs485_is_true_or_false_or_a_table() -> None:
+    for text, wanted in (
+        ("true", True),
+        ("false", False),
+        ("{}", Rs485()),
+        ('{ by = "software", delay_before = 0.0004 }', Rs485(by="software", delay_before=0.0004)),
+        (
+            '{ level = "low", delay_before = 0.001, delay_after = 0.002, rx_during_tx = true }',
+            Rs485(level="low", delay_before=0.001, delay_after=0.002, rx_during_tx=True),
+        ),
+    ):
+        port = parse(f'[port]\npath = "/dev/ttyS0"\nrs485 = {text}\n{NODE}').port
+        assert port == SerialPort("/dev/ttyS0", baudrate=57600, rs485=wanted)
+    dotted = '[port]\npath = "/dev/ttyS0"\nrs485.level = "low"\n'
+    assert parse(dotted + NODE).port == parse(f'port = "/dev/ttyS0?rs485.level=low"\n{NODE}').port
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "1",
+            "port.rs485: must be true, false or a table of by, level, delay_before, delay_after, rx_during_tx, not 1",
+        ),
+        ('{ level = "up" }', "port.rs485.level: no such level 'up'; there are high, low"),
+        ('{ by = "hardware" }', "port.rs485.by: no such by 'hardware'; "),
+        ("{ delay_before = 1 }", "port.rs485.delay_before: must be a number of seconds, 0 to 0.1, not 1"),
+        ("{ delay_after = -0.001 }", "port.rs485.delay_after: must be a number of seconds, 0 to 0.1, not -0.001"),
+        ("{ delay_after = 0.0004 }", "port.rs485: rs485: delay_after must be a whole number of milliseconds"),
+        ("{ delay = 0.001 }", "port.rs485.delay: no such key; did you mean 'delay_"),
+        ('{ rx_during_tx = "yes" }', "port.rs485.rx_during_tx: must be true or false, not 'yes'"),
+        ('{ by = "software", rx_during_tx = true }', "port.rs485: rs485: rx_during_tx must be false with by"),
+    ],
+)
+def test_a_wrong_rs485_is_named_with_its_line_its_key_and_what_is_possible(text: str, says: str) -> None:
+    with pytest.raises(FileError, match=f"line.toml:3: {re.escape(says)}"):
+        parse(f'[port]\npath = "/dev/ttyS0"\nrs485 = {text}\n{NODE}')
 
 
 def test_a_tcp_port_is_a_url_or_a_table() -> None:

@@ -37,6 +37,7 @@ BASE: dict[str, Any] = {
 PLACES: dict[str, tuple[str, ...]] = {
     "The top": (),
     "[port]": ("port",),
+    "rs485 = {}": ("port", "rs485"),
     "[protocols.NAME]": ("protocols", "hcp2"),
     "[nodes.NAME]": ("nodes", "n"),
     "timing = {}": ("nodes", "n", "timing"),

@@ -16,6 +16,7 @@ from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings
 from busmaster.registry import Protocol, find, protocols
 from busmaster.transport.rfc2217 import Rfc2217Port
+from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -59,6 +60,22 @@ def test_what_was_said_of_the_port_is_kept_and_what_was_found_of_it_added(tmp_pa
     found = Discovery(LineSettings(19200, 7, "E"), echo=True, found=[node_of(find("ct-ansi").protocol)])
     port = line_of(found, said, tmp_path).bus.endpoint
     assert port == replace(said, baudrate=19200, bytesize=7, parity="E", echo=True)
+
+
+@pytest.mark.parametrize(
+    ("rs485", "text"),
+    [
+        (Rs485(by="software", delay_after=0.0004), 'rs485 = { by = "software", delay_after = 0.0004 }'),
+        (Rs485(level="low", delay_before=0.002, rx_during_tx=True), 'rs485 = { level = "low", delay_before = 0.002, '),
+        (Rs485(), "rs485 = {}"),
+        (True, "rs485 = true"),
+    ],
+)
+def test_rs485_is_written_as_the_file_reads_it(rs485: Rs485 | bool, text: str, tmp_path: Path) -> None:
+    found = Discovery(SETTINGS, found=[node_of(find("dc104").protocol)])
+    said = SerialPort("/dev/ttyS1", baudrate=19200, rs485=rs485)
+    assert text in line_text(said, found)
+    assert line_of(found, said, tmp_path).bus.endpoint == said
 
 
 def test_a_device_servers_port_is_as_it_was_said(tmp_path: Path) -> None:
