@@ -219,6 +219,35 @@ def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
     return Finding("windows", True, what)
 
 
+def turnaround(starts: Sequence[float], released: Sequence[float] | None, byte_time: float) -> Iterator[Finding]:
+    """Report how fast RTS releases the line after a request, as far as that can be measured.
+
+    `starts`: seconds from the end of each request to the first byte of its reply. `released`: those to the release of
+    the line by software; None if the driver does that, which no program can observe. A byte is received at its end.
+    """
+    begun = max(0.0, min(starts) - byte_time) if starts else None
+    if released is None:
+        if begun is not None:
+            what = f"the line was free {milliseconds(begun)} ms after the last bit at the latest: a reply began then"
+            yield Finding("turnaround", True, what, "the driver does not report when it releases the line")
+    elif released:
+        times = sorted(max(0.0, seconds) for seconds in released)
+        shown = " / ".join(map(milliseconds, (times[0], median(times), percentile(times))))
+        what = (
+            f"software releases the line {shown} ms after the calculated end of the last bit (least / median / p99 of "
+            f"{len(times)})"
+        )
+        if begun is None or times[-1] < begun:
+            yield Finding("turnaround", True, what)
+        else:
+            yield Finding(
+                "turnaround",
+                False,
+                f"{what}, but a reply began after {milliseconds(begun)} ms: the transmitter can damage it",
+                "shorten rs485.delay_after, have the drive reply later, or use a driver or an adapter that switches",
+            )
+
+
 def nobody(asked: str, profile: Profile, settings: LineSettings | None) -> Finding:
     """Say that no node has answered. `asked` names them, as in "nodes 1-4"."""
     at = "" if settings is None else f" at {speed(settings)}"

@@ -139,7 +139,12 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
         yield from remote_port(wire.transport)
     if device is not None:
         yield from rate(device.fileno(), where.settings.baudrate)
-        yield from driver(device.fileno(), where.low_latency if isinstance(where, SerialPort) else None)
+        serial = where if isinstance(where, SerialPort) else None
+        yield from driver(
+            device.fileno(),
+            None if serial is None else serial.low_latency,
+            switched=serial is not None and serial.rts is not None and serial.rts.by == "software",
+        )
 
 
 def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
@@ -165,8 +170,11 @@ def remote_port(transport: asyncio.Transport) -> Iterator[Finding]:
         yield Finding("modem lines", True, f"the server reports {states}")
 
 
-def driver(descriptor: int, wanted: bool | None = None) -> Iterator[Finding]:
-    """Say what the driver of an open serial port does. `wanted` is the low-latency flag that it was opened with."""
+def driver(descriptor: int, wanted: bool | None = None, *, switched: bool = False) -> Iterator[Finding]:
+    """Say what the driver of an open serial port does. `wanted` is the low-latency flag that it was opened with.
+
+    `switched`: software switches the transmitter.
+    """
     match adapters.low_latency(descriptor):
         case None:
             yield Finding("driver", True, "it has no low-latency flag")
@@ -178,6 +186,8 @@ def driver(descriptor: int, wanted: bool | None = None) -> Iterator[Finding]:
             advice = "?low_latency=1 may bring replies sooner" if wanted is None else ""
             yield Finding("driver", True, "its low-latency flag is not set", advice)
     match adapters.rs485_mode(descriptor):
+        case _ if switched:
+            yield Finding("rs485", True, "software switches the transmitter by RTS")
         case None:
             yield Finding("rs485", True, "the driver has no RS-485 mode: the adapter switches by itself, or is RS-232")
         case True:
@@ -188,7 +198,7 @@ def driver(descriptor: int, wanted: bool | None = None) -> Iterator[Finding]:
                 True,
                 "the driver's RS-485 mode is off",
                 "if nothing is answered and this is a bare transceiver that needs RTS, add ?rs485=1 (rs485=True in "
-                "Python); a driver may know the mode and still refuse it",
+                "Python), or ?rs485.by=software if the driver knows the mode and still refuses it",
             )
 
 
@@ -220,6 +230,12 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     records = await ask_all(patient, prober)
     for finding in uart.findings(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
         tell(finding)
+    if isinstance(where, SerialPort) and where.rts is not None:
+        assert wire.transport is not None
+        starts = [start for record in records for start in record.starts]
+        released = wire.transport.get_extra_info("released")
+        for finding in diagnosis.turnaround(starts, released, byte_time if wire.paced else 0.0):
+            tell(finding)
     if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):
             tell(finding)

@@ -39,6 +39,7 @@ from busmaster.transport import identity
 from tests.app.cli.conftest import Command, without_time
 from tests.app.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged
+from tests.transport.rs485_driver import FakeDriver
 from tests.transport.usb import UsbTree
 
 HCP2 = ("--protocol", "hcp2")
@@ -323,6 +324,41 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
     assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
         *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows", "learning")
     ]
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.filterwarnings("default:.*RTS is switched by software")
+@pytest.mark.parametrize(
+    ("by", "what"), [("driver", "the line was free "), ("software", "software releases the line ")]
+)
+def test_the_turnaround_of_a_port_with_rs485_is_measured(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, by: str, what: str
+) -> None:
+    FakeDriver(monkeypatch)
+    with serve_pty(line_of("hcp2", [hcp2(1, Delay(0.02))], paced=False)) as server:
+        port = f"{server.path}?baudrate=57600&rs485.by={by}"
+        done = busmaster("doctor", port, *HCP2, "--nodes", "1", "--timeout", "1000")
+    [line] = [line for line in done.lines if line.split()[1:2] == ["turnaround"]]
+    assert not line.startswith("FAIL")
+    assert what in line
+    assert ("RTS is switched by software" in done.err) is (by == "software")
+    assert ("software switches the transmitter by RTS" in "\n".join(done.lines)) is (by == "software")
+
+
+def test_a_release_after_the_beginning_of_a_reply_is_to_be_changed() -> None:
+    late, soon = [0.0002, 0.0031], [0.0002, 0.0009]
+    [finding] = diagnosis.turnaround([0.004, 0.005], late, byte_time=0.001)
+    assert not finding.ok
+    assert "releases the line 0.2 / 1.6 / 3.1 ms after" in finding.what
+    assert "a reply began after 3 ms" in finding.what
+    [finding] = diagnosis.turnaround([0.004, 0.005], soon, byte_time=0.001)
+    assert finding.ok
+    assert [*diagnosis.turnaround([], None, byte_time=0.001)] == []
+    [finding] = diagnosis.turnaround([], soon, byte_time=0.001)
+    assert finding.ok
+    [finding] = diagnosis.turnaround([0.004, 0.005], None, byte_time=0.001)
+    assert finding.ok
+    assert "free 3 ms after the last bit at the latest" in finding.what
 
 
 @pytest.mark.slow
