@@ -119,6 +119,10 @@ class Api:
         past = [[self._wall(when), value] for when, value in row.past]
         return _json({**self._point(row), "past": past, "details": details})
 
+    async def read_or_write(self, request: Request) -> Response:
+        """Answer one point, or write it. One route has both methods, so that a 405 names both in `Allow`."""
+        return await (self.write(request) if request.method == "PUT" else self.point(request))
+
     async def write(self, request: Request) -> Response:
         """Write one point. The body is JSON, and says so: what a form of another site sends never is."""
         by = self._guard.writer(request.headers)
@@ -267,8 +271,7 @@ def application(line: Following, guard: Guard, tell: Told = lambda _: None) -> G
         Route("/api/groups", api.groups, methods=["GET"]),
         Route("/api/events", api.events, methods=["GET"]),
         Route("/api/points", api.points, methods=["GET"]),
-        Route(one, api.point, methods=["GET"]),
-        Route(one, api.write, methods=["PUT"]),
+        Route(one, api.read_or_write, methods=["GET", "PUT"]),
         WebSocketRoute("/api/stream", api.stream),
         Mount("/page", StaticFiles(directory=PAGE)),
     ]
@@ -347,6 +350,8 @@ async def _explain(_: Request, error: Exception) -> Response:
 
 async def _explain_http(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    if error.status_code == 405 and not error.headers:
+        error.headers = {"allow": "GET, HEAD"}  # of the page's files, for which Starlette names none (RFC 9110, 15.5.6)
     return _json({"error": "NotServed", "what": error.detail}, error.status_code, error.headers)
 
 

@@ -110,6 +110,27 @@ async def test_its_schema_has_every_path_and_is_served(tmp_path: Path) -> None:
     assert methods == {(f"/api/{name}", "get") for name in named} | {(one, "get"), (one, "put")}
 
 
+METHODS = ("GET", "HEAD", "PUT", "POST", "PATCH", "DELETE", "OPTIONS", "TRACE", "QUERY")
+
+
+@pytest.mark.asyncio
+async def test_a_method_that_a_path_does_not_have_is_refused_with_those_that_it_has(tmp_path: Path) -> None:
+    paths = {path: {method.upper() for method in of if method != "parameters"} for path, of in SCHEMA["paths"].items()}
+    paths |= dict.fromkeys(("/", "/openapi.json", "/page/page.js"), {"GET"})
+    async with page(tmp_path) as of:
+        for path, documented in paths.items():
+            allowed = documented | {"HEAD"}
+            for method in METHODS:
+                answer = await of.client.request(method, path.format(group="axes", key="5/10"))
+                if method in allowed:
+                    assert answer.status_code != 405, (method, path)
+                    continue
+                assert answer.status_code == 405, (method, path)
+                assert set(answer.headers["allow"].split(", ")) == allowed, (method, path)
+                assert answer.json()["error"] == "NotServed"
+                assert answer.headers["x-content-type-options"] == "nosniff"
+
+
 @pytest.mark.asyncio
 async def test_a_write_passes_the_owners_authorisation_and_its_limits_hold(tmp_path: Path) -> None:
     async with served(tmp_path) as line, page(tmp_path) as of:
