@@ -165,6 +165,14 @@ MOST_PAGE_CONNECTIONS = 512
 the connection that has waited longest without a whole request, and that is reported once a minute."""
 REQUEST_WITHIN = 10.0
 """Seconds in which a connection must send a whole request, with its body, from its beginning or from its last reply."""
+MOST_SAMPLES = 10_000
+"""Samples of one reply of /api/history: of more, each part of the range is summed up."""
+HISTORY_WITHIN = 10.0
+"""Seconds for reading the history of one request: a longer range is refused with 503."""
+MOST_HISTORY = 16
+"""Requests for history that are read or wait to be read: one more is refused with 503."""
+HISTORY_THREADS = 2
+"""Requests for history that are read at a time."""
 
 # Metrics
 

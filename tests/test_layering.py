@@ -114,7 +114,7 @@ OPEN: dict[str, set[str]] = {
     "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},
     "app.interfaces": {"following", "opcua", "opcua_access", "web"},
     "app.line": {"", "parameter_sets", "points_table", "points_taking"},
-    "app.outputs": {"base", "cells", "distributor", "kinds", "settings"},
+    "app.outputs": {"base", "cells", "distributor", "history", "kinds", "settings"},
     "app.service": {
         *("authorisation", "folder", "messages", "payload", "permission", "picture", "record", "refusals", "remote"),
         *("remote_exchanges", "remote_group", "remote_overview", "rights", "service", "tcp", "touches", "values"),

@@ -5,15 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import QueryParams
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
@@ -31,7 +35,14 @@ from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.refusals import Logins, wait_text
 from busmaster.app.service.tcp import HostPort, listening
-from busmaster.bounds import LONGEST_COMMAND, LONGEST_PAGE_MESSAGE, MOST_PAGES
+from busmaster.bounds import (
+    HISTORY_THREADS,
+    LONGEST_COMMAND,
+    LONGEST_PAGE_MESSAGE,
+    MOST_HISTORY,
+    MOST_PAGES,
+    MOST_SAMPLES,
+)
 from busmaster.errors import (
     BacklogFull,
     BusClosed,
@@ -44,6 +55,12 @@ from busmaster.errors import (
 )
 
 PAGE = Path(__file__).parent / "page"
+NUMBER = re.compile(r"[-+]?[0-9]{1,20}(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,3})?")
+LARGEST_NUMBER = 1e11
+"""Of a parameter of a request for history: the year 5138."""
+DEFAULT_RANGE = 3600.0
+"""Seconds of history, if a request has no `from`."""
+DEFAULT_SAMPLES = 1000
 CLOSE_WITHIN = 1
 """Seconds in which pages are let go at the end."""
 STATUS: tuple[tuple[type[Exception], int], ...] = (
@@ -61,16 +78,28 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
 Told = Callable[[str], None]
 
 
+class PastValues(Protocol):
+    """Where past values are read. `read` blocks; it raises OSError where they cannot be read."""
+
+    def read(self, key: str, unit: str, begin: float, end: float, limit: int) -> Any:
+        """Return `samples`, `parts` and `labels` of a point, from `begin` to `end` in seconds since 1970."""
+        ...
+
+
 class Api:
     """What is answered. `tell` is told, in a sentence, of each write that somebody asked for."""
 
-    def __init__(self, line: Following, guard: Guard, tell: Told) -> None:
+    def __init__(self, line: Following, guard: Guard, tell: Told, history: PastValues | None = None) -> None:
         self._line = line
         self._guard = guard
         self._tell = tell
         self._logins = Logins(FailedLogins("web", line, tell).note, time.monotonic)
         self._audience = Audience(line)
         self._pages = 0
+        self._history = history
+        # Threads of its own: asyncio's are those by which the line is followed.
+        self._readers = ThreadPoolExecutor(HISTORY_THREADS, "busmaster history")
+        self._reading = 0
 
     async def line(self, _: Request) -> Response:
         """Answer what the line does."""
@@ -87,6 +116,7 @@ class Api:
             "since": since,
             "read_only": not self._may_be_written(),
             "wants_token": self._guard.wants_token,
+            "history": self._history is not None,
             "frame": None,
         }
         if frame is not None:
@@ -118,6 +148,33 @@ class Api:
         details = await self._line.details(row.group, row.key)
         past = [[self._wall(when), value] for when, value in row.past]
         return _json({**self._point(row), "past": past, "details": details})
+
+    async def history(self, request: Request) -> Response:
+        """Answer past values of a point, which the line lets this interface read."""
+        if self._history is None:
+            raise HTTPException(404, "no history is served here: start with --history FILE")
+        row = self._row(request)
+        begin, end, limit = _range(request)
+        if self._reading >= MOST_HISTORY:
+            raise HTTPException(503, f"{MOST_HISTORY} requests for history are being served already")
+        self._reading += 1
+        try:
+            read = partial(self._history.read, row.key, row.unit, begin, end, limit)
+            found = await asyncio.get_running_loop().run_in_executor(self._readers, read)
+        except OSError as error:
+            raise HTTPException(503, str(error)) from None
+        finally:
+            self._reading -= 1
+        return _json(
+            {
+                "from": begin,
+                "to": end,
+                "unit": row.unit,
+                "samples": [sample._asdict() for sample in found.samples],
+                "parts": [part._asdict() for part in found.parts],
+                "labels": dict(found.labels),
+            }
+        )
 
     async def read_or_write(self, request: Request) -> Response:
         """Answer one point, or write it. One route has both methods, so that a 405 names both in `Allow`."""
@@ -227,6 +284,30 @@ def _as_in_the_file(said: dict[str, Any]) -> dict[str, Any]:
     return said | {"protocol": kind or said["protocol"]}
 
 
+def _range(request: Request) -> tuple[float, float, int]:
+    """Return begin, end and limit of a request for history. Raises HTTPException for what is none."""
+    query = request.query_params
+    end = _number(query, "to", time.time())
+    begin = _number(query, "from", end - DEFAULT_RANGE)
+    limit = _number(query, "limit", DEFAULT_SAMPLES)
+    if not begin < end:
+        raise HTTPException(400, f"from ({begin:.14g}) must be less than to ({end:.14g})")
+    if not 1 <= limit <= MOST_SAMPLES or limit != int(limit):
+        raise HTTPException(400, f"limit must be a whole number from 1 to {MOST_SAMPLES}")
+    return begin, end, int(limit)
+
+
+def _number(query: QueryParams, name: str, default: float) -> float:
+    texts = query.getlist(name)
+    if not texts:
+        return default
+    if len(texts) > 1 or not NUMBER.fullmatch(texts[0]) or not 0 <= (number := float(texts[0])) <= LARGEST_NUMBER:
+        raise HTTPException(
+            400, f"{name} must be one number from 0 to {LARGEST_NUMBER:.0f}, not {cut(repr(', '.join(texts)))}"
+        )
+    return number
+
+
 WISHES = {'{"exchanges":true}': True, '{"exchanges":false}': False}
 
 
@@ -259,9 +340,11 @@ async def _value(request: Request) -> float | str:
     raise HTTPException(400, 'the body is {"value": NUMBER}, {"value": true}, {"value": false} or {"value": "TEXT"}')
 
 
-def application(line: Following, guard: Guard, tell: Told = lambda _: None) -> Guarded:
+def application(
+    line: Following, guard: Guard, tell: Told = lambda _: None, history: PastValues | None = None
+) -> Guarded:
     """Return the ASGI application that shows a line. `tell` is told of each write that somebody asked for."""
-    api = Api(line, guard, tell)
+    api = Api(line, guard, tell, history)
     one = "/api/points/{group}/{key:path}"
     routes = [
         Route("/", _page, methods=["GET"]),
@@ -272,6 +355,7 @@ def application(line: Following, guard: Guard, tell: Told = lambda _: None) -> G
         Route("/api/events", api.events, methods=["GET"]),
         Route("/api/points", api.points, methods=["GET"]),
         Route(one, api.read_or_write, methods=["GET", "PUT"]),
+        Route("/api/history/{group}/{key:path}", api.history, methods=["GET"]),
         WebSocketRoute("/api/stream", api.stream),
         Mount("/page", StaticFiles(directory=PAGE)),
     ]
@@ -324,13 +408,14 @@ async def serve(
     hosts: Sequence[str],
     opened: Told,
     tell: Told = lambda _: None,
+    history: PastValues | None = None,
 ) -> None:
     """Follow a line and serve its page until cancelled. `opened` is told the page's URL, `hosts` are further names of
-    it.
+    it, `history` is where past values are read.
 
     Raises InvalidCommand where nothing can listen there.
     """
-    async with serving(application(line, Guard(listen, secrets, hosts), tell), listen, tell) as url:
+    async with serving(application(line, Guard(listen, secrets, hosts), tell, history), listen, tell) as url:
         opened(url)
         await line.follow()
 

@@ -15,7 +15,7 @@ import httpx2 as httpx
 from busmaster import Hcp2Controller
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.guard import Guard
-from busmaster.app.interfaces.web import application, serving
+from busmaster.app.interfaces.web import PastValues, application, serving
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.rights import Role
 from busmaster.bus.points import Point
@@ -81,11 +81,12 @@ async def page(
     listen: tuple[str, int] = HERE,
     seen_at: tuple[str, int] | None = None,
     secrets: dict[str, bytes] | None = None,
+    history: PastValues | None = None,
 ) -> AsyncIterator[Page]:
     """The page of the line of this folder. Its guard takes it that it listens at `seen_at`, if that is not so."""
     writes: list[str] = []
     async with followed(folder, read_only=read_only) as line:
-        guarded = application(line, Guard(seen_at or listen, secrets or {}), writes.append)
+        guarded = application(line, Guard(seen_at or listen, secrets or {}), writes.append, history)
         async with (
             serving(guarded, listen) as url,
             httpx.AsyncClient(base_url=url, timeout=PATIENCE, trust_env=False) as client,

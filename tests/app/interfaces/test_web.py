@@ -6,6 +6,8 @@ import asyncio
 import json
 import os
 import socket
+import threading
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +20,12 @@ from busmaster import Hcp2Controller, MicroFlexDrive
 from busmaster.app.interfaces import audience, following
 from busmaster.app.interfaces.audience import MOST_EXCHANGES, Seat
 from busmaster.app.interfaces.web import PAGE, serving
+from busmaster.app.outputs.history import History, HistoryFile, PastSample
+from busmaster.app.outputs.settings import SqliteSettings
+from busmaster.app.outputs.sqlite import SqliteOutput
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.rights import Role
-from busmaster.bounds import LONGEST_COMMAND
+from busmaster.bounds import HISTORY_THREADS, LONGEST_COMMAND, MOST_HISTORY
 from busmaster.bus.limits import Limit
 from busmaster.errors import InvalidCommand
 from busmaster.registry import kinds
@@ -105,7 +110,7 @@ async def test_its_schema_has_every_path_and_is_served(tmp_path: Path) -> None:
     Draft202012Validator.check_schema({"$defs": SCHEMA["components"]["schemas"]})
     assert SCHEMA["openapi"].startswith("3.1")
     methods = {(path, method) for path, of in SCHEMA["paths"].items() for method in of if method != "parameters"}
-    named = {"line", "nodes", "groups", "events", "points"}
+    named = {"line", "nodes", "groups", "events", "points", "history/{group}/{key}"}
     one = "/api/points/{group}/{key}"
     assert methods == {(f"/api/{name}", "get") for name in named} | {(one, "get"), (one, "put")}
 
@@ -199,6 +204,150 @@ async def test_while_the_owner_is_away_it_says_so_and_writes_nothing(tmp_path: P
         assert (status, said["error"]) == (503, "NotStarted")
         answer = await of.client.get(ONE)
         assert answer.status_code == 503
+
+
+# history
+
+PAST = "/api/history/axes/5/10"
+FIRST = 1_700_000_000.0
+
+
+class Past:
+    """Past values that a test gives. What was requested is kept, with the thread that read it."""
+
+    def __init__(self, found: History | Exception | None = None) -> None:
+        self.found = found or History()
+        self.requests: list[tuple[str, str, float, float, int]] = []
+        self.threads: set[int] = set()
+        self.held = threading.Event()
+        self.held.set()
+
+    def read(self, key: str, unit: str, begin: float, end: float, limit: int) -> History:
+        self.requests.append((key, unit, begin, end, limit))
+        self.threads.add(threading.get_ident())
+        assert self.held.wait(PATIENCE)
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found
+
+
+async def past_of(of: Page, status: int = 200, path: str = PAST) -> Any:
+    """The answer to a request for history, which the schema allows."""
+    answer = await of.client.get(path)
+    assert answer.status_code == status, answer.text
+    check("/api/history/{group}/{key}", "get", status, answer.json())
+    return answer.json()
+
+
+@pytest.mark.asyncio
+async def test_past_values_come_from_the_database_that_the_output_writes(tmp_path: Path) -> None:
+    output = SqliteOutput("sqlite", SqliteSettings(path=str(tmp_path / "line.db")))
+    output.start()
+    history = HistoryFile(str(tmp_path / "line.db"))
+    async with served(tmp_path) as line, page(tmp_path, history=history) as of:
+        poll(line)
+        [group] = line.bus.groups
+        await shows(of.line)
+        for _ in range(3):
+            output.offer(await anext(aiter(group)))
+        await asyncio.to_thread(output.close, PATIENCE)
+        assert (await of.client.get("/api/line")).json()["history"]
+        found = await past_of(of)
+        assert [(sample["value"], sample["quality"]) for sample in found["samples"]] == 3 * [(0.0, "good")]
+        assert found["from"] < found["samples"][0]["time"] < found["samples"][2]["time"] <= found["to"]
+        found = await past_of(of, path=f"{PAST}?limit=2")
+        assert found["samples"] == []
+        assert sum(part["samples"] for part in found["parts"]) == 3
+
+
+@pytest.mark.asyncio
+async def test_history_is_read_in_the_range_that_is_requested_and_off_the_loop(tmp_path: Path) -> None:
+    samples = (PastSample(FIRST, inf, "good", None), PastSample(FIRST + 1, None, "bad", "no reply"))
+    past = Past(History(samples, labels=(("1", "jog"),)))
+    async with served(tmp_path) as line, page(tmp_path, history=past) as of:
+        poll(line)
+        await shows(of.line)
+        found = await past_of(of, path=f"{PAST}?from={FIRST}&to={FIRST + 10}&limit=7")
+        assert past.requests == [("5/10", "", FIRST, FIRST + 10, 7)]
+        assert threading.get_ident() not in past.threads
+        assert (found["from"], found["to"], found["labels"]) == (FIRST, FIRST + 10, {"1": "jog"})
+        assert [sample["value"] for sample in found["samples"]] == [{"float": "inf"}, None]
+        await past_of(of, path=f"{PAST}?to={FIRST}")
+        assert past.requests[1][2:] == (FIRST - 3600, FIRST, 1000)
+
+
+@pytest.mark.parametrize(
+    ("query", "why"),
+    [
+        ("from=yesterday", "from must be one number"),
+        ("from=nan", "from must be one number"),
+        ("to=1_0", "to must be one number"),
+        ("to=-1", "to must be one number from 0"),
+        ("to=1e300", "to must be one number from 0 to 100000000000"),
+        ("from=1&from=2", "not '1, 2'"),
+        ("from=10&to=10", "from (10) must be less than to (10)"),
+        ("from=&to=10", "from must be one number"),
+        ("limit=0", "limit must be a whole number from 1 to 10000"),
+        ("limit=10001", "limit must be a whole number from 1 to 10000"),
+        ("limit=1.5", "limit must be a whole number from 1 to 10000"),
+    ],
+)
+@pytest.mark.asyncio
+async def test_a_range_that_is_none_is_refused_before_anything_is_read(tmp_path: Path, query: str, why: str) -> None:
+    past = Past()
+    async with served(tmp_path) as line, page(tmp_path, history=past) as of:
+        poll(line)
+        await shows(of.line)
+        assert why in (await past_of(of, 400, f"{PAST}?{query}"))["what"]
+        assert past.requests == []
+
+
+@pytest.mark.asyncio
+async def test_history_is_authorised_as_reads_are(tmp_path: Path) -> None:
+    past = Past()
+    async with served(tmp_path) as line, page(tmp_path, history=past) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await of.client.get(PAST, headers={"Origin": "http://evil.example"})).status_code == 403
+        assert "there is no point '5/11'" in (await past_of(of, 404, "/api/history/axes/5/11"))["what"]
+        await past_of(of, 404, "/api/history/other/5/10")
+        assert past.requests == []
+    async with page(tmp_path, history=past) as of:  # and no line is served
+        await past_of(of, 503)
+        assert past.requests == []
+
+
+@pytest.mark.asyncio
+async def test_a_history_that_is_not_served_or_cannot_be_read_is_an_error_in_words(tmp_path: Path) -> None:
+    past = Past(OSError("the history x.db cannot be read: disk I/O error"))
+    async with served(tmp_path) as line:
+        poll(line)
+        async with page(tmp_path, history=past) as of:
+            await shows(of.line)
+            assert (await past_of(of, 503))["what"] == "the history x.db cannot be read: disk I/O error"
+        async with page(tmp_path) as of:
+            await shows(of.line)
+            assert not (await of.client.get("/api/line")).json()["history"]
+            assert "--history" in (await past_of(of, 404))["what"]
+
+
+@pytest.mark.asyncio
+async def test_requests_for_history_beyond_the_bound_are_refused_and_all_else_goes_on(tmp_path: Path) -> None:
+    past = Past()
+    past.held.clear()
+    async with served(tmp_path) as line, page(tmp_path, history=past) as of:
+        poll(line)
+        await shows(of.line)
+        requests = {asyncio.ensure_future(of.client.get(PAST)) for _ in range(MOST_HISTORY + 1)}
+        try:
+            [refused], waiting = await asyncio.wait(requests, return_when=asyncio.FIRST_COMPLETED)
+            assert (await refused).status_code == 503
+            assert len(past.requests) == HISTORY_THREADS
+            assert (await of.client.get("/api/line")).status_code == 200
+        finally:
+            past.held.set()
+        assert {answer.status_code for answer in await asyncio.gather(*waiting)} == {200}
+        await past_of(of)  # their places are free again
 
 
 # who is let in
