@@ -348,6 +348,7 @@ def application(
     one = "/api/points/{group}/{key:path}"
     routes = [
         Route("/", _page, methods=["GET"]),
+        Route("/docs", _docs, methods=["GET"]),
         Route("/openapi.json", _schema, methods=["GET"]),
         Route("/api/line", api.line, methods=["GET"]),
         Route("/api/nodes", api.nodes, methods=["GET"]),
@@ -422,6 +423,10 @@ async def serve(
 
 async def _page(_: Request) -> Response:
     return FileResponse(PAGE / "index.html")
+
+
+async def _docs(_: Request) -> Response:
+    return FileResponse(PAGE / "docs.html")
 
 
 async def _schema(_: Request) -> Response:

@@ -121,7 +121,7 @@ METHODS = ("GET", "HEAD", "PUT", "POST", "PATCH", "DELETE", "OPTIONS", "TRACE", 
 @pytest.mark.asyncio
 async def test_a_method_that_a_path_does_not_have_is_refused_with_those_that_it_has(tmp_path: Path) -> None:
     paths = {path: {method.upper() for method in of if method != "parameters"} for path, of in SCHEMA["paths"].items()}
-    paths |= {path: {"GET"} for path in ("/", "/openapi.json", "/page/page.js")}
+    paths |= {path: {"GET"} for path in ("/", "/docs", "/openapi.json", "/page/page.js")}
     async with page(tmp_path) as of:
         for path, documented in paths.items():
             allowed = documented | {"HEAD"}

@@ -1,5 +1,6 @@
 // One point: what there is to know of it, and writing it, which is asked twice.
 
+import { element } from "./element.js";
 import { shown } from "./line.js";
 import { draw_trend } from "./trend.js";
 
@@ -175,11 +176,4 @@ function beyond(value, details) {
     if (limit.maximum !== null && value > limit.maximum) return `${value} is above the limit of ${limit.maximum}.`;
   }
   return "";
-}
-
-export function element(name, text = "", kind = "") {
-  const made = document.createElement(name);
-  made.textContent = text;
-  if (kind) made.className = kind;
-  return made;
 }

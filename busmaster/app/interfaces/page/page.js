@@ -1,7 +1,8 @@
 // The page: it is told what changes by a WebSocket, and draws that at most once a frame.
 
 import { Line, milliseconds, shown } from "./line.js";
-import { PointDialog, element } from "./dialog.js";
+import { PointDialog } from "./dialog.js";
+import { element } from "./element.js";
 import { Wire } from "./wire.js";
 import { draw_trend } from "./trend.js";
 
