@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import threading
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from busmaster import Hcp2Controller
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.guard import Guard
 from busmaster.app.interfaces.web import PastValues, application, serving
+from busmaster.app.outputs.history import History
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.rights import Role
 from busmaster.bus.points import Point
@@ -92,3 +94,22 @@ async def page(
             httpx.AsyncClient(base_url=url, timeout=PATIENCE, trust_env=False) as client,
         ):
             yield Page(line, url, client, writes)
+
+
+class Past:
+    """Past values that a test gives. What was requested is kept, with the thread that read it."""
+
+    def __init__(self, found: History | Exception | None = None) -> None:
+        self.found = found or History()
+        self.requests: list[tuple[str, str, float, float, int]] = []
+        self.threads: set[int] = set()
+        self.held = threading.Event()
+        self.held.set()
+
+    def read(self, key: str, unit: str, begin: float, end: float, limit: int) -> History:
+        self.requests.append((key, unit, begin, end, limit))
+        self.threads.add(threading.get_ident())
+        assert self.held.wait(PATIENCE)
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found

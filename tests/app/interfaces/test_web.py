@@ -29,7 +29,7 @@ from busmaster.bounds import HISTORY_THREADS, LONGEST_COMMAND, MOST_HISTORY
 from busmaster.bus.limits import Limit
 from busmaster.errors import InvalidCommand
 from busmaster.registry import kinds
-from tests.app.interfaces.lines import HERE, ONE, READS, Page, assert_goes_on_alone, page, poll, shows
+from tests.app.interfaces.lines import HERE, ONE, READS, Page, Past, assert_goes_on_alone, page, poll, shows
 from tests.app.service.lines import Served, served, until
 from tests.patience import PATIENCE
 
@@ -210,25 +210,6 @@ async def test_while_the_owner_is_away_it_says_so_and_writes_nothing(tmp_path: P
 
 PAST = "/api/history/axes/5/10"
 FIRST = 1_700_000_000.0
-
-
-class Past:
-    """Past values that a test gives. What was requested is kept, with the thread that read it."""
-
-    def __init__(self, found: History | Exception | None = None) -> None:
-        self.found = found or History()
-        self.requests: list[tuple[str, str, float, float, int]] = []
-        self.threads: set[int] = set()
-        self.held = threading.Event()
-        self.held.set()
-
-    def read(self, key: str, unit: str, begin: float, end: float, limit: int) -> History:
-        self.requests.append((key, unit, begin, end, limit))
-        self.threads.add(threading.get_ident())
-        assert self.held.wait(PATIENCE)
-        if isinstance(self.found, Exception):
-            raise self.found
-        return self.found
 
 
 async def past_of(of: Page, status: int = 200, path: str = PAST) -> Any:

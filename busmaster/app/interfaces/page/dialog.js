@@ -2,7 +2,7 @@
 
 import { element } from "./element.js";
 import { shown } from "./line.js";
-import { draw_trend } from "./trend.js";
+import { Plot } from "./plot.js";
 
 const LONG_TEXT = 40; // characters that are shown in large letters
 const by = (id) => document.getElementById(id);
@@ -11,13 +11,14 @@ const box = by("point"), form = by("write-form"), field = by("new-value");
 export class PointDialog {
   constructor(colours) {
     this.colours = colours;
+    this.plot = new Plot();
     this.row = null;
     this.asked = null; // the value that is to be confirmed
     this.details = null;
     this.busy = false;
     by("shut").addEventListener("click", () => box.close());
     by("back").addEventListener("click", () => { this.ask(null); field.focus(); });
-    box.addEventListener("close", () => { this.row = null; });
+    box.addEventListener("close", () => { this.row = null; this.plot.close(); });
     field.addEventListener("input", () => { this.ask(null); this.outcome(""); });
     form.addEventListener("submit", (event) => { event.preventDefault(); this.submit(); });
   }
@@ -31,8 +32,9 @@ export class PointDialog {
     by("write-limits").textContent = "";
     by("point-facts").replaceChildren();
     this.allow(may);
-    this.draw();
     box.showModal();
+    this.plot.open(row, may.history ? path_of(row, "history") : null);
+    this.draw();
     (by("go").hidden ? by("shut") : field).focus();
     await this.load(row);
   }
@@ -73,7 +75,9 @@ export class PointDialog {
     const reading = shown(row.value, row.precision);
     by("point-value").textContent = reading;
     by("point-reading").classList.toggle("long", reading.length > LONG_TEXT);
-    draw_trend(by("point-trend"), row, { ...this.colours(), bounds: true, precision: row.precision });
+    this.plot.bounds = [this.details?.low, this.details?.high].filter((bound) => typeof bound === "number");
+    this.plot.colours = this.colours();
+    this.plot.update(row, line);
     const facts = [["group", row.group], ["protocol", `${row.kind}, address ${row.address}`]];
     if (this.details) facts.push(["asked as", this.details.command]);
     if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", alarms_text(this.details, row)]);
@@ -134,8 +138,8 @@ function why_not(row, may) {
   return "";
 }
 
-function path_of(row) {
-  return `/api/points/${encodeURIComponent(row.group)}/${row.key.split("/").map(encodeURIComponent).join("/")}`;
+function path_of(row, what = "points") {
+  return `/api/${what}/${encodeURIComponent(row.group)}/${row.key.split("/").map(encodeURIComponent).join("/")}`;
 }
 
 function typed(text) {

@@ -17,7 +17,7 @@ const by = (id) => document.getElementById(id);
 const line = new Line();
 const wire = new Wire(by("wire-canvas"), by("tip"), by("wire-said"));
 const shown_rows = new Map();
-let may = { read_only: true, wants_token: false };
+let may = { read_only: true, wants_token: false, history: false };
 let asked_what_may_be = false; // until then it is not known whether the page is read-only
 let connected = false;
 let stale = true; // something was heard since it was drawn
@@ -29,7 +29,7 @@ let order = "";
 function colours() {
   const style = getComputedStyle(document.documentElement);
   const of = (name) => style.getPropertyValue(`--${name}`).trim();
-  return { ink: of("ok"), dim: of("dim"), bad: of("bad") };
+  return { ink: of("ok"), dim: of("dim"), bad: of("bad"), late: of("late"), rule: of("rule") };
 }
 
 const dialog = new PointDialog(colours);

@@ -13,15 +13,15 @@ export function fit(canvas) {
   return { pen, width, height };
 }
 
-export function draw_trend(canvas, { past, value: last }, { ink, dim, bad, bounds = false, precision = null }) {
+export function draw_trend(canvas, { past, value: last }, { ink, bad }) {
   const { pen, width, height } = fit(canvas);
   const numbers = past.map(([, value]) => value).filter((value) => value !== null);
   if (!past.length || !width || (!numbers.length && typeof last === "string")) return;
-  let low = Math.min(...numbers), high = Math.max(...numbers);
+  const low = Math.min(...numbers), high = Math.max(...numbers);
   const begin = past[0][0], span = past.at(-1)[0] - begin || 1;
-  const flat = high === low, edge = bounds ? 14 : 3;
+  const flat = high === low;
   const x = (when) => ((when - begin) / span) * (width - 6) + 3;
-  const y = (value) => (flat ? height / 2 : height - edge - ((value - low) / (high - low)) * (height - 2 * edge));
+  const y = (value) => (flat ? height / 2 : height - 3 - ((value - low) / (high - low)) * (height - 6));
   pen.lineWidth = 1.5;
   pen.strokeStyle = ink;
   pen.beginPath();
@@ -34,13 +34,4 @@ export function draw_trend(canvas, { past, value: last }, { ink, dim, bad, bound
   pen.stroke();
   pen.fillStyle = bad;
   for (const [when, value] of past) if (value === null) pen.fillRect(x(when) - 0.5, height - 3, 1.5, 3);
-  if (bounds && numbers.length) {
-    pen.fillStyle = dim;
-    pen.font = "11px system-ui, sans-serif";
-    const text = (value) => (precision === null ? String(+value.toPrecision(6)) : value.toFixed(precision));
-    pen.fillText(text(high), 3, 10);
-    if (!flat) pen.fillText(text(low), 3, height - 2);
-    const seconds = `${span.toFixed(span < 10 ? 1 : 0)} s`;
-    pen.fillText(seconds, width - pen.measureText(seconds).width - 3, height - 2);
-  }
 }
