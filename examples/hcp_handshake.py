@@ -24,21 +24,10 @@ ATTEMPTS = 100
 SETTINGS = HcpController.profile.line
 
 
-async def give_command(controller: HcpController, command: int, speed: float, target: float) -> None:
-    """The data first, the command last and in a telegram of its own: the program must not act on old data."""
-    await controller.write(2, speed, target, 0)
-    await controller.write(1, command)
-    with anyio.fail_after(10):
-        while True:
-            await anyio.sleep(0.02)
-            if await controller.read(1) == 0:
-                return
-
-
 async def move_to(controller: HcpController, target: float, speed: float) -> int:
     """Returns after how many attempts the axis is there."""
     for attempt in range(1, ATTEMPTS + 1):
-        await give_command(controller, MOVE_ABSOLUTE, speed, target)
+        await controller.execute(MOVE_ABSOLUTE, speed, target, 0, finish_within=10)
         if abs(await controller.read(10) - target) < 0.001:
             return attempt
     raise TimeoutError(f"the axis is not at {target} after {ATTEMPTS} commands: does the program run?")

@@ -6,14 +6,16 @@ import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
+import anyio
+
 from busmaster.bus.handle import Handle, Send, checked_count, item_text, read_each, unknown_item
 from busmaster.bus.parameters import Parameter, Value
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
-from busmaster.contract.arguments import is_decimal
+from busmaster.contract.arguments import is_decimal, seconds, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.items import Access
-from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted, VerifyFailed, WriteUnconfirmed
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
 from busmaster.protocols._comms.elements import STARTS_EVENT, Element
 
@@ -21,6 +23,12 @@ T = TypeVar("T")
 
 LAST_OF_PROGRAM = 99
 """The elements up to it are the Mint program's own."""
+COMMAND_ELEMENT = 1
+"""The element of the documents' handshake that takes the command. The elements after it have the data."""
+LOOK_AGAIN = 0.02
+"""Seconds between two reads of an element that is awaited."""
+LONGEST_HANDOVER = 2.0
+"""Seconds for which a command holds the line: three exchanges, each with its retries."""
 
 
 class CommsHandle(Handle):
@@ -163,6 +171,131 @@ class CommsHandle(Handle):
         if element is None:
             raise unknown_item(name, self.elements, self._form)
         return element
+
+
+class MintHandle(CommsHandle):
+    """A handle of a controller that runs a Mint program, which elements 1 to 99 belong to."""
+
+    async def execute(
+        self,
+        command: float,
+        *data: float,
+        finish_within: float,
+        takes: float = 0.0,
+        element: int = COMMAND_ELEMENT,
+    ) -> None:
+        """Have the Mint program carry out a command, and return when it reports the end: the handshake of AN00110 and
+        AN00129.
+
+        The data are written to the elements after `element`, then the command to `element`. The program sets that
+        element to 0 when the command is done. All this may take `finish_within` seconds. No other request of any
+        program, except an urgent one, goes between the data and the command.
+
+        The program of the documents sets the element to 0 at the end of every loop. A command that arrives between its
+        read and that statement is lost, and looks like one that is done. A program that sets the element to 0 only
+        after a command has no such gap. For others, `takes` is the shortest time in seconds that the command can take:
+        an end before that raises VerifyFailed.
+
+        Raises NotStarted, and does not send the command, while the program carries out another one, or if the time is
+        over before. Raises WriteUnconfirmed if it is not known whether the command arrived, or if its end was not
+        reported in time: the program may still carry it out. Raises VerifyFailed if another command has replaced it.
+        If the caller is cancelled, a command that was sent is carried out. Raises InvalidCommand, before anything is
+        sent, for a command of 0 and for values that cannot be sent.
+        """
+        node, finish_within = self.node, seconds(finish_within, f"{self.node.label}: finish_within")
+        seconds(takes, f"{node.label}: takes")
+        start = self._command_of(command, data, element)
+        finish_by = node.now() + finish_within
+        async with self.exclusive(max_hold=LONGEST_HANDOVER) as held:
+            await held._hand_over(start, data, finish_by)
+            sent = node.now()  # a command that was repeated is not measured from its first attempt
+            await held._start(start, finish_by)
+        await self._await_end(start, sent, finish_by, takes)
+
+    def _command_of(self, command: float, data: Sequence[float], element: int) -> WriteElements:
+        """Return the write that starts a command. Raises InvalidCommand for one that cannot be sent, or its data."""
+        start = self._write_command(element, (command,))
+        if float(start.text) == 0:
+            raise InvalidCommand(f"{self.node.label}: 0 is no command: the program reports with it that one is done")
+        whole_number(start.element + len(data), 1, LAST_OF_PROGRAM, f"{self.node.label}: the last element of a command")
+        if data:
+            self._writes(start.element + 1, data)
+        self.node.check(start)
+        return start
+
+    async def _hand_over(self, start: WriteElements, data: Sequence[float], finish_by: float) -> None:
+        """Write the data, unless the program carries out a command: it could use them for that."""
+        running = await self.read(start.element, finish_within=self._left(finish_by))
+        if running != 0:
+            raise NotStarted(
+                f"element {start.element} is {running:g}: the program still carries out a command",
+                node=self.node,
+                command=str(start),
+                hint="wait until it is 0; if it stays, see whether the program runs",
+            )
+        if not data:
+            return
+        first = start.element + 1
+        try:
+            await self.write(first, *data, finish_within=self._left(finish_by))
+        except WriteUnconfirmed:
+            # Not written twice, for a write may start an event. If they are all there, nothing needs to be.
+            found = await self.read(first, len(data), finish_within=self._left(finish_by))
+            if not all(map(is_read_back, data, found)):
+                raise
+
+    async def _start(self, start: WriteElements, finish_by: float) -> None:
+        """Write the command. If it is not acknowledged, the element shows whether it has arrived."""
+        try:
+            await self.node.request(start, finish_within=self._left(finish_by))
+        except WriteUnconfirmed as error:
+            try:
+                found = await self.read(start.element, finish_within=self._left(finish_by))
+            except BusError:
+                raise error from None
+            if not is_read_back(start.values[0], found):
+                error.hint = "it is lost, or done already: check its effect before you give it again"
+                raise
+
+    async def _await_end(self, start: WriteElements, sent: float, finish_by: float, takes: float) -> None:
+        """Read the element of a command until it is 0."""
+        element, last = start.element, ""
+        while (left := self._left(finish_by)) > 0:
+            await anyio.sleep(min(LOOK_AGAIN, left))
+            try:
+                found = await self.read(element, finish_within=self._left(finish_by))
+            except BusClosed:
+                raise
+            except BusError as error:  # the program goes on meanwhile, so it may yet be seen to end
+                last = last or error.what
+                continue
+            last = f"it read {found:g} last"
+            if found == 0:
+                took = self.node.now() - sent
+                if took < takes:
+                    raise VerifyFailed(
+                        f"element {element} is 0 after {took:.3f} s, and the command takes {takes:g} s at least",
+                        node=self.node,
+                        command=str(start),
+                        hint="the program may have set it to 0 without the command: check its effect",
+                    )
+                return
+            if not is_read_back(start.values[0], found):
+                raise VerifyFailed(
+                    f"element {element} reads {found:g} after command {start.text}: another one has replaced it",
+                    node=self.node,
+                    command=str(start),
+                    hint="let one program alone give commands to a controller",
+                )
+        raise WriteUnconfirmed(
+            f"the command was sent, and element {element} did not become 0 in time: {last or 'it was not read'}",
+            node=self.node,
+            command=str(start),
+            hint="the program may still carry it out: read the element",
+        )
+
+    def _left(self, finish_by: float) -> float:
+        return max(0.0, finish_by - self.node.now())
 
 
 class HasElements(typing.Protocol):

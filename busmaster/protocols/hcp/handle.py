@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import ClassVar
 
 from busmaster.contract.profile import Profile
-from busmaster.protocols._comms.handle import CommsHandle
+from busmaster.protocols._comms.handle import MintHandle
 from busmaster.protocols.hcp import codec as hcp
 
 
-class HcpController(CommsHandle):
+class HcpController(MintHandle):
     """A Mint controller over HCP: nodes 0-15, comms elements 1-99.
 
     winder = HcpController(bus, 2)

@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 from busmaster.bus.points import Point
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.profile import Profile
-from busmaster.protocols._comms.handle import CommsHandle, Named
+from busmaster.protocols._comms.handle import MintHandle, Named
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import comms_array
 
 
-class Hcp2Controller(CommsHandle):
+class Hcp2Controller(MintHandle):
     """A Mint controller over HCP2: nodes 0-255, comms elements 1-99 and the extended comms array, 100-255.
 
     controller = Hcp2Controller(bus, 5)
