@@ -19,7 +19,7 @@ from busmaster.arbiter.unexpected import QUIET
 from busmaster.bus.bus import Bus
 from busmaster.bus.bus_like import find_group
 from busmaster.bus.exclusive import HeldNode, checked_hold
-from busmaster.bus.handle import Handle, Send
+from busmaster.bus.handle import Action, Handle, Send
 from busmaster.bus.limits import Limit
 from busmaster.bus.meaning import MOST_DIGITS, OF_QUANTITIES, PLAIN, MeansNothing, Named
 from busmaster.bus.node import Node, Request
@@ -100,6 +100,7 @@ __all__ = [
     "TIMES",
     "URGENT",
     "USB",
+    "Action",
     "Attempt",
     "Between",
     "Bit",
@@ -163,6 +164,7 @@ __all__ = [
     "Waiter",
     "WriteOptions",
     "accept_device",
+    "actions",
     "add_tap",
     "begin_with",
     "check_company",
@@ -172,6 +174,7 @@ __all__ = [
     "checked_options",
     "checked_priority",
     "clock_of",
+    "counted_items",
     "documented",
     "empty_set",
     "find_group",
@@ -414,6 +417,19 @@ def prepare_write(handle: Handle, item: str, values: Sequence[Any], **options: U
     Raises InvalidCommand.
     """
     return handle._prepare_write(item, values, **options)
+
+
+def actions(handle: Handle | type[Handle]) -> Mapping[str, Action]:
+    """Return what a node does beyond reads and writes, by name."""
+    return handle._actions
+
+
+def counted_items(handle: Handle, item: str) -> tuple[str, ...]:
+    """Return the items of one with a count ("1.01:20", "3000:500"); another item stands for itself.
+
+    Raises InvalidCommand.
+    """
+    return handle._counted(item)
 
 
 def listed_parameters(handle: Handle) -> tuple[Parameter, ...]:

@@ -186,7 +186,7 @@ SHOWN = {
         planned probe profile request statistics stops suspend suspended timed_request timings use_sync_reads""",
     "handle": """bus differences exclusive in_operation items node parameters point prepare_load profile read
         save_parameters use_sync_reads write""",
-    "controller": "axis element elements io named",
+    "controller": "axis element elements execute io named",
     "drive": "write_all",
     "unit": "",
     "msc": """address_step clear_flag find_address_step flag flags load_cam model set_flag status symbols

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, overload
 
 from busmaster.bounds import MOST_MEMBERS
@@ -42,6 +42,25 @@ Send: TypeAlias = Callable[[], Awaitable[None]]
 """Sends a prepared write."""
 
 
+@dataclass(frozen=True, slots=True)
+class Action:
+    """One thing that a handle does beyond reads and writes, for the command line.
+
+    `about`: a sentence for the help. `run`: carries it out; called with the handle and the numbers. `check`: called
+    likewise, raises InvalidCommand for numbers that cannot be sent. `numbers`: names of the numbers that it takes; one
+    that ends with "..." stands for any count. `time`: the argument of `run` that limits its time, in seconds, or empty.
+    `needs_time`: the time has no default. `least`: the argument for the shortest time that it can take, or empty.
+    """
+
+    about: str
+    run: Callable[..., Awaitable[Any]]
+    check: Callable[..., object]
+    numbers: tuple[str, ...] = ()
+    time: str = ""
+    needs_time: bool = False
+    least: str = ""
+
+
 class Handle(ABC):
     """An awaitable handle of one node: thin and typed, over `Requester.request`.
 
@@ -54,6 +73,8 @@ class Handle(ABC):
     profile: ClassVar[Profile]
     _identity: ClassVar[tuple[str, ...]] = ()
     """Items that identify a node, such as its firmware."""
+    _actions: ClassVar[Mapping[str, Action]] = {}
+    """The actions of the node, by their names on the command line."""
 
     def __init__(
         self,
@@ -340,6 +361,7 @@ def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
 
 
 __all__ = [
+    "Action",
     "Handle",
     "Send",
     "checked_count",

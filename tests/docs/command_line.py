@@ -34,6 +34,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         (f"write {LINE} --protocol hcp2 --node 5 --verify 1=123.456", RUN),
         ("write line.toml winder/setpoint=120", RUN),
     ),
+    "do": (
+        (f"do 7@{LINE} enable --protocol microflex", DRIVES),
+        ("do winder@line.toml execute 1 200 25 --within 10", DRIVES),
+    ),
     "poll": ((f"poll {LINE} --protocol hcp2 --nodes 1-4 --items 1,2 --period 0.2", CTRL_C),),
     "scan": ((f"scan {LINE} --protocol hcp2 --nodes 1-8", RUN),),
     "discover": ((f"discover {LINE} --yes -o found.toml", LONG),),

@@ -35,6 +35,7 @@ COMMANDS = (
     "demo",
     "read",
     "write",
+    "do",
     "poll",
     "scan",
     "discover",

@@ -22,7 +22,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 NOT_THE_FILES = (
     *("capture", "capture_files", "capture_mb", "verify", "as_json"),
-    *("items", "output", "dry_run", "yes", "enabled", "undo"),
+    *("items", "output", "dry_run", "yes", "enabled", "undo", "within", "at_least"),
 )
 """Options that say nothing of a line, and stand beside a LINE.toml."""
 

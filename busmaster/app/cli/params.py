@@ -8,24 +8,21 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 
 import click
 
-from busmaster import Bus, Priority, ext
+from busmaster import Priority, ext
 from busmaster.app.cli.app import FAILED, OK, bus_error_text
 from busmaster.app.cli.arguments import Connection, connected, json_option
-from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.late import late_nodes
-from busmaster.app.cli.lines import is_line_file, keep, load
+from busmaster.app.cli.lines import keep
 from busmaster.app.cli.output import Level, columns, emit, json_line, note, value_text
 from busmaster.app.cli.parsing import option_type, parse_items
 from busmaster.app.cli.protocols import ItemCommand, NodeCommand
-from busmaster.app.cli.reaching import owner_of, reach, tell_owner
-from busmaster.app.line import ConfiguredLine
+from busmaster.app.cli.targets import AT, NODE_AT, Lines, Target, split
 from busmaster.app.line.parameter_sets import (
     PART,
     PartFile,
@@ -38,12 +35,10 @@ from busmaster.app.line.parameter_sets import (
 )
 from busmaster.app.service.authorisation import Wish
 from busmaster.app.service.record import WriteRecord, this_user
-from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.ext import (
     Change,
     Found,
-    Handle,
     Left,
     Outcome,
     Parameter,
@@ -53,15 +48,12 @@ from busmaster.ext import (
     Send,
     Value,
     empty_set,
-    is_decimal,
     meant,
     walk,
 )
-from busmaster.registry import NodeKind, find
+from busmaster.registry import NodeKind
 
 DIFFERENT = 1
-AT = "@"
-NODE_AT = "NODE@PORT|NODE@LINE.toml"
 items_option = click.option(
     "--items",
     type=option_type(parse_items),
@@ -90,115 +82,52 @@ def command() -> None:
     """
 
 
-# nodes and their lines
+# the parameters of a node
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A node: a handle without decimals of its own, and what is known of its parameters.
-
-    `line` is that of its LINE.toml, None for a node of a PORT; `name` is what the file calls it. `owned`: the bus is
-    that of the program that owns the line.
-    """
-
-    kind: NodeKind
-    bus: Bus | RemoteBus
-    handle: Handle
-    line: ConfiguredLine | None = None
-    name: str = ""
-    owned: bool = False
-
-    @property
-    def label(self) -> str:
-        return self.handle.node.label
-
-    def parameters(self, items: Sequence[str] | None = None) -> tuple[Parameter, ...]:
-        """Return its parameters, or those of `items`. Raises InvalidCommand if there are none."""
-        if self.line is None:
-            return self.handle.parameters(items or ())
-        return line_parameters(self.line, self.name, self.handle, items or ())
-
-    def known(self) -> tuple[Parameter, ...]:
-        """Return its parameters, none if there is no list."""
-        try:
-            return self.parameters()
-        except InvalidCommand:
-            return ()
-
-    def prepare(self, wanted: SetFile, change: Change, item: str) -> Send:
-        """Return what writes a value, in the background. Raises InvalidCommand for one beyond a limit of LINE.toml or
-        the range in the set."""
-        wanted.check_range(change.parameter.item)
-        if self.line is not None and self.owned:
-            own = ext.plain_handle(self.line.nodes[self.name])
-            ext.prepare_write(own, item, [change.value])  # its owner has limits too
-        [send] = ext.prepare_write(self.handle, item, [change.value], priority=Priority.BACKGROUND)
-        return send
-
-    @contextmanager
-    def recorded(self, change: Change) -> Iterator[None]:
-        """Keep a record of a write, where no owner does."""
-        if self.line is None or self.owned:
-            yield
-            return
-        parameter = change.parameter
-        name = parameter.name if parameter.name in self.line.file.nodes[self.name].points else parameter.item
-        wish = Wish(
-            interface="command line",
-            by="busmaster params load",
-            name=f"{self.name}/{name}",
-            point=self.line.point(f"{self.name}/{name}"),
-            value=in_unit(parameter, change.value, self.kind),
-        )
-        with self.line.authorisation.begin(wish):
-            yield
+def parameters_of(target: Target, items: Sequence[str] | None = None) -> tuple[Parameter, ...]:
+    """Return the parameters of a node, or those of `items`. Raises InvalidCommand if there are none."""
+    if target.line is None:
+        return target.handle.parameters(items or ())
+    return line_parameters(target.line, target.name, target.handle, items or ())
 
 
-@dataclass
-class Lines:
-    """The lines of the nodes of one command: a line is opened once, though two of its nodes are compared."""
-
-    buses: dict[str, Bus | RemoteBus] = field(default_factory=dict)
-    files: dict[str, ConfiguredLine] = field(default_factory=dict)
-
-    def target(self, connection: Connection, node: str) -> Target:
-        """Return a node. Raises UsageError or InvalidCommand for one that does not exist."""
-        port = connection.port
-        if is_line_file(port):
-            return self._of_file(connection, node)
-        if node and not is_decimal(node):
-            raise click.UsageError(f"a node of a port is named by its address, not {node!r}")
-        address = connection.one_address(int(node) if node else None)
-        bus = self.buses.get(port) or self.buses.setdefault(port, reach(connection))
-        return Target(find(connection.protocol), bus, ext.plain_handle(connection.open_handle(bus, address)))
-
-    def _of_file(self, connection: Connection, node: str) -> Target:
-        port = connection.port
-        if port not in self.files:
-            file = load(port)
-            owner = owner_of(file.port)
-            if owner is not None and connection.capture is not None:
-                raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
-            recording = capturing(connection.capture, port=file.port.name, echo=file.port.echo)
-            recorder = click.get_current_context().with_resource(recording)
-            self.files[port] = ConfiguredLine(file, outputs=False, tap=recorder)
-            self.buses[port] = self.files[port].bus if owner is None else connect(owner.address)
-            if owner is not None:
-                tell_owner(owner)
-        line, bus = self.files[port], self.buses[port]
-        if node not in line.nodes:
-            raise click.UsageError(f"{port} has no node {node!r}; {meant(node, line.nodes)}")
-        owned = bus is not line.bus
-        handle = ext.plain_handle(line.handle(node, bus if owned else None))
-        return Target(line.file.nodes[node].kind, bus, handle, line, node, owned)
+def known_parameters(target: Target) -> tuple[Parameter, ...]:
+    """Return the parameters of a node, none if there is no list."""
+    try:
+        return parameters_of(target)
+    except InvalidCommand:
+        return ()
 
 
-def split(text: str) -> tuple[str, str]:
-    """Return the node and the port or file of NODE@PORT. Raises UsageError."""
-    node, at, where = text.partition(AT)
-    if not at or not where:
-        raise click.UsageError(f"a node is written {NODE_AT}, like winder@line.toml, not {text!r}")
-    return node, where
+def prepare_change(target: Target, wanted: SetFile, change: Change, item: str) -> Send:
+    """Return what writes a value, in the background. Raises InvalidCommand for one beyond a limit of LINE.toml or the
+    range in the set."""
+    wanted.check_range(change.parameter.item)
+    if target.line is not None and target.owned:
+        own = ext.plain_handle(target.line.nodes[target.name])
+        ext.prepare_write(own, item, [change.value])  # its owner has limits too
+    [send] = ext.prepare_write(target.handle, item, [change.value], priority=Priority.BACKGROUND)
+    return send
+
+
+@contextmanager
+def recorded(target: Target, change: Change) -> Iterator[None]:
+    """Keep a record of a write, where no owner does."""
+    if target.line is None or target.owned:
+        yield
+        return
+    parameter = change.parameter
+    name = parameter.name if parameter.name in target.line.file.nodes[target.name].points else parameter.item
+    wish = Wish(
+        interface="command line",
+        by="busmaster params load",
+        name=f"{target.name}/{name}",
+        point=target.line.point(f"{target.name}/{name}"),
+        value=in_unit(parameter, change.value, target.kind),
+    )
+    with target.line.authorisation.begin(wish):
+        yield
 
 
 def me() -> str:
@@ -235,7 +164,7 @@ def save_command(connection: Connection, node: str | None, output: str, items: t
     """
     parsed_output(output)
     target = Lines().target(connection, node or "")
-    return until_ended(save, target, target.parameters(items), output)
+    return until_ended(save, target, parameters_of(target, items), output)
 
 
 def parsed_output(path: str) -> None:
@@ -326,7 +255,9 @@ async def diff(lines: Lines, sides: Sequence[SetFile | Target], items: Sequence[
     kind = sides[0].kind
     wanted: set[str] | None = None
     if items is not None:
-        wanted = {parameter.item for each in sides if isinstance(each, Target) for parameter in each.parameters(items)}
+        wanted = {
+            parameter.item for each in sides if isinstance(each, Target) for parameter in parameters_of(each, items)
+        }
         wanted = wanted or set(items)
     found = [each for each in kind.handle.differences(one, other) if wanted is None or each.parameter.item in wanted]
     for item in one.identity.keys() & other.identity.keys():
@@ -357,10 +288,10 @@ async def read(target: Target, files: Sequence[ParameterSet], items: Sequence[st
     from busmaster.app.cli.progress import Bar
 
     if files and items is None:
-        own = {one.item: one for one in target.known()}
+        own = {one.item: one for one in known_parameters(target)}
         parameters = [own.get(item, entry.parameter) for item, entry in files[0].entries.items()]
     else:
-        parameters = list(target.parameters(items))
+        parameters = list(parameters_of(target, items))
     with Bar(target.label, len(parameters)) as bar:
 
         def progress(found: Found) -> None:
@@ -467,8 +398,8 @@ async def may_be_written(target: Target, enabled: bool, *, again: bool = False) 
 
 async def prepare(target: Target, wanted: SetFile) -> ParameterLoad:
     """Read what the node holds of a set."""
-    prepared = partial(target.prepare, wanted)
-    plan = await target.handle.prepare_load(wanted.set, parameters=target.known(), prepare=prepared, by=me())
+    prepared = partial(prepare_change, target, wanted)
+    plan = await target.handle.prepare_load(wanted.set, parameters=known_parameters(target), prepare=prepared, by=me())
     for item, value in wanted.set.identity.items():
         now = plan.undo.identity.get(item)
         if now is not None and now != value:
@@ -524,7 +455,7 @@ async def carry_out(plan: ParameterLoad, target: Target) -> int:
     """Write the changes, print what became of each, and return the exit status."""
     outcomes: list[Outcome] = []
     try:
-        async for outcome in plan.write(around=target.recorded):
+        async for outcome in plan.write(around=partial(recorded, target)):
             outcomes.append(outcome)
             if outcome.result is Result.WRITTEN:
                 emit(f"{outcome.change.parameter.item} ok")

@@ -14,6 +14,7 @@ from busmaster.app.service.messages import value_of
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.reads import PlainRead
+from busmaster.app.service.record import RAW_COMMAND
 from busmaster.app.service.rights import Rights
 from busmaster.app.service.telling import protocol_of
 from busmaster.bounds import LONGEST_WAIT
@@ -34,8 +35,6 @@ from busmaster.ext import (
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 """Of a request, those that a client may say."""
 INTERFACE = "service"
-RAW_COMMAND = "raw command"
-"""What the record of a write names in place of a point, where no poll group has one: its value says the rest."""
 
 
 class Asker(Protocol):

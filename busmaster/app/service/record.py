@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 LONGEST_SHOWN = 200
 """Characters of each part, such as a value or an error, that are kept of a write."""
 
+RAW_COMMAND = "raw command"
+"""What the record of a write names in place of a point, where there is none: its value says the rest."""
+
 
 class Outcome(Enum):
     """What became of a write."""

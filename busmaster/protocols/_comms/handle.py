@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
 import anyio
 
-from busmaster.bus.handle import Handle, Send, checked_count, item_text, read_each, unknown_item
+from busmaster.bus.handle import Action, Handle, Send, checked_count, item_text, read_each, unknown_item
 from busmaster.bus.parameters import Parameter, Value
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
@@ -296,6 +296,18 @@ class MintHandle(CommsHandle):
 
     def _left(self, finish_by: float) -> float:
         return max(0.0, finish_by - self.node.now())
+
+    _actions: ClassVar[Mapping[str, Action]] = {
+        "execute": Action(
+            "Have the Mint program carry out a command with its data, by the handshake of the Mint notes.",
+            execute,
+            check=lambda handle, command, *data: handle._command_of(command, data, COMMAND_ELEMENT),
+            numbers=("COMMAND", "DATA..."),
+            time="finish_within",
+            needs_time=True,
+            least="takes",
+        )
+    }
 
 
 class HasElements(typing.Protocol):

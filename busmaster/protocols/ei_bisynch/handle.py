@@ -7,7 +7,7 @@ from copy import copy
 from decimal import ROUND_HALF_UP, Decimal
 from typing import Any, ClassVar, Self, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
+from busmaster.bus.handle import Action, Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.parameters import FIRST, USUAL, Parameter
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
@@ -115,9 +115,18 @@ class BisynchInstrument(Handle):
 
     async def clear_error(self, **options: Unpack[CommandOptions]) -> None:
         """Clear the last error, so that the next one can be told from it."""
-        await self.node.request(
-            Write(LAST_ERROR, 0, hexadecimal=True, printable_check=self._printable_check), **options
+        await self.node.request(self._clearing(), **options)
+
+    def _clearing(self) -> Write:
+        return Write(LAST_ERROR, 0, hexadecimal=True, printable_check=self._printable_check)
+
+    _actions: ClassVar[Mapping[str, Action]] = {
+        "clear-error": Action(
+            "Clear the last error, so that the next one can be told from it.",
+            clear_error,
+            check=lambda instrument: instrument.node.check(instrument._clearing()),
         )
+    }
 
     async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write a parameter, or several tags from `item` on, acknowledged.

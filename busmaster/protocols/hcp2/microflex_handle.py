@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, ClassVar, Unpack
 
 import anyio
 
+from busmaster.bus.handle import Action
 from busmaster.bus.requester import CommandOptions, Priority, ReadOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.profile import Profile
@@ -163,7 +164,7 @@ class MicroFlexDrive(CommsHandle):
         stop: bool = False,
     ) -> None:
         """Write the command word. It changes more than its own point: all samples of the drive are stale after it."""
-        command = hcp2.Write(microflex.COMMAND_WORD.number, (word,), idempotent=True)
+        command = _command(word)
         await self.node.request(command, priority=priority, stops_seen=stops_seen, stop=stop)
 
     async def _clear_cancel(self, command: Callable[[CommandWord], Coroutine[Any, Any, None]]) -> None:
@@ -199,6 +200,31 @@ class MicroFlexDrive(CommsHandle):
                     command=str(self.status_word.command),
                 )
             await anyio.sleep(LOOK_AGAIN)
+
+    _actions: ClassVar[Mapping[str, Action]] = {
+        "enable": Action(
+            "Enable the drive, and wait until its status word says so.",
+            enable,
+            check=lambda drive: drive.node.check(_command(CommandWord.ENABLE)),
+            time="within",
+        ),
+        "disable": Action(
+            "Disable the drive ahead of all other traffic, and wait until its status word says so.",
+            disable,
+            check=lambda drive: drive.node.check(_command(_NOTHING), stop=True),
+            time="within",
+        ),
+        "reset": Action(
+            "Cancel its asynchronous errors. A drive that is enabled stays enabled.",
+            cancel_errors,
+            check=lambda drive: drive.node.check(_command(CommandWord.CANCEL)),
+        ),
+    }
+
+
+def _command(word: CommandWord) -> hcp2.Write:
+    """Return the write of a command word. It may be repeated: the bits are levels."""
+    return hcp2.Write(microflex.COMMAND_WORD.number, (word,), idempotent=True)
 
 
 async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence, Si
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NoReturn, Unpack, overload
 
-from busmaster.bus.handle import Handle, Send, checked_count, encoder, item_text, unknown_item
+from busmaster.bus.handle import Action, Handle, Send, checked_count, encoder, item_text, unknown_item
 from busmaster.bus.parameters import Parameter
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, Priority, ReadOptions, SeveralRequests, WriteOptions
@@ -293,6 +293,21 @@ class MscController(Handle):
         """Return that the program runs, which uses the data, as its status word says; "" if it does not."""
         running = ProgramStatus.PROGRAM_RUNNING in await self.status(**options)
         return "its status word says PROGRAM_RUNNING" if running else ""
+
+    _actions: ClassVar[Mapping[str, Action]] = {
+        "set-flag": Action(
+            "Turn an output flag or user flag on.",
+            set_flag,
+            check=lambda unit, number: unit.node.check(SetFlag(number)),
+            numbers=("FLAG",),
+        ),
+        "clear-flag": Action(
+            "Turn an output flag or user flag off.",
+            clear_flag,
+            check=lambda unit, number: unit.node.check(ClearFlag(number)),
+            numbers=("FLAG",),
+        ),
+    }
 
     # inside
 

@@ -19,6 +19,7 @@ PROMISED = {
     "demo": "[--seconds S] [--plain]",
     "read": "PORT|LINE.toml [--protocol P] [--node N] ITEM... [--json]",
     "write": "PORT|LINE.toml [--protocol P] [--node N] ITEM=VALUE[,VALUE...]... [--verify] [--json] [--decimals N]",
+    "do": "NODE@PORT|NODE@LINE.toml ACTION [NUMBER]... [--protocol P] [--within S] [--at-least S] [--json]",
     "poll": "PORT --protocol P [--nodes N-M,K] --items ITEM,ITEM... --period S [--seconds S] [--json] [--plain]",
     "scan": "PORT --protocol P [--nodes N-M,K] [--json]",
     "emulate": "[LINE.toml] [--protocol P] [--nodes N-M,K] [--pty [LINK]] [--tcp HOST:PORT] [--baud N] [--paced]"
@@ -56,6 +57,7 @@ NODE = f"{LINE} [--retries N] [--address-step N]"
 BESIDE = {
     "read": f"{CAPTURE} {NODE} [--chain]",
     "write": f"{CAPTURE} {NODE}",
+    "do": f"{CAPTURE} {NODE}",
     "poll": f"{CAPTURE} {NODE} [--read-only]",
     "scan": f"{CAPTURE} {NODE}",
     "run": f"{CAPTURE} [--port PORT]",

@@ -1,0 +1,222 @@
+"""`busmaster do`: actions of drives, by a port, by a file, and through the program that owns the line."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster.emulator.line import Line
+from busmaster.emulator.serve import TcpServer
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
+from busmaster.registry import kinds
+from tests.app.cli.conftest import Command, owner, serve, without_time
+from tests.handles.test_handshake import careful
+from tests.patience import PATIENCE
+
+MICROFLEX = ("--protocol", "microflex", "--timeout", "1000")
+FILE = """
+port = "PORT?baudrate=57600"
+[nodes.drive]
+protocol = "microflex"
+address = 7
+timing = { window = 1.0 }
+[outputs.sqlite]
+path = "FOLDER/line.sqlite"
+"""
+
+
+@pytest.fixture
+def drive() -> Iterator[TcpServer]:
+    """A MicroFlex drive at address 7."""
+    with serve("microflex", 7) as server:
+        yield server
+
+
+def microflex(line: Line) -> EmulatedMicroFlex:
+    device = line.device(7)
+    assert isinstance(device, EmulatedMicroFlex)
+    return device
+
+
+def enabled(server: TcpServer) -> bool:
+    return server.call(lambda line, now: microflex(line).enabled)
+
+
+@pytest.fixture
+def file(tmp_path: Path, drive: TcpServer) -> Path:
+    path = tmp_path / "line.toml"
+    path.write_text(FILE.replace("PORT", drive.path).replace("FOLDER", str(tmp_path)))
+    return path
+
+
+def audit(path: Path) -> list[tuple[Any, ...]]:
+    """By whom, point, value and outcome of each write that is on record."""
+    with sqlite3.connect(path.parent / "line.sqlite", timeout=PATIENCE) as database:
+        rows = database.execute("select by, point, value, outcome from audit order by time").fetchall()
+    database.close()
+    return rows
+
+
+def test_a_drive_is_enabled_and_disabled_by_its_address(busmaster: Command, drive: TcpServer) -> None:
+    node = f"7@{drive.path}"
+    ran = busmaster("do", node, "enable", *MICROFLEX)
+    assert (ran.status, ran.out, ran.err) == (0, "enable ok 192 HARDWARE_ENABLE|ENABLED\n", "")
+    assert enabled(drive)
+    ran = busmaster("do", node, "disable", *MICROFLEX, "--json")
+    said = {"node": 7, "action": "disable", "ok": True, "value": 64, "names": ["HARDWARE_ENABLE"]}
+    assert (ran.status, without_time(ran.out)) == (0, said)
+    assert not enabled(drive)
+
+
+def test_a_reset_cancels_the_errors(busmaster: Command, drive: TcpServer) -> None:
+    drive.call(lambda line, now: setattr(microflex(line), "axis_error", 4))
+    ran = busmaster("do", f"7@{drive.path}", "enable", *MICROFLEX, "--within", "0.05")
+    assert (ran.status, ran.out) == (1, "")
+    assert "not enabled: it has an error" in ran.err
+    ran = busmaster("do", f"7@{drive.path}", "reset", *MICROFLEX)
+    assert (ran.status, ran.err) == (0, "")
+    assert drive.call(lambda line, now: (microflex(line).axis_error, microflex(line).command_word & 64)) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("node", "arguments", "complaint"),
+    [
+        ("7@PORT", ("enabel", *MICROFLEX), "no such action 'enabel'; microflex has enable, disable, reset"),
+        ("7@PORT", ("enable", "1", *MICROFLEX), "enable is written enable, not with 1 numbers"),
+        ("7@PORT", ("reset", *MICROFLEX, "--within", "1"), "reset takes no --within"),
+        ("7@PORT", ("enable", *MICROFLEX, "--at-least", "1"), "enable takes no --at-least"),
+        ("7@PORT", ("enable", *MICROFLEX, "--wihtin", "1"), "no such option '--wihtin'"),
+        ("7@PORT", ("enable", *MICROFLEX, "--within", "0"), "a time is above 0"),
+        ("drive@PORT", ("enable", *MICROFLEX), "a node of a port is named by its address"),
+        ("7", ("enable", *MICROFLEX), "a node is written"),
+        ("11@PORT", ("enable", "--protocol", "mentor"), "mentor has no actions"),
+        ("2@PORT", ("execute", "1", "--protocol", "hcp"), "execute needs --within S"),
+        ("2@PORT", ("execute", "--protocol", "hcp", "--within", "1"), "execute is written execute COMMAND DATA..."),
+        ("2@PORT", ("execute", "0", "--protocol", "hcp", "--within", "1"), "0 is no command"),
+        ("2@PORT", ("execute", "1", "x", "--protocol", "hcp", "--within", "1"), "'x' is no number"),
+        ("3@PORT", ("set-flag", "256", "--protocol", "msc"), "256"),
+        ("3@PORT", ("set-flag", "1.5", "--protocol", "msc"), "1.5"),
+    ],
+)
+def test_what_is_no_action_is_status_2_and_nothing_is_sent(
+    busmaster: Command, node: str, arguments: tuple[str, ...], complaint: str
+) -> None:
+    """Nobody listens on this port, and nobody is asked to."""
+    ran = busmaster("do", node.replace("PORT", "socket://127.0.0.1:1"), *arguments)
+    assert (ran.status, ran.out) == (2, "")
+    assert complaint in ran.err
+
+
+def test_a_program_carries_out_a_command_with_data_below_0(busmaster: Command, tmp_path: Path) -> None:
+    with serve("hcp2", 1) as server:
+        mint = server.call(lambda line, now: line.device(1))
+        assert isinstance(mint, EmulatedMint)
+
+        def run(line: Line, now: float) -> None:
+            mint.program = careful
+            mint.start_program()
+
+        server.call(run)
+        arguments = ("execute", "1", "10", "-2", "--within", "30", "--protocol", "hcp2", "--timeout", "1000")
+        ran = busmaster("do", f"1@{server.path}", *arguments, "--at-least", "0.1")
+        assert (ran.status, ran.out, ran.err) == (0, "execute ok\n", "")
+        assert server.call(lambda line, now: mint.axes[1].position(now)) == -2
+        ran = busmaster("do", f"1@{server.path}", *arguments, "--at-least", "20")
+        assert ran.status == 1
+        assert "the command takes 20 s at least" in ran.err
+
+
+def test_flags_are_set_and_cleared(busmaster: Command) -> None:
+    with serve("msc", 3) as server:
+        msc = ("--protocol", "msc", "--timeout", "1000")
+        assert busmaster("do", f"3@{server.path}", "set-flag", "0", *msc).out == "set-flag ok\n"
+        assert busmaster("read", server.path, *msc, "--node", "3", "flag:0").out == "flag:0 1\n"
+        assert busmaster("do", f"3@{server.path}", "clear-flag", "0", *msc).out == "clear-flag ok\n"
+        assert busmaster("read", server.path, *msc, "--node", "3", "flag:0").out == "flag:0 0\n"
+
+
+def test_help_lists_the_actions_of_each_protocol(busmaster: Command) -> None:
+    text = busmaster("do", "--help").out.partition("ACTION, by protocol")[2]
+    for kind in kinds().values():
+        for name in kind.handle._actions:
+            assert f"{kind.name} " in text
+            assert f" {name}" in text
+
+
+# by a file
+
+
+def test_each_write_of_an_action_is_on_record_by_its_point(busmaster: Command, file: Path, drive: TcpServer) -> None:
+    assert busmaster("do", f"drive@{file}", "enable").status == 0
+    assert busmaster("do", f"drive@{file}", "reset").status == 0
+    assert busmaster("do", f"drive@{file}", "disable").status == 0
+    assert audit(file) == [
+        ("busmaster do enable", "drive/command_word", 128, "written"),
+        ("busmaster do reset", "drive/command_word", 192, "written"),
+        ("busmaster do reset", "drive/command_word", 128, "written"),
+        ("busmaster do disable", "drive/command_word", 0, "written"),
+    ]
+    assert not enabled(drive)
+
+
+def test_a_point_of_the_file_names_the_record(busmaster: Command, file: Path) -> None:
+    file.write_text(file.read_text() + '[nodes.drive.points]\ncontrol = { item = "108" }\n')
+    assert busmaster("do", f"drive@{file}", "enable").status == 0
+    assert audit(file) == [("busmaster do enable", "drive/control", 128, "written")]
+
+
+def test_limits_hold_for_an_action_and_not_for_a_stop(busmaster: Command, file: Path, drive: TcpServer) -> None:
+    text = file.read_text()
+    assert busmaster("do", f"drive@{file}", "enable").status == 0
+    file.write_text(text + '[nodes.drive.points]\ncommand_word = { item = "command_word", writable = false }\n')
+    for action in ("enable", "reset"):
+        ran = busmaster("do", f"drive@{file}", action)
+        assert (ran.status, ran.out) == (2, "")
+    assert enabled(drive)
+    assert busmaster("do", f"drive@{file}", "disable").status == 0
+    assert not enabled(drive)
+    assert [row[-1] for row in audit(file)] == ["written", "refused", "refused", "written"]
+
+
+def test_an_action_that_fails_is_on_record(busmaster: Command, file: Path, drive: TcpServer) -> None:
+    drive.call(lambda line, now: line.cut(now, line.device(7)))
+    file.write_text(file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05"))
+    assert busmaster("do", f"drive@{file}", "enable").status == 1
+    assert audit(file) == [("busmaster do enable", "drive/command_word", 128, "unconfirmed")]
+
+
+@pytest.mark.parametrize("option", [("--protocol", "microflex"), ("--baud", "9600")])
+def test_what_the_file_says_is_not_said_again(busmaster: Command, file: Path, option: tuple[str, ...]) -> None:
+    ran = busmaster("do", f"drive@{file}", "enable", *option)
+    assert ran.status == 2
+    assert f"says what is on the line: leave out {option[0]}" in ran.err
+
+
+def test_a_node_that_the_file_does_not_have_is_named(busmaster: Command, file: Path) -> None:
+    ran = busmaster("do", f"drvie@{file}", "enable")
+    assert ran.status == 2
+    assert "has no node 'drvie'; did you mean 'drive'?" in ran.err
+
+
+# through the owner
+
+
+@pytest.mark.slow
+def test_the_owner_of_the_line_carries_it_out_and_keeps_the_record(
+    busmaster: Command, file: Path, drive: TcpServer
+) -> None:
+    with owner("serve", str(file)):
+        ran = busmaster("do", f"drive@{file}", "enable")
+        assert (ran.status, ran.out) == (0, "enable ok 192 HARDWARE_ENABLE|ENABLED\n")
+        assert "is owned by process" in ran.err
+        assert enabled(drive)
+        assert busmaster("do", f"7@{drive.path}", "disable", *MICROFLEX[:2]).status == 0
+        assert not enabled(drive)
+    enabling, disabling = audit(file)  # as the owner keeps them
+    assert enabling[2:] == ("'write element 108 = 128'", "written")
+    assert disabling[2:] == ("'write element 108 = 0'", "written")
