@@ -20,6 +20,12 @@ from busmaster.errors import BusError
 ANSWER_WITHIN = 2.0
 """Seconds in which a program that owns a line has to say how it is."""
 NOT_FOR_US = "not for this user"
+REFUSED = {
+    "refused_connections": "connections refused",
+    "refused_requests": "requests refused",
+    "failed_logins": "logins failed",
+}
+"""What the owner has counted, and how it is named."""
 
 
 @click.command(short_help="List this user's lines that run.")
@@ -52,14 +58,14 @@ async def ask(owner: Owner) -> dict[str, Any]:
     """Return how a line is, or why its owner does not say so."""
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
     line |= {"tcp": None, "programs": None, "utilisation": None, "state": None}
-    line |= {"refused_connections": None, "failed_logins": None}
+    line |= dict.fromkeys(REFUSED)
     line |= {"up": None, "nodes": None, "error": None}
     line["time"] = utc(time.time())
     try:
         async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
             nodes, line["tcp"] = remote.about["nodes"], remote.about["tcp"]
             line["programs"] = remote.about["clients"] - 1  # without this one
-            for count in ("refused_connections", "failed_logins"):
+            for count in REFUSED:
                 line[count] = remote.about.get(count)
             line["state"] = remote.about.get("state", "ready")
             line["up"] = 0 if line["state"] == "offline" else sum(node["health"] == "up" for node in nodes)
@@ -75,8 +81,7 @@ async def ask(owner: Owner) -> dict[str, Any]:
 
 def refused_text(line: dict[str, Any]) -> str:
     """Return what the owner of a line has refused since it runs, "" for nothing."""
-    names = {"refused_connections": "connections refused", "failed_logins": "logins failed"}
-    return ", ".join(f"{line[count]} {name}" for count, name in names.items() if line[count])
+    return ", ".join(f"{line[count]} {name}" for count, name in REFUSED.items() if line[count])
 
 
 def cells(line: dict[str, Any]) -> tuple[str, ...]:

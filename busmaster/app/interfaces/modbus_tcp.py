@@ -30,12 +30,14 @@ from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.interfaces import following, interface_options, place_of
 from busmaster.app.cli.output import Level, note
 from busmaster.app.interfaces.following import Following
+from busmaster.app.interfaces.reported_refusals import ReportedRefusals
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.refusals import LimitedReport, peer_of
 from busmaster.app.service.remote import RemoteBus
 from busmaster.app.service.tcp import is_loopback, listening
 from busmaster.app.service.touches import Touches
+from busmaster.bounds import REQUEST_WITHIN
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, LineDown, NotStarted, Refused, Superseded
 from busmaster.ext import meant, read_file
 from busmaster.registry import protocols
@@ -49,7 +51,7 @@ MOST_CONNECTIONS = 128
 MOST_PER_PEER = 32
 """Connections of one address: one more is refused."""
 IDLE = 120.0
-"""Seconds for the next whole request, by default: then the connection is closed."""
+"""Seconds without a request, by default: then the connection is closed."""
 SEND_WITHIN = 10.0
 """Seconds in which a client must read its replies."""
 UNREAD = 4096
@@ -90,7 +92,7 @@ UNIT_REFUSED = {
 
 
 class BadFrame(Exception):
-    """What a client sent is not Modbus TCP: where the next request begins is not known."""
+    """What a client sent is not Modbus TCP, or too slow: where the next request begins is not known."""
 
 
 class ExceptionReply(Exception):
@@ -123,7 +125,7 @@ def length_of(header: bytes) -> int:
     """Return how many bytes follow the header of a request. Raises BadFrame."""
     _, protocol, length, _ = HEADER.unpack(header)
     if protocol != 0 or not 2 <= length <= LONGEST_PDU + 1:
-        raise BadFrame
+        raise BadFrame("not Modbus TCP")
     return int(length) - 1
 
 
@@ -232,7 +234,7 @@ class Entry:
             return [int(value)]
         number: int | float = int(value) if isinstance(value, int) else value
         if self.scale != 1:
-            number = float(Decimal(repr(number)) / Decimal(repr(self.scale)))
+            number = _finite(Decimal(repr(number)) / Decimal(repr(self.scale)))
         try:
             data = struct.pack(f">{FORMATS[self.type]}", number if self.is_float else round(number))
         except (struct.error, OverflowError):
@@ -254,7 +256,7 @@ class Entry:
                 short for digits in range(6, 10) if struct.pack(">f", short := float(f"{number:.{digits}g}")) == data
             )
         if self.scale != 1:
-            number = float(Decimal(repr(number)) * Decimal(repr(self.scale)))
+            number = _finite(Decimal(repr(number)) * Decimal(repr(self.scale)))
         return int(number) if number == int(number) else number
 
     @property
@@ -268,6 +270,13 @@ class Entry:
         if self.byte_order == "little":
             words = [word[::-1] for word in words]
         return b"".join(words[::-1] if self.word_order == "little" else words)
+
+
+def _finite(number: Decimal) -> float:
+    """Return it as a float. Raises ValueError for one that is beyond all floats."""
+    if not math.isfinite(found := float(number)):
+        raise ValueError(f"{number:.6g} is not within the range of a float")
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -621,13 +630,22 @@ class Rules:
         return any(mapped in network for network in self.peers)
 
 
+Refuse: TypeAlias = Callable[[str, str], None]
+"""Called with each refusal: "connections" or "requests", and the peer."""
+
+
+def _ignore(_kind: str, _peer: str) -> None:
+    """Report no refusal."""
+
+
 class Answers:
     """Replies to requests. `tell` is called with a line for each write: its client, and its outcome."""
 
-    def __init__(self, values: Values, rules: Rules, tell: Callable[[str], None]) -> None:
+    def __init__(self, values: Values, rules: Rules, tell: Callable[[str], None], refused: Refuse = _ignore) -> None:
         self._values = values
         self._rules = rules
         self._tell = tell
+        self._refused = refused
         self._denied = LimitedReport(tell, _denied_text)
 
     async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
@@ -739,6 +757,7 @@ class Answers:
 
     def _deny(self, peer: str, code: int) -> None:
         self._denied.note(peer_of(peer))
+        self._refused("requests", peer_of(peer))
         raise ExceptionReply(code, "this may not be written")
 
 
@@ -772,11 +791,16 @@ def code_of(error: BusError | InvalidCommand) -> int:
 class ModbusTcpServer:
     """Accepts clients, and replies to the requests of each one by one, in their order."""
 
-    def __init__(self, answers: Answers, tell: Callable[[str], None], *, idle: float = IDLE) -> None:
+    def __init__(
+        self, answers: Answers, tell: Callable[[str], None], refused: Refuse = _ignore, *, idle: float = IDLE
+    ) -> None:
         self._answers = answers
         self._idle = idle
+        self._refused = refused
         self._open: dict[asyncio.StreamWriter, str] = {}
         """The connections and their peers; the one without a request for the longest time first."""
+        self._busy: set[asyncio.StreamWriter] = set()
+        """Those whose request has no reply yet."""
         self._closed = LimitedReport(tell, self._closed_text)
 
     async def accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -784,22 +808,21 @@ class ModbusTcpServer:
         host = str((writer.get_extra_info("peername") or ("unknown",))[0])
         peer = peer_of(host)
         if sum(other == peer for other in self._open.values()) >= MOST_PER_PEER:
-            self._closed.note(f"beyond {MOST_PER_PEER} of one address")
-            writer.transport.abort()
+            self._refuse(writer, peer, f"beyond {MOST_PER_PEER} of one address")
             return
         self._open[writer] = peer
         if len(self._open) > MOST_CONNECTIONS:
-            oldest = next(iter(self._open))
-            del self._open[oldest]
-            self._closed.note(f"beyond {MOST_CONNECTIONS}: the one idle for the longest time")
-            oldest.transport.abort()
+            # One whose request is on its way stays: closing it would not take the request from the line.
+            oldest = next(one for one in self._open if one not in self._busy)
+            why = f"beyond {MOST_CONNECTIONS}: the one idle for the longest time"
+            self._refuse(oldest, self._open.pop(oldest), why)
         writer.transport.set_write_buffer_limits(high=UNREAD)
         try:
             await self._serve(reader, writer, host)
-        except BadFrame:
-            self._closed.note("not Modbus TCP")
+        except BadFrame as bad:
+            self._refuse(writer, peer, str(bad))
         except TimeoutError:
-            self._closed.note(f"no whole request for {self._idle:g} s, or replies not read for {SEND_WITHIN:g} s")
+            self._closed.note(f"no request for {self._idle:g} s")
         except (OSError, asyncio.IncompleteReadError):
             pass  # the client has left
         finally:
@@ -809,16 +832,34 @@ class ModbusTcpServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str) -> None:
         while True:
             async with asyncio.timeout(self._idle):
-                header = await reader.readexactly(HEADER.size)
-                pdu = await reader.readexactly(length_of(header))
-            if writer in self._open:
-                self._open[writer] = self._open.pop(writer)
+                begun = await reader.readexactly(1)
+            try:
+                async with asyncio.timeout(REQUEST_WITHIN):
+                    header = begun + await reader.readexactly(HEADER.size - 1)
+                    pdu = await reader.readexactly(length_of(header))
+            except TimeoutError:
+                raise BadFrame(f"half a request for {REQUEST_WITHIN:g} s") from None
+            if writer not in self._open:
+                return  # another one has its place
+            self._open[writer] = self._open.pop(writer)
             transaction, _, _, unit = HEADER.unpack(header)
-            reply = await self._answers.reply(host, unit, pdu)
+            self._busy.add(writer)
+            try:
+                reply = await self._answers.reply(host, unit, pdu)
+            finally:
+                self._busy.discard(writer)
             writer.write(HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply)
-            async with asyncio.timeout(SEND_WITHIN):
-                await writer.drain()
+            try:
+                async with asyncio.timeout(SEND_WITHIN):
+                    await writer.drain()
+            except TimeoutError:
+                raise BadFrame(f"replies not read for {SEND_WITHIN:g} s") from None
             await asyncio.sleep(0)  # a client that sends without pause is served in turn with the others
+
+    def _refuse(self, writer: asyncio.StreamWriter, peer: str, why: str) -> None:
+        self._closed.note(why)
+        self._refused("connections", peer)
+        writer.transport.abort()
 
     def _closed_text(self, counts: Counter[str]) -> str:
         return f"Modbus TCP connections closed: {'; '.join(f'{many} ({why})' for why, many in counts.most_common())}"
@@ -836,7 +877,8 @@ async def serve(
 
     Raises InvalidCommand if it cannot listen there.
     """
-    server = ModbusTcpServer(Answers(values, rules, tell), tell, idle=idle)
+    refused = ReportedRefusals("modbus-tcp", values.line, "connections", "requests").note
+    server = ModbusTcpServer(Answers(values, rules, tell, refused), tell, refused, idle=idle)
     socket = await asyncio.to_thread(listening, listen)
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(values.run())

@@ -20,7 +20,6 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from busmaster import Snapshot
-from busmaster.app.interfaces.failed_logins import FailedLogins
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua_access import Rules, guard
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
@@ -36,6 +35,7 @@ from busmaster.app.interfaces.opcua_terms import (
     status_of_write,
     type_of,
 )
+from busmaster.app.interfaces.reported_refusals import FailedLogins
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.remote import RemoteBus

@@ -27,9 +27,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from busmaster.app.interfaces.audience import Audience, Seat
 from busmaster.app.interfaces.connections import Crowd
-from busmaster.app.interfaces.failed_logins import FailedLogins
 from busmaster.app.interfaces.following import Following, Lost
 from busmaster.app.interfaces.guard import Guard, Guarded
+from busmaster.app.interfaces.reported_refusals import FailedLogins
 from busmaster.app.service.messages import encoded
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut

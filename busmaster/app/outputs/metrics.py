@@ -18,7 +18,7 @@ from busmaster import Bus, Health, Node, Priority, ext
 from busmaster.app.outputs.base import Output, OutputKind, OutputLine, OutputStatistics, Unsuitable, check_extra
 from busmaster.app.outputs.scrapes import listening, page, serve
 from busmaster.app.outputs.settings import MetricsSettings
-from busmaster.app.service.refusals import INTERFACES, TOO_FAST, Refusals
+from busmaster.app.service.refusals import TOO_FAST, Refusals
 from busmaster.app.service.rights import Role
 from busmaster.app.service.values import micros
 from busmaster.ext import RecentUtilisation
@@ -309,14 +309,26 @@ class MetricsOutput(Output):
             labels=["role"],
         )
         logins = CounterMetricFamily(
-            "busmaster_logins_failed", "Logins that failed, by interface: service, web, opcua", labels=["interface"]
+            "busmaster_logins_failed",
+            "Logins that failed, by interface; service: at the line's socket",
+            labels=["interface"],
         )
-        refused, failed = self._ask(lambda: (dict(self._refusals.connections), dict(self._refusals.logins)))
+        at_interfaces = CounterMetricFamily(
+            "busmaster_interface_refused",
+            "Connections and requests that an interface in another process has refused",
+            labels=["interface", "kind"],
+        )
+        counts = self._refusals
+        refused, failed, beyond = self._ask(
+            lambda: (dict(counts.connections), dict(counts.logins), dict(counts.at_interfaces))
+        )
         for role in (*(role.value for role in Role), "safe", TOO_FAST):
             connections.add_metric([role], refused.get(role, 0))
-        for interface in INTERFACES:
-            logins.add_metric([interface], failed.get(interface, 0))
-        yield from (connections, logins)
+        for interface, count in failed.items():
+            logins.add_metric([interface], count)
+        for labels, count in beyond.items():
+            at_interfaces.add_metric(labels, count)
+        yield from (connections, logins, at_interfaces)
 
 
 def number_of(value: object) -> float | None:

@@ -18,7 +18,7 @@ from busmaster.app.service.overview import said_details
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.plans import groups_of
-from busmaster.app.service.refusals import INTERFACES
+from busmaster.app.service.refusals import KINDS, is_interface_name
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Rights, Role
 from busmaster.app.service.streams import Broadcast, GroupBroadcast
@@ -201,8 +201,8 @@ class Client:
                 self._hold(params)
             case "release":
                 self._release(params.get("sequence", -1))
-            case "failed_logins":
-                self._take_failed_logins(params.get("interface"), params.get("peers"))
+            case "refusals":
+                self._take_refusals(params.get("interface"), params.get("kind"), params.get("peers"))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
                 if node is not None and self.permission.covers(node):
@@ -210,13 +210,17 @@ class Client:
                 elif node is not None:
                     self._stopping.add(node)
 
-    def _take_failed_logins(self, interface: object, peers: object) -> None:
+    def _take_refusals(self, interface: object, kind: object, peers: object) -> None:
         """Count what an interface in another process reports. What is not a count is ignored."""
-        if interface not in INTERFACES[1:] or not isinstance(peers, dict):
+        if not (isinstance(interface, str) and is_interface_name(interface)):
             return
+        if not (isinstance(kind, str) and kind in KINDS and isinstance(peers, dict)):
+            return
+        refusals = self._line.authorisation.refusals
+        refusals.begin(interface, kind)
         for peer, count in islice(peers.items(), MOST_REPORTED + 1):
             if type(count) is int and 0 < count <= MOST_FAILED and len(peer) <= LONGEST_SENDER and peer.isprintable():
-                self._line.authorisation.refusals.note_login(str(interface), peer, count)
+                refusals.note(interface, kind, peer, count)
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
         """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""

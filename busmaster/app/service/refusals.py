@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import re
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -29,8 +30,13 @@ NAMED = 3
 OTHERS = "others"
 TOO_FAST = "unknown"
 """The role of connections that are closed before they show who they are."""
-INTERFACES = ("service", "web", "opcua")
-"""Where a program logs in."""
+SERVICE = "service"
+"""The line's own socket, beside the interfaces, which name themselves."""
+KINDS = ("logins", "connections", "requests")
+"""What an interface can refuse."""
+INTERFACE_NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+MOST_INTERFACES = 16
+"""Names under which refusals are counted; those of further ones are counted as OTHERS."""
 MOST_GOOD = 16
 """Names of tokens that are remembered for one peer."""
 
@@ -66,13 +72,18 @@ class LimitedReport:
 
 
 class Refusals:
-    """What one line has refused, for its log, its metrics and `status`. Those of `on_report` are told a sentence."""
+    """What one line and its interfaces have refused, for its log, its metrics and `status`.
+
+    Those of `on_report` are told a sentence. The interfaces are not listed here: each reports its own name.
+    """
 
     def __init__(self) -> None:
         self.connections: Counter[str] = Counter()
         """Connections for which no place was free, by the role of the program; of TOO_FAST, which came too fast."""
-        self.logins: Counter[str] = Counter()
+        self.logins: Counter[str] = Counter({SERVICE: 0})
         """Failed logins, by the interface."""
+        self.at_interfaces: Counter[tuple[str, str]] = Counter()
+        """Connections and requests that interfaces have refused, by the interface and the kind."""
         self.on_report: list[Told] = []
         self._reports: dict[str, LimitedReport] = {}
 
@@ -90,6 +101,34 @@ class Refusals:
         """Count failed logins of a peer, and report them."""
         self.logins[interface] += count
         self._report(interface, lambda counts: failed_text(interface, counts)).note(peer, count)
+
+    def begin(self, interface: str, kind: str) -> None:
+        """Count a kind of refusals of an interface from 0 on, if it is not counted yet."""
+        interface = self._counted_as(interface)
+        if kind == "logins":
+            self.logins[interface] += 0
+        else:
+            self.at_interfaces[interface, kind] += 0
+
+    def note(self, interface: str, kind: str, peer: str, count: int = 1) -> None:
+        """Count what an interface refused to a peer, and report it."""
+        interface = self._counted_as(interface)
+        if kind == "logins":
+            self.note_login(interface, peer, count)
+            return
+        self.at_interfaces[interface, kind] += count
+        self._report(f"{interface} {kind}", lambda counts: _at_interface_text(interface, kind, counts)).note(
+            peer, count
+        )
+
+    def total(self, kind: str) -> int:
+        """Return how many connections or requests were refused, at the service and at all interfaces."""
+        at_interfaces = sum(count for (_, other), count in self.at_interfaces.items() if other == kind)
+        return at_interfaces + (self.connections.total() if kind == "connections" else 0)
+
+    def _counted_as(self, interface: str) -> str:
+        known = {*self.logins, *(name for name, _ in self.at_interfaces)}
+        return interface if interface in known or len(known) < MOST_INTERFACES else OTHERS
 
     def _report(self, kind: str, text: Callable[[Counter[str]], str]) -> LimitedReport:
         return self._reports.setdefault(kind, LimitedReport(self._tell, text))
@@ -114,6 +153,17 @@ def _too_fast_text(counts: Counter[str]) -> str:
         f"{many} connection{'s were' if many > 1 else ' was'} refused, because the program connects again and again: "
         f"{_peers_text(counts)}"
     )
+
+
+def _at_interface_text(interface: str, kind: str, counts: Counter[str]) -> str:
+    many = counts.total()
+    refused = f"{kind} were" if many > 1 else f"{kind.removesuffix('s')} was"
+    return f"{many} {refused} refused at {interface}: {_peers_text(counts)}"
+
+
+def is_interface_name(name: str) -> bool:
+    """Return whether an interface in another process can have this name."""
+    return name != SERVICE and INTERFACE_NAME.fullmatch(name) is not None
 
 
 def _peers_text(counts: Counter[str]) -> str:

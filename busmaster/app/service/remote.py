@@ -324,9 +324,12 @@ class RemoteBus:
         """
         return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
 
-    def report_failed_logins(self, interface: str, peers: Mapping[str, int]) -> None:
-        """Tell the owner how many logins of each peer failed at an interface that this program serves: web or opcua."""
-        self.link.tell("failed_logins", {"interface": interface, "peers": dict(peers)})
+    def report_refusals(self, interface: str, kind: str, peers: Mapping[str, int]) -> None:
+        """Report to the owner how often the interface that this program serves has refused each peer.
+
+        `kind` is "logins", "connections" or "requests". Without peers, the owner begins to count the kind at 0.
+        """
+        self.link.tell("refusals", {"interface": interface, "kind": kind, "peers": dict(peers)})
 
     def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens to line and nodes from now on; a node in it is this program's."""

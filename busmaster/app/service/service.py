@@ -27,7 +27,7 @@ from busmaster.app.service.messages import INVALID_PARAMS, VERSIONS, Malformed, 
 from busmaster.app.service.outbox import Outbox
 from busmaster.app.service.overview import state_text
 from busmaster.app.service.peers import Holder, Peer, find_name, process_of
-from busmaster.app.service.refusals import Logins, wait_text
+from busmaster.app.service.refusals import SERVICE, Logins, wait_text
 from busmaster.app.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 from busmaster.app.service.telling import listed_groups
 from busmaster.app.service.visit import Reception, Visit
@@ -97,7 +97,7 @@ class Service:
         self._count = 0
         self._admission = Admission(self.authorisation.refusals)
         self._rate = ConnectionRate(time.monotonic)
-        self._logins = Logins(partial(self.authorisation.refusals.note_login, "service"), time.monotonic)
+        self._logins = Logins(partial(self.authorisation.refusals.note_login, SERVICE), time.monotonic)
         self._log = logging.getLogger("busmaster.app.service")
         self.tell: Callable[[str], None] = self._log.warning
         """Told, at most once a minute, of connections and logins that were refused."""
@@ -374,7 +374,8 @@ class Service:
             "process": owner.pid,
             "read_only": client.read_only,
             "clients": len(self._clients),
-            "refused_connections": self.authorisation.refusals.connections.total(),
+            "refused_connections": self.authorisation.refusals.total("connections"),
+            "refused_requests": self.authorisation.refusals.total("requests"),
             "failed_logins": self.authorisation.refusals.logins.total(),
             "state": state_text(self.bus),
             "nodes": nodes,

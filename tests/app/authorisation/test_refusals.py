@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from busmaster import bounds
-from busmaster.app.service.refusals import Logins, failed_text, pause_after, peer_of
+from busmaster.app.service.refusals import Logins, Refusals, failed_text, is_interface_name, pause_after, peer_of
 
 HERE, ELSEWHERE = "10.0.0.1", "10.0.0.2"
 
@@ -109,3 +109,26 @@ def test_a_report_names_the_worst_peers_and_counts_the_others() -> None:
     text = failed_text("web", Counter({"a": 1, "b": 5, "c": 2, "d": 1, "e": 1}))
     assert text == "10 failed logins at web: 5 from b, 2 from c, 1 from a and 2 more"
     assert failed_text("web", Counter({"a": 1})) == "1 failed login at web: 1 from a"
+
+
+def test_refusals_of_an_interface_are_counted_under_the_name_that_it_reports() -> None:
+    refusals = Refusals()
+    for number in range(20):
+        refusals.begin(f"interface{number}", "connections")
+    assert len(refusals.at_interfaces) == 16  # with the service, and the last ones as others
+    assert refusals.at_interfaces["others", "connections"] == 0
+    assert ("interface19", "connections") not in refusals.at_interfaces
+    assert refusals.logins == {"service": 0}
+    refusals.connections["read"] = 5
+    refusals.at_interfaces["interface3", "connections"] = 2
+    refusals.at_interfaces["interface4", "requests"] = 4
+    assert (refusals.total("connections"), refusals.total("requests")) == (7, 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "right"),
+    [("web", True), ("modbus-tcp", True), ("my_world2", True), ("service", False), ("", False), ("Web", False)]
+    + [(name, False) for name in ('a"b', "a b", "a\n", "a" * 33, "2b")],
+)
+def test_an_interface_has_a_name_that_metrics_and_logs_can_show(name: str, right: bool) -> None:
+    assert is_interface_name(name) is right

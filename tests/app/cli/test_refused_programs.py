@@ -7,7 +7,7 @@ import json
 import socket
 import subprocess
 import urllib.request
-from contextlib import AsyncExitStack, closing
+from contextlib import AsyncExitStack, ExitStack, closing, suppress
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import pytest
 from asyncua import Client, ua
 
 from busmaster import Hcp2Controller, bounds, connect
+from busmaster.app.interfaces import modbus_tcp
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import LineDown
 from tests.app.cli.conftest import Command, owner, started
@@ -52,10 +53,14 @@ async def fill(stack: AsyncExitStack, address: str, token: str | None = None) ->
 
 
 def count_of(port: int, name: str) -> float:
+    [value] = counts_of(port, name)
+    return value
+
+
+def counts_of(port: int, name: str) -> list[float]:
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE) as answer:
         lines = answer.read().decode().splitlines()
-    [value] = [line.rpartition(" ")[2] for line in lines if line.startswith(f"busmaster_{name}")]
-    return float(value)
+    return [float(line.rpartition(" ")[2]) for line in lines if line.startswith(f"busmaster_{name}")]
 
 
 def told(process: subprocess.Popen[str], what: str) -> str:
@@ -157,6 +162,49 @@ def test_who_guesses_passwords_of_opcua_is_slowed_down_counted_and_reported(
             while failed_logins(busmaster) < count:
                 pass
             assert count_of(metrics, 'logins_failed_total{interface="opcua"}') == count
+        finally:
+            interface.kill()
+            interface.communicate(timeout=PATIENCE)
+
+
+def test_what_modbus_tcp_refuses_is_counted_and_reported_by_the_owner(
+    busmaster: Command, file: Path, metrics: int
+) -> None:
+    places = modbus_tcp.MOST_PER_PEER
+    with (
+        owner("serve", str(file)) as (process, address),
+        started("modbus-tcp", "--bind", "127.0.0.1:0", address) as interface,
+        ExitStack() as stack,
+    ):
+        try:
+            port = int(told(interface, "clients find it at").rpartition(":")[2])
+            counts = 'interface_refused_total{interface="modbus-tcp",kind='
+            while len(zeros := counts_of(metrics, counts)) < 2:
+                pass  # until it has named itself to the owner
+            assert zeros == [0, 0]
+            opened = [
+                stack.enter_context(socket.create_connection(("127.0.0.1", port), PATIENCE, (GUESSER, 0)))
+                for _ in range(places)
+            ]
+            for one in opened:
+                one.sendall(bytes.fromhex("0001 0000 0006 01 06 0000 0001"))
+                assert one.recv(260) == bytes.fromhex("0001 0000 0003 01 86 01")  # nothing is allowed
+            for _ in range(3):
+                with (
+                    socket.create_connection(("127.0.0.1", port), PATIENCE, (GUESSER, 0)) as beyond,
+                    suppress(ConnectionError),
+                ):
+                    assert beyond.recv(1) == b""
+            texts = [told(process, "refused at modbus-tcp: ") for _ in range(2)]
+            assert all(text.strip().endswith(f"from {GUESSER}") for text in texts)
+            assert sorted("connection" in text for text in texts) == [False, True]
+            line = {"refused_connections": 0, "refused_requests": 0}
+            while line["refused_requests"] < places or line["refused_connections"] < 3:
+                line = json.loads(busmaster("status", "--json").out)
+            assert (line["refused_connections"], line["refused_requests"], line["failed_logins"]) == (3, places, 0)
+            assert f"slitter: 3 connections refused, {places} requests refused" in busmaster("status").err
+            assert count_of(metrics, f'{counts}"connections"') == 3
+            assert count_of(metrics, f'{counts}"requests"') == places
         finally:
             interface.kill()
             interface.communicate(timeout=PATIENCE)

@@ -175,6 +175,7 @@ def test_values_are_encoded_and_decoded(options: dict[str, Any], value: float, r
         ({"type": "float32"}, 16777217),  # it would be sent as 16777216
         ({"type": "float32"}, 1e39),
         ({"type": "float64"}, float("inf")),
+        ({"type": "float64", "scale": 0.1}, 1e308),  # it would be sent as infinity
         ({"type": "float64"}, "running"),
         ({"type": "float64"}, (1, 2)),
         ({"type": "bit", "table": "coil"}, 2),
@@ -188,6 +189,8 @@ def test_a_value_that_does_not_fit_is_an_error(options: dict[str, Any], value: A
 def test_a_written_number_that_is_none_is_an_error() -> None:
     with pytest.raises(ValueError, match="nan"):
         Entry("winder/force", 0).value([0x7FC0, 0])
+    with pytest.raises(ValueError, match="not within"):
+        Entry("winder/force", 0, type="float64", scale=10).value([0x7FEF, 0xFFFF, 0xFFFF, 0xFFFF])
 
 
 MAP = """
@@ -295,10 +298,16 @@ class Echo:
 Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
 
 
-def with_server(story: Callable[[Connect, Echo, list[str]], Awaitable[None]], **options: Any) -> None:
+def with_server(
+    story: Callable[[Connect, Echo, list[str]], Awaitable[None]], echo: Echo | None = None, **options: Any
+) -> list[tuple[str, str]]:
+    """Run a story with a server. Return what it refused."""
+    refused: list[tuple[str, str]] = []
+
     async def run() -> None:
-        echo, reports, opened = Echo(), list[str](), list[asyncio.StreamWriter]()
-        served = ModbusTcpServer(echo, reports.append, **options)  # type: ignore[arg-type]
+        replies, reports, opened = echo or Echo(), list[str](), list[asyncio.StreamWriter]()
+        note: Any = lambda *refusal: refused.append(refusal)  # noqa: E731
+        served = ModbusTcpServer(replies, reports.append, note, **options)  # type: ignore[arg-type]
 
         async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
             reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
@@ -309,13 +318,14 @@ def with_server(story: Callable[[Connect, Echo, list[str]], Awaitable[None]], **
             asyncio.timeout(PATIENCE),
             await asyncio.start_server(served.accept, "127.0.0.1", 0, limit=modbus_tcp.UNREAD) as server,
         ):
-            await story(connect, echo, reports)
+            await story(connect, replies, reports)
             for writer in opened:
                 writer.transport.abort()
             while served._open:  # noqa: ASYNC110  nothing reports that the last connection has ended
                 await asyncio.sleep(0.001)
 
     asyncio.run(run())
+    return refused
 
 
 async def is_closed(reader: asyncio.StreamReader) -> bool:
@@ -365,20 +375,40 @@ def test_a_bad_frame_closes_the_connection_and_is_counted(sent: bytes) -> None:
     with_server(story)
 
 
-def test_an_idle_client_and_half_a_request_are_closed() -> None:
+def test_an_idle_client_and_half_a_request_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "REQUEST_WITHIN", 0.2)
+
     async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
         (silent, _), (half, writer) = await connect(), await connect()
         writer.write(frame(READ)[:9])
         assert await is_closed(silent)
+        assert "no request for 0.05 s" in reports[0]
         assert await is_closed(half)
-        assert "no whole request for 0.05 s" in reports[0]
 
-    with_server(story, idle=0.05)
+    refused = with_server(story, idle=0.05)
+    assert refused == [("connections", "127.0.0.1")]  # the client that was silent has done no wrong
+
+
+def test_half_a_request_is_closed_sooner_than_an_idle_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "REQUEST_WITHIN", 0.05)
+
+    async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        reader, writer = await connect()
+        writer.write(frame(READ) + frame(READ)[:1])
+        assert await reader.readexactly(len(frame(READ))) == frame(READ)
+        assert await is_closed(reader)
+        assert reports == ["Modbus TCP connections closed: 1 (half a request for 0.05 s)"]
+
+    with_server(story)
 
 
 @pytest.mark.slow
 def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_tcp, "SEND_WITHIN", 0.05)
+
+    class Long(Echo):
+        async def reply(self, _peer: str, _unit: int, _pdu: bytes) -> bytes:
+            return bytes(5000)  # the system holds some megabytes: a real reply would fill that slowly
 
     async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
         _, writer = await connect()
@@ -388,7 +418,7 @@ def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.M
                 await writer.drain()
         assert "replies not read" in reports[0]
 
-    with_server(story)
+    assert with_server(story, Long()) == [("connections", "127.0.0.1")]
 
 
 def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -412,7 +442,32 @@ def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest
         assert await is_closed(second)  # the first has sent a request since
         assert "idle for the longest time" in reports[0]
 
-    with_server(total)
+    assert with_server(total) == [("connections", "127.0.0.1")]
+
+
+def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 2)
+    go_on = asyncio.Event()
+
+    class Slow(Echo):
+        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
+            reply = await super().reply(peer, unit, pdu)
+            await go_on.wait()
+            return reply
+
+    async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
+        busy = [await connect() for _ in range(2)]
+        for _, writer in busy:
+            writer.write(frame(READ))
+        while echo.counts[1] < 2:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        beyond, _ = await connect()
+        assert await is_closed(beyond)
+        go_on.set()
+        for reader, _ in busy:
+            assert await reader.readexactly(len(frame(READ))) == frame(READ)
+
+    with_server(story, Slow())
 
 
 # the command, beside an owner, by real clients

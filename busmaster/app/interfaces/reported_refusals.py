@@ -1,0 +1,73 @@
+"""What an interface refuses: reported on its standard error, and to the owner of the line, which counts it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import partial
+
+from busmaster.app.interfaces.following import Following
+from busmaster.app.service.refusals import OTHERS, LimitedReport, failed_text
+from busmaster.bounds import MOST_REPORTED
+from busmaster.errors import LineDown
+
+TELL_EVERY = 1.0
+"""Seconds from one message to the line's owner to the next: a guesser fails a thousand times a second."""
+
+
+class ReportedRefusals:
+    """Reports to the line's owner what `interface` refuses, once in TELL_EVERY, as soon as the owner is there.
+
+    `kinds` are what this interface can refuse: "logins", "connections", "requests". The owner gets them with each
+    connection, so that its metrics have a count of 0 before the first refusal.
+    """
+
+    def __init__(self, interface: str, line: Following, *kinds: str) -> None:
+        self._interface = interface
+        self._line = line
+        self._untold: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
+        self._timer: asyncio.TimerHandle | None = None
+        line.on_state(self._announce)
+
+    def note(self, kind: str, peer: str) -> None:
+        """Count a refusal of a peer."""
+        untold = self._untold[kind]
+        untold[peer if peer in untold or len(untold) < MOST_REPORTED else OTHERS] += 1
+        if self._timer is None:
+            self._tell_later()
+
+    def _announce(self) -> None:
+        if self._line.is_connected:
+            self._tell_owner(self._untold)
+
+    def _tell_later(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(TELL_EVERY, self._tell_what_is_new)
+
+    def _tell_what_is_new(self) -> None:
+        self._timer = None
+        if not self._tell_owner([kind for kind, counts in self._untold.items() if counts]):
+            self._tell_later()
+
+    def _tell_owner(self, kinds: Iterable[str]) -> bool:
+        """Report these kinds. Return whether the owner was there."""
+        try:
+            for kind in kinds:
+                self._line.remote.report_refusals(self._interface, kind, self._untold[kind])
+                self._untold[kind].clear()
+        except LineDown:
+            return False
+        return True
+
+
+class FailedLogins:
+    """Takes note of failed logins at `interface`: `tell` is called at most once a minute, and the owner counts them."""
+
+    def __init__(self, interface: str, line: Following, tell: Callable[[str], None]) -> None:
+        self._report = LimitedReport(tell, partial(failed_text, interface))
+        self._refusals = ReportedRefusals(interface, line, "logins")
+
+    def note(self, peer: str) -> None:
+        """Take note of a failed login of a peer."""
+        self._report.note(peer)
+        self._refusals.note("logins", peer)
