@@ -510,12 +510,13 @@ class Values:
         if self.line.is_connected:
             with suppress(LineDown):  # it is being left
                 remote = self.line.remote
-        if remote is not self._remote:  # the values are of the connection before
+        if remote is not self._remote:
             self._remote = remote
-            self._touches = Touches()
-            self._held.clear()
-            self._new_rows = True
             await self._leave_groups(set())
+            if remote is not None:  # another owner has another clock; until then the last values stay, as AWAY
+                self._touches = Touches()
+                self._held.clear()
+                self._new_rows = True
         frame = self.line.picture.frame
         if remote is None or frame is None or not self._new_rows:
             return
@@ -572,8 +573,9 @@ class Values:
         for name in self._groups.keys() - wanted:
             task = self._groups.pop(name)
             self._heard.pop(name, None)
-            for identity in [identity for identity, held in self._held.items() if held.group == name]:
-                del self._held[identity]
+            if self._remote is not None:  # the group has ended, and not its owner
+                for identity in [identity for identity, held in self._held.items() if held.group == name]:
+                    del self._held[identity]
             task.cancel()
             await asyncio.wait([task])
 
@@ -727,16 +729,18 @@ class Answers:
         self._check_writer(peer, bool(self._rules.units))
         if unit not in self._rules.units:
             self._deny(peer, ILLEGAL_VALUE)
-        kind = "write_coils" if request.table == "coil" else "write_registers"
+        write, read = ("write_coils", "read_bits") if request.table == "coil" else ("write_registers", "read_registers")
         what = f"client {peer}: unit {unit}, {len(request.values)} from {request.table} {request.first}"
         try:
-            await self._run(unit, Priority.COMMAND, kind, request.first, request.values)
+            # Without the read of what it changes, all points of the unit would be stale until their next cycle.
+            changed = _modbus_commands()[read](request.first, len(request.values), request.table)
+            await self._run(unit, Priority.COMMAND, write, request.first, request.values, touches=changed)
         except ExceptionReply as refused:
             self._tell(f"{what}: {cut(str(refused))}")
             raise
         self._tell(f"{what}: written")
 
-    async def _run(self, unit: int, priority: Priority, kind: str, *arguments: Any) -> Any:
+    async def _run(self, unit: int, priority: Priority, kind: str, *arguments: Any, touches: Any = None) -> Any:
         line = self._values.line
         if not line.is_connected:
             raise ExceptionReply(NO_REPLY, "the line's owner is away")
@@ -745,7 +749,7 @@ class Answers:
         try:
             command = _modbus_commands()[kind](*arguments)
             node = line.remote.find("modbus", unit)
-            return await node.request(command, priority=priority, finish_within=FINISH_WITHIN)
+            return await node.request(command, touches=touches, priority=priority, finish_within=FINISH_WITHIN)
         except (BusError, InvalidCommand) as error:
             raise ExceptionReply(code_of(error), str(error)) from None
 

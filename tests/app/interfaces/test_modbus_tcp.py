@@ -653,14 +653,18 @@ def test_without_allow_nothing_is_written_and_only_what_it_names_otherwise(file:
 
 
 def test_a_value_is_not_sent_when_the_owner_stands_still_or_is_gone(file: Path) -> None:
-    with interface(str(file), "--type", "float32", "--last") as opened, client_of(opened) as client:
+    kept = list(struct.unpack(">2H", struct.pack(">f", 21)))
+    options = ("--type", "float32", "--last", "--allow", "oven/setpoint")
+    with interface(str(file), *options) as opened, client_of(opened) as client:
         assert code(client.read_holding_registers(0, count=3)) == 11
         with interface(str(file)) as plain, client_of(plain) as other:
             with owner("serve", str(file)) as (process, _):
                 eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
+                eventually(lambda: client.write_registers(0, kept), lambda reply: not code(reply))
                 eventually(
                     lambda: client.read_holding_registers(0, count=3),
-                    lambda reply: not code(reply) and reply.registers == [0, 0, 0],
+                    lambda reply: not code(reply) and reply.registers == [*kept, 0],
+                    (0, 11),  # with --last the value before the write is sent too, as stale
                 )
                 os.kill(process.pid, signal.SIGSTOP)
                 try:
@@ -673,6 +677,9 @@ def test_a_value_is_not_sent_when_the_owner_stands_still_or_is_gone(file: Path) 
                 eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
             eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: code(reply) == 11, (0,))
             eventually(lambda: client.read_holding_registers(2, count=1), lambda reply: reply.registers == [3], (0,))
+            for _ in range(20):  # the last value stays for as long as the owner is away
+                time.sleep(0.05)
+                assert client.read_holding_registers(0, count=3).registers == [*kept, 3]
             with owner("serve", str(file)):
                 eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
 
@@ -699,11 +706,11 @@ def test_a_value_of_a_unit_that_has_fallen_silent_is_not_sent(tmp_path: Path) ->
 
 
 def test_units_are_read_with_the_priority_of_polls_and_written_as_commands() -> None:
-    sent: list[tuple[str, Priority]] = []
+    sent: list[tuple[str, str, Priority]] = []
 
     class Unit:
-        async def request(self, command: Any, *, priority: Priority, finish_within: float) -> Any:
-            sent.append((str(command), priority))
+        async def request(self, command: Any, *, touches: Any, priority: Priority, finish_within: float) -> Any:
+            sent.append((str(command), str(touches), priority))
             return (7,)
 
     line: Any = SimpleNamespace(
@@ -717,10 +724,15 @@ def test_units_are_read_with_the_priority_of_polls_and_written_as_commands() -> 
         rules = Rules(units=frozenset((3,)), pass_through=True)
         answers = Answers(Values(line), rules, lambda _: None)
         assert await answers.reply("127.0.0.1", 3, READ) == bytes.fromhex("03 02 0007")
-        assert await answers.reply("127.0.0.1", 3, bytes.fromhex("06 0000 0007")) == bytes.fromhex("06 0000 0007")
+        for pdu in ("06 0000 0007", "0f 0008 0002 01 03"):  # and what they change, so that only that becomes stale
+            assert await answers.reply("127.0.0.1", 3, bytes.fromhex(pdu)) == bytes.fromhex(pdu)[:5]
 
     asyncio.run(run())
-    assert sent == [("read holding 0", Priority.POLL), ("write holding 0 = 7", Priority.COMMAND)]
+    assert sent == [
+        ("read holding 0", "None", Priority.POLL),
+        ("write holding 0 = 7", "read holding 0", Priority.COMMAND),
+        ("write coil 8-9 = 1, 1", "read coil 8-9", Priority.COMMAND),
+    ]
 
 
 def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_replies(file: Path) -> None:
@@ -742,8 +754,12 @@ def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_
         assert code(client.read_holding_registers(999, count=2, device_id=11)) == 2  # of the unit
         assert code(client.write_register(100, 1, device_id=12)) == 3
         assert code(client.read_holding_registers(0, device_id=13)) == 10
-        # the points: what was written to the unit has made them stale
-        eventually(lambda: client.read_holding_registers(0, count=4, device_id=255), lambda one: not code(one))
+        for number in range(1, 6):  # a point that reads what was written is stale until it is read again
+            assert code(client.write_register(2, number, device_id=11)) == 0
+            eventually(
+                lambda: client.read_holding_registers(8, count=4, device_id=255),
+                lambda one, number=number: one.registers == list(struct.unpack(">4H", struct.pack(">d", number))),  # type: ignore[misc]
+            )
         opened.await_text(r"unit 11, 25 from holding 100: written")
         wrong: list[Any] = []
 
