@@ -22,6 +22,8 @@ import pytest
 from opcua import ua
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
+from pymodbus.client import ModbusTcpClient
+from pymodbus.exceptions import ModbusException
 
 from tests.app.cli.conftest import ENVIRONMENT, ROOT
 from tests.app.outputs.brokers import needs_mosquitto, running
@@ -79,6 +81,7 @@ class Plant:
         self.folder = folder
         self.pty = folder / "line"
         self.metrics_port, self.web_port, self.opcua_port = free_port(), free_port(), free_port()
+        self.modbus_port, self.modbus_last_port = free_port(), free_port()
         self.file = folder / "slitter.toml"
         self.file.write_text(TEXT.format(pty=self.pty, folder=folder, broker=broker, metrics=self.metrics_port))
         self.environment = {**ENVIRONMENT, "XDG_RUNTIME_DIR": str(folder)}
@@ -127,10 +130,15 @@ class Plant:
     def interfaces(self) -> None:
         """Start the interfaces, or start them again."""
         self._client = None
-        for name, port in (("web", self.web_port), ("opcua", self.opcua_port)):
+        for name, port, command in (
+            ("web", self.web_port, ("web",)),
+            ("opcua", self.opcua_port, ("opcua",)),
+            ("modbus-tcp", self.modbus_port, ("modbus-tcp",)),
+            ("modbus-tcp with --last", self.modbus_last_port, ("modbus-tcp", "--last")),
+        ):
             if name in self.programs:
                 self.stop(name, signal.SIGKILL)
-            self.start(name, name, "slitter", "--bind", f"127.0.0.1:{port}")
+            self.start(name, *command, "slitter", "--bind", f"127.0.0.1:{port}")
 
     # what each consumer says
 
@@ -197,6 +205,25 @@ class Plant:
             "value": read("winder/force").StatusCode.name,
         }
 
+    def modbus_tcp(self) -> dict[str, str]:
+        def read(port: int, first: int, count: int) -> list[int] | str:
+            client: Any = ModbusTcpClient("127.0.0.1", port=port, timeout=PATIENCE, retries=0)
+            with closing(client):
+                if not client.connect():
+                    raise OSError("nothing listens")
+                reply = client.read_holding_registers(first, count=count)
+            return f"exception {reply.exception_code}" if reply.isError() else list(reply.registers)
+
+        def shown(registers: list[int] | str) -> str:
+            return registers if isinstance(registers, str) else "shown"
+
+        last, status = read(self.modbus_last_port, 0, 5), read(self.modbus_last_port, 4, 1)
+        return {
+            "value": shown(read(self.modbus_port, 0, 4)),
+            "last": shown(last),
+            "status": status if isinstance(status, str) else str(status[0]),
+        }
+
     def mqtt(self) -> dict[str, str]:
         heard = self.heard
         return {
@@ -219,6 +246,7 @@ class Plant:
             "metrics": self.metrics,
             "REST": self.rest,
             "OPC UA": self.opc_ua,
+            "Modbus TCP": self.modbus_tcp,
             "MQTT": self.mqtt,
             "SQLite": self.sqlite,
         }
@@ -232,7 +260,7 @@ class Plant:
         while time.monotonic() < end:
             try:
                 seen = measure()
-            except (OSError, KeyError, ValueError, TypeError, sqlite3.Error, ua.UaError) as starting:
+            except (OSError, KeyError, ValueError, TypeError, sqlite3.Error, ua.UaError, ModbusException) as starting:
                 seen = {"no answer": repr(starting)}
             if {fact: seen.get(fact) for fact in facts} == facts:
                 return
