@@ -108,7 +108,7 @@ def table() -> list[str]:
         "line time while the owner waits": lambda r: (
             f"1/{1 + r.owner_time:g} for all of the role" if r.owner_time else "takes turns with the owner"
         ),
-        "new nodes": lambda r: f"{r.new_nodes}" + (", asked within the budget of probes" if r.budgeted else ""),
+        "new nodes": lambda r: f"{r.new_nodes}" + (", within the probe budget" if r.budgeted else ""),
         "reply times of a new node": lambda r: "any, up to 5 s" if r.own_times else "at most the protocol's",
         "`demand`": lambda r: f"one cycle in {r.demand_every} periods, for all" if r.demand_every else "yes",
         "own poll groups": lambda r: f"{r.groups}, in {r.polls.name}",
