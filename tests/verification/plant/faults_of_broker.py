@@ -74,7 +74,7 @@ def away_at_the_end(plant: Plant) -> str:
     [kept] = [line for line in plant.run.told if line.startswith("busmaster: mqtt: ")]
     back(plant)
     plant.start_run()
-    return f"the first run: {kept.removeprefix('busmaster: ')}"
+    return f"first run: `{kept.removeprefix('busmaster: ')}`"
 
 
 def away_for_good(plant: Plant) -> None:
@@ -98,27 +98,29 @@ def away_at_the_end_of_a_run_before(plant: Plant) -> str:
     away(plant)
     plant.wait_for_cycles(ENOUGH)
     plant.end_run()
-    return "what was in it is moved aside whole, and is not counted"
+    return "the damaged file is kept under another name; its values are not counted"
 
 
 FAULTS = {
-    "broker-killed": Fault(name="the broker is killed, and started again", make=killed),
+    "broker-killed": Fault(name="the broker is killed and restarted", make=killed),
     "broker-killed-spill": Fault(name="the same with `spill`", make=killed, site=SPILL),
-    "broker-stopped": Fault(name="the broker stands still, then goes on", make=stopped),
-    "broker-refuses": Fault(name="the broker lets nobody in, then does", make=refuses),
-    "half-open": Fault(name="the network to the broker passes nothing on (half open)", make=half_open),
-    "broken-off": Fault(name="the connection to the broker is broken off", make=broken_off),
+    "broker-stopped": Fault(name="the broker is stopped, then continues", make=stopped),
+    "broker-refuses": Fault(name="the broker rejects all logins, then accepts them", make=refuses),
+    "half-open": Fault(name="the network to the broker drops all data (half-open connection)", make=half_open),
+    "broken-off": Fault(name="the connection to the broker is reset", make=broken_off),
     "buffer-full": Fault(
-        name="the broker is away for longer than `buffer` lasts", make=killed, site=Site(mqtt="buffer = 40")
+        name="the broker is unavailable until `buffer` is full", make=killed, site=Site(mqtt="buffer = 40")
     ),
     "spill-full": Fault(
-        name="the broker is away for longer than `spill_values` last",
+        name="the broker is unavailable until `spill_values` is reached",
         make=killed,
         site=Site(mqtt='spill = "{folder}/mqtt.spool"\nspill_values = 40'),
     ),
-    "away-at-end": Fault(name="the broker is away when run ends, with `spill`", make=away_at_the_end, site=SPILL),
-    "away-for-good": Fault(name="the broker is away when run ends, without `spill`", make=away_for_good),
+    "away-at-end": Fault(
+        name="the broker is unavailable when `run` ends, with `spill`", make=away_at_the_end, site=SPILL
+    ),
+    "away-for-good": Fault(name="the broker is unavailable when `run` ends, without `spill`", make=away_for_good),
     "spill-damaged": Fault(
-        name="the file of `spill` is damaged at the start", make=damaged_spill, site=SPILL, uncounted=("mqtt",)
+        name="the file of `spill` is damaged at startup", make=damaged_spill, site=SPILL, uncounted=("mqtt",)
     ),
 }

@@ -40,7 +40,7 @@ def strange(make: Callable[[], str | bytes], topic: str = "") -> Callable[[Plant
         why = refusal(plant, make(), topic)
         plant.over()
         plant.obeys_commands()
-        return f"answered: {why[:120]}"
+        return f"rejected: `{why[:120]}`"
 
     return made
 
@@ -80,8 +80,8 @@ def flood(plant: Plant) -> str:
     thread.join()
     plant.over()
     return (
-        f"{done} of {len(took)} allowed commands meanwhile carried out, the others refused; answered within"
-        f" {max(took):.1f} s, half of them within {median(took):.1f} s"
+        f"{done} of {len(took)} allowed commands carried out, the others refused; results within {max(took):.1f} s,"
+        f" half of them within {median(took):.1f} s"
     )
 
 
@@ -96,7 +96,7 @@ def late(plant: Plant) -> str:
     answers = [plant.subscriber.answer(f"late {number}") for number in range(5)] + [plant.subscriber.answer("expired")]
     assert not any(answer["ok"] for answer in answers), answers
     plant.obeys_commands()
-    return f"each answered: {answers[0]['error']}"
+    return f"each rejected: `{answers[0]['error']}`"
 
 
 def beyond_a_limit(plant: Plant) -> str:
@@ -104,7 +104,7 @@ def beyond_a_limit(plant: Plant) -> str:
     assert not answer["ok"]
     plant.over()
     plant.obeys_commands()
-    return f"answered: {answer['error']}"
+    return f"rejected: `{answer['error']}`"
 
 
 def while_the_line_is_gone(plant: Plant) -> str:
@@ -116,7 +116,7 @@ def while_the_line_is_gone(plant: Plant) -> str:
     plant.over()
     plant.run.heard("the line is up", plant.fault_at)
     plant.obeys_commands()
-    return f"answered: {answer['error']}"
+    return f"rejected: `{answer['error']}`"
 
 
 def to_a_dead_node(plant: Plant) -> str:
@@ -128,13 +128,13 @@ def to_a_dead_node(plant: Plant) -> str:
     plant.over()
     plant.run.heard("winder is up", plant.fault_at)
     plant.obeys_commands()
-    return f"answered: {answer['error']}"
+    return f"rejected: `{answer['error']}`"
 
 
 def forbidden(plant: Plant) -> str:
     why = refusal(plant, "1", f"{PREFIX}/set/winder/11")
     plant.over()
-    return f"answered: {why}"
+    return f"rejected: `{why}`"
 
 
 LONG_TOPIC = f"{PREFIX}/set/{'x' * 65_000}"
@@ -145,9 +145,9 @@ FAULTS = {
     "nested-4k": Fault(name="a command nested 4,000 deep", make=strange(lambda: "[" * 2_000 + "]" * 2_000)),
     "long-topic": Fault(name="a topic of 64 kB", make=strange(lambda: "1", LONG_TOPIC)),
     "flood": Fault(name="70,000 refused commands", make=flood),
-    "late-commands": Fault(name="run stands still while commands come", make=late),
+    "late-commands": Fault(name="`run` is stopped while commands arrive", make=late),
     "limit": Fault(name="a command beyond a limit", make=beyond_a_limit),
     "forbidden": Fault(name="a command that the file does not allow", make=forbidden),
-    "command-no-line": Fault(name="a command while the port is gone", make=while_the_line_is_gone),
-    "command-no-node": Fault(name="a command to a node that is off", make=to_a_dead_node),
+    "command-no-line": Fault(name="a command while the port is missing", make=while_the_line_is_gone),
+    "command-no-node": Fault(name="a command to a node that is switched off", make=to_a_dead_node),
 }

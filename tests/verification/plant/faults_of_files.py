@@ -160,22 +160,24 @@ FAULTS = {
     "csv-moved": Fault(name="the CSV file is moved away (rotation)", make=moved("csv")),
     "csv-removed": Fault(name="the CSV file is removed", make=removed("csv")),
     "csv-emptied": Fault(name="the CSV file is emptied (copytruncate)", make=emptied),
-    "jsonl-moved": Fault(name="the file of JSON lines is moved away", make=moved("jsonl")),
+    "jsonl-moved": Fault(name="the JSON lines file is moved away", make=moved("jsonl")),
     "folder-removed": Fault(
-        name="the folder is removed, and made again", make=folder_removed, site=Site(folder="logs", in_folder=("csv",))
+        name="the folder is removed and created again",
+        make=folder_removed,
+        site=Site(folder="logs", in_folder=("csv",)),
     ),
     "disk-full": Fault(name="the disk of CSV and JSON lines is full", make=full("csv", "jsonl"), site=ON_DISK),
     "sqlite-full": Fault(
         name="the disk of SQLite is full", make=full("sqlite"), site=Site(disk=1024, on_disk=("sqlite",))
     ),
     "read-only": Fault(
-        name="the disk becomes one that nobody may write to",
+        name="the disk becomes read-only",
         make=read_only,
         site=Site(folder="logs", in_folder=("csv", "jsonl")),
     ),
     "sqlite-locked": Fault(name="another process locks the database for 10 s", make=locked),
     "sqlite-read": Fault(name="another process reads the database in one long transaction", make=read_for_long),
     "sqlite-moved": Fault(name="the database is moved away", make=moved("sqlite")),
-    "sqlite-other": Fault(name="something else takes the database's place, and is removed", make=no_database),
-    "half-line": Fault(name="a crash has left half a line in the CSV file", make=half_a_line),
+    "sqlite-other": Fault(name="another file replaces the database and is then removed", make=no_database),
+    "half-line": Fault(name="the CSV file ends with half a line after a crash", make=half_a_line),
 }

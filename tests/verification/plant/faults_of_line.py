@@ -32,7 +32,7 @@ def still_for(seconds: float) -> Fault:
         plant.drives.go_on()
         plant.over()
 
-    return Fault(name=f"all drives stand still for {seconds:g} s", make=make)
+    return Fault(name=f"all drives are stopped for {seconds:g} s", make=make)
 
 
 def node_off(plant: Plant) -> None:
@@ -76,14 +76,15 @@ def another_master(plant: Plant) -> str:
     other.send(signal.SIGTERM)
     other.wait()
     plant.over()
-    return f"the other one heard {len(other.printed())} values; whose an answer is nobody can tell then"
+    return f"the other master received {len(other.printed())} values; replies cannot be attributed"
 
 
 def same_port(plant: Plant) -> str:
     other = plant.once("run", str(plant.file))
     assert other.returncode, other
     plant.over()
-    return f"the other one ends with {other.returncode}: {other.stderr.splitlines()[-1].removeprefix('busmaster: ')}"
+    why = other.stderr.splitlines()[-1].removeprefix("busmaster: ")
+    return f"the other process: exit status {other.returncode}, `{why}`"
 
 
 def all_nodes_off(plant: Plant) -> None:
@@ -98,16 +99,18 @@ def all_nodes_off(plant: Plant) -> None:
 
 
 FAULTS = {
-    "port-gone": Fault(name="the port is gone, and comes back", make=port_gone),
-    "server-gone": Fault(name="the serial server breaks off, and refuses", make=port_gone, site=Site(tcp=True)),
-    "drives-killed": Fault(name="all that is behind the port is killed, and started again", make=drives_killed),
+    "port-gone": Fault(name="the port disappears and returns", make=port_gone),
+    "server-gone": Fault(
+        name="the serial server closes the connection, then refuses new ones", make=port_gone, site=Site(tcp=True)
+    ),
+    "drives-killed": Fault(name="the process behind the port is killed and restarted", make=drives_killed),
     "still-1": still_for(1.0),
     "still-10": still_for(10.0),
     "node-off": Fault(name="one node is switched off and on", make=node_off),
     "nodes-off": Fault(name="all nodes are switched off and on", make=all_nodes_off),
     "node-garbles": Fault(name="one node's replies have a flipped bit", make=node_garbles),
-    "noise": Fault(name="noise of one node comes in bursts", make=noise),
-    "port-missing": Fault(name="the port is missing at the start", make=missing_at_start, site=Site(starts=False)),
+    "noise": Fault(name="one node sends bursts of noise", make=noise),
+    "port-missing": Fault(name="the port is missing at startup", make=missing_at_start, site=Site(starts=False)),
     "same-port": Fault(name="another busmaster is started on the same port", make=same_port),
     "another-master": Fault(
         name="another master uses the same serial server", make=another_master, site=Site(tcp=True), beyond=True

@@ -53,7 +53,7 @@ def terminated(plant: Plant) -> str:
     """The drive has another setpoint then."""
     plant.obeys_commands()
     status = plant.end_run()
-    return f"exit status {status}; the drive was left at {setpoint(plant)} N"
+    return f"exit status {status}; the drive was set to {setpoint(plant)} N"
 
 
 def terminated_with_a_dead_node(plant: Plant) -> str:
@@ -79,7 +79,7 @@ def killed(plant: Plant) -> str:
     left = setpoint(plant)
     plant.start_run()
     plant.over()
-    return f"`busmaster safe` left the drive at {left} N; nobody can count what was in memory"
+    return f"`busmaster safe` set the drive to {left} N; values in memory cannot be counted"
 
 
 def stopped(plant: Plant) -> None:
@@ -130,9 +130,7 @@ def clock_set(seconds: int) -> Fault:
             plant.run.heard("the clock was set", plant.fault_at)
         plant.wait_for_cycles(ENOUGH)
 
-    name = (
-        f"somebody sets the clock {'forward' if seconds > 0 else 'back'} by {abs(seconds) // 3600} h, with `keep_days`"
-    )
+    name = f"the clock is set {'forward' if seconds > 0 else 'back'} by {abs(seconds) // 3600} h, with `keep_days`"
     return Fault(name=name, make=make, site=Site(sqlite="keep_days = 1", skewed=True))
 
 
@@ -164,7 +162,7 @@ def watched(plant: Plant) -> str:
         manager.settimeout(20.0)
         while "WATCHDOG=1" not in manager.recv(1000).decode():
             pass
-    return f"the supervisor heard {told.strip()}, and nothing for the 2 s: it would have restarted the service"
+    return f"the supervisor received `{told.strip()}`, then nothing for 2 s: it would have restarted the service"
 
 
 def loss_in_metrics(plant: Plant) -> str:
@@ -173,7 +171,7 @@ def loss_in_metrics(plant: Plant) -> str:
     number = plant.scrape()["busmaster_line_losses_total"]
     plant.order("back")
     plant.over()
-    return f"metrics: busmaster_line_losses {number:g}"
+    return f"metrics: `busmaster_line_losses_total {number:g}`"
 
 
 CAPTURE = Site(disk=128, arguments=("--json", "--capture", "disk/line.pcapng"))
@@ -195,9 +193,7 @@ def capture_cut_off(plant: Plant) -> str:
     assert done.returncode == 0, done
     plant.start_run()
     plant.over()
-    return (
-        f"`replay` of what the killed one left: {done.stdout.splitlines()[-1] if done.stdout else done.stderr.strip()}"
-    )
+    return f"`replay` of the capture: {done.stdout.splitlines()[-1] if done.stdout else done.stderr.strip()}"
 
 
 EVERYWHERE = ("csv", "jsonl", "sqlite", "mqtt")
@@ -211,19 +207,19 @@ FAULTS = {
         name="SIGTERM, with a dead node in [safe]", make=terminated_with_a_dead_node, status=1, site=Site(within=2.0)
     ),
     "kill": Fault(name="SIGKILL, then `busmaster safe`", make=killed, uncounted=EVERYWHERE),
-    "stopped": Fault(name="run stands still for 5 s", make=stopped),
+    "stopped": Fault(name="`run` is stopped for 5 s", make=stopped),
     "terminal": Fault(
-        name="its terminal is closed", make=terminal_closed, site=Site(arguments=("--plain",), screen=True)
+        name="the terminal of `run` is closed", make=terminal_closed, site=Site(arguments=("--plain",), screen=True)
     ),
-    "screen": Fault(name="the process that draws is killed", make=screen_killed, site=Site(arguments=(), screen=True)),
+    "screen": Fault(name="the screen process is killed", make=screen_killed, site=Site(arguments=(), screen=True)),
     "stdout-full": Fault(
         name="standard output goes to a full disk", make=stdout_full, site=Site(disk=64, stdout="disk/out.jsonl")
     ),
     "stdin-closed": Fault(name="standard input is closed", make=stdin_closed),
     "clock-forward": clock_set(A_YEAR),
     "clock-back": clock_set(-3600),
-    "watchdog": Fault(name="a supervisor watches, run stands still", make=watched, site=Site(starts=False)),
-    "counted-loss": Fault(name="the port is lost, and a scraper looks", make=loss_in_metrics),
+    "watchdog": Fault(name="`run` is stopped under a watchdog", make=watched, site=Site(starts=False)),
+    "counted-loss": Fault(name="the metrics are scraped while the port is missing", make=loss_in_metrics),
     "capture-full": Fault(name="the disk of `--capture` is full", make=capture_full, site=CAPTURE),
     "capture-cut": Fault(
         name="SIGKILL, then `replay` of the capture", make=capture_cut_off, site=CAPTURE, uncounted=EVERYWHERE

@@ -28,7 +28,7 @@ def half_open(plant: Plant) -> str:
         answered = plant.scrape()
         most = threads(plant)
     plant.over()
-    return f"a scrape among them is answered with {len(answered)} numbers; threads: {before}, then {most}"
+    return f"a scrape at the same time returns {len(answered)} numbers; threads: {before}, then {most}"
 
 
 def at_once(plant: Plant) -> str:
@@ -50,7 +50,7 @@ def at_once(plant: Plant) -> str:
         askers = [asker for asker in askers if asker.is_alive()] or askers[-1:]
     plant.over()
     whole = sum(map(bool, found))
-    return f"{whole} of {SCRAPES} answered whole, the others told to come later; threads: {before}, then {most}"
+    return f"{whole} of {SCRAPES} complete; a scrape beyond the limit would get 503; threads: {before}, then {most}"
 
 
 def nobody_reads(plant: Plant) -> str:
@@ -61,7 +61,7 @@ def nobody_reads(plant: Plant) -> str:
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
         answered = plant.scrape()
     plant.over()
-    return f"a scrape among them is answered with {len(answered)} numbers"
+    return f"a scrape at the same time returns {len(answered)} numbers"
 
 
 def port_taken(plant: Plant) -> None:
@@ -77,8 +77,8 @@ def port_taken(plant: Plant) -> None:
 FAULTS = {
     "half-open-scrapes": Fault(name="1,000 half-open connections to the metrics", make=half_open),
     "scrapes": Fault(name="200 scrapes at once", make=at_once),
-    "silent-scrapes": Fault(name="50 scrapers that never read the answer", make=nobody_reads),
+    "silent-scrapes": Fault(name="50 scrapers that never read the reply", make=nobody_reads),
     "metrics-taken": Fault(
-        name="the port of the metrics is taken at the start", make=port_taken, site=Site(starts=False)
+        name="the port of the metrics is in use at startup", make=port_taken, site=Site(starts=False)
     ),
 }

@@ -90,16 +90,16 @@ def both_of_scrapes(plant: Plant) -> str:
 
 
 FAULTS: dict[str, Callable[[Plant], str | None]] = {
-    "the broker is killed, and started again": faults_of_broker.killed,
+    "the broker is killed and restarted": faults_of_broker.killed,
     "one node is switched off and on": faults_of_line.node_off,
     "the CSV file is moved away": faults_of_files.moved("csv"),
     "the disk of CSV and JSON lines is full": faults_of_files.full("csv", "jsonl"),
     "another process locks the database for 10 s": faults_of_files.locked,
-    "the serial server breaks off, and refuses": faults_of_line.port_gone,
+    "the serial server closes the connection, then refuses new ones": faults_of_line.port_gone,
     "70,000 refused commands": faults_of_commands.poured,
     "SIGHUP, the file unchanged": faults_of_run.hangup_unchanged,
     "1,000 half-open connections, 200 scrapes at once": both_of_scrapes,
-    "the broker stands still, then goes on": faults_of_broker.stopped,
+    "the broker is stopped, then continues": faults_of_broker.stopped,
 }
 
 
