@@ -88,7 +88,7 @@ def section(file: Path) -> str:
     for chosen in dict.fromkeys(bug.chosen for bug in bugs):
         those = [bug for bug in bugs if bug.chosen == chosen]
         missed = sum(bug.first == "missed" for bug in those)
-        lines.append(f"Chosen {chosen}: {len(those)}, of which {missed} were missed at first.\n")
+        lines.append(f"Chosen {chosen}: {len(those)}, {missed} of them missed at first.\n")
         lines.append("| bug | file | at first | noticed by |\n|---|---|---|---|")
         for bug in those:
             tests = "<br>".join(f"`{test}`" for test in bug.tests)
