@@ -19,7 +19,7 @@ CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busm
 CLEAN = """busmaster/arbiter busmaster/bus busmaster/transport README.md CONTRIBUTING.md SECURITY.md
 CODE_OF_CONDUCT.md benchmarks/README.md docs/README.md docs/adding-a-protocol.md docs/adding-an-interface.md
 docs/adding-an-output.md docs/architecture.md docs/explanation docs/howto docs/interfaces.md docs/monitoring.md
-docs/plant.md docs/planted-bugs.md docs/promises.md docs/protocols docs/public-api.md docs/questions.md
+docs/plant.md docs/planted-bugs.md docs/promises.md docs/proof.md docs/protocols docs/public-api.md docs/questions.md
 docs/service.md docs/tutorial.md docs/upgrading.md"""
 LONGEST = 30
 RULES = {  # name: what to look for, in any case

@@ -136,7 +136,7 @@ class Setup:
 
     @property
     def name(self) -> str:
-        parts = [self.kind, "asks " + ",".join(str(place) for place in self.commands)]
+        parts = [self.kind, "commands " + ",".join(str(place) for place in self.commands)]
         parts += [word for word in ("in_sync", "whole", "paced", "echo", "strict") if getattr(self, word)]
         if self.receive_latency:
             parts.append(f"latency {self.receive_latency * 1000:g} ms")
