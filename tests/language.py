@@ -17,10 +17,9 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
 CLEAN = """busmaster/arbiter busmaster/bus busmaster/transport README.md CONTRIBUTING.md SECURITY.md
-CODE_OF_CONDUCT.md benchmarks/README.md docs/README.md docs/adding-a-protocol.md docs/adding-an-interface.md
-docs/adding-an-output.md docs/architecture.md docs/explanation docs/howto docs/interfaces.md docs/monitoring.md
-docs/plant.md docs/planted-bugs.md docs/promises.md docs/proof.md docs/protocols docs/public-api.md docs/questions.md
-docs/service.md docs/tutorial.md docs/upgrading.md"""
+CODE_OF_CONDUCT.md benchmarks/README.md docs/README.md docs/adding-*.md docs/architecture.md docs/explanation
+docs/howto docs/interfaces.md docs/monitoring.md docs/p*.md docs/protocols docs/questions.md docs/service.md
+docs/tutorial.md docs/upgrading.md"""
 LONGEST = 30
 RULES = {  # name: what to look for, in any case
     "person": r"\b(?:no|some)(?:body| one)\b|\bwho(?:m|ever)\b|\bhis\b|\bhe\b|\bhim\b",
@@ -93,7 +92,7 @@ def main(arguments: list[str]) -> None:
 
 
 def files(paths: Iterable[str]) -> list[Path]:
-    found = [file for path in map(ROOT.joinpath, paths) for file in (path, *path.rglob("*.[mp][dy]"))]
+    found = {file for name in paths for path in ROOT.glob(name) for file in (path, *path.rglob("*.[mp][dy]"))}
     return sorted(file for file in found if file.is_file())
 
 
