@@ -112,7 +112,7 @@ def test_modbus_keeps_the_contract() -> None:
 
 def test_a_read_is_never_sent_to_all() -> None:
     for command in (ReadRegisters(0), ReadBits(0)):
-        with pytest.raises(InvalidCommand, match="nobody answers"):
+        with pytest.raises(InvalidCommand, match="a read of all units has no reply"):
             command.open(0, PROFILE.timings)
 
 

@@ -20,12 +20,12 @@ from tests.protocols.modbus_frames import UNIT, frame
         ("11 83 02 c1 34", "illegal data address", None),
         ("11 83 03 00 f4", "illegal data value", None),
         ("11 83 04 41 36", "device failure", None),
-        ("11 83 05 80 f6", "acknowledged, but it takes long", "ask again later"),
-        ("11 83 06 c0 f7", "device busy", "ask again later"),
+        ("11 83 05 80 f6", "acknowledged, but it takes long", "try again later"),
+        ("11 83 06 c0 f7", "device busy", "try again later"),
         ("11 83 07 01 37", "exception 7", None),
         ("11 83 08 41 33", "memory parity error", None),
-        ("11 83 0a c0 f2", "gateway path unavailable", "look at the gateway"),
-        ("11 83 0b 01 32", "gateway target did not respond", "look behind the gateway"),
+        ("11 83 0a c0 f2", "gateway path unavailable", "check the gateway"),
+        ("11 83 0b 01 32", "gateway target did not respond", "check the device behind the gateway"),
     ],
 )
 def test_an_exception_is_a_refusal_with_its_name_that_is_believed_at_once(

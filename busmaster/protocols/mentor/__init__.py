@@ -9,7 +9,7 @@ from busmaster.protocols.mentor.handle import MentorDrive
 from busmaster.protocols.mentor.parameters import ITEMS, NAMED
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
-CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
+CHAIN = Option("chain", "flag", "read a run in one exchange; use it only if no other drive can misinterpret it")
 
 EMULATED = (
     Option(
@@ -22,7 +22,7 @@ EMULATED = (
         "default, 0 where it is not lively.",
     ),
     Option("short_after_write", "flag", about="Short commands work after a write too."),
-    Option("refuse_malformed", "flag", about="A read request that is none is answered by NAK, not by silence."),
+    Option("refuse_malformed", "flag", about="The reply to a malformed read request is a NAK, not silence."),
     Option(
         "parameters",
         "tables",
@@ -44,7 +44,7 @@ EMULATED = (
         ),
     ),
 )
-"""What can be said of an emulated drive. `fine`: it may be written in high resolution."""
+"""Options of an emulated drive. `fine`: it may be written in high resolution."""
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -61,7 +61,8 @@ PROTOCOL = Protocol(
                 Option(
                     "chained",
                     "flag",
-                    about="A run is read in one exchange, where no other drive on the line can mistake it.",
+                    about="Poll groups read neighbouring parameters in one exchange, as a run. Use it only if no other "
+                    "drive on the line can misinterpret it.",
                 ),
             ),
             read_options=(CHAIN,),

@@ -1,4 +1,4 @@
-"""CT-ANSI as a listener hears it, with the short commands of Mentor II."""
+"""Reads captures of CT-ANSI, with the short commands of Mentor II."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_paramet
 from busmaster.wire.checks import bcc
 
 STEPS = {"again": 0, "next": 1, "previous": -1}
-"""The short commands, and the step each takes."""
+"""The short commands, and their steps."""
 
 
 class MentorDialect:
     """CT-ANSI: EOT a a a a m m p p ENQ, EOT a a a a STX m m p p ..., and NAK, ACK, BS for again, next, previous.
 
-    Bit 7 is parity, or nothing: it is not looked at. ACK and NAK are the drive's while something is asked, and the
-    host's short commands after a read that was answered.
+    Bit 7 is parity or unused, and ignored. ACK and NAK are the drive's while a request is open, and the host's short
+    commands after the reply to a read.
     """
 
     starts = bytes((EOT, STX))
@@ -45,7 +45,7 @@ class MentorDialect:
     def __init__(self) -> None:
         self._asked: Frame | None = None
         self._armed: Frame | None = None
-        """The last read that was answered: what a short command refers to."""
+        """The last read with a reply, to which a short command refers."""
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
         data = _plain(data)
@@ -61,7 +61,7 @@ class MentorDialect:
         return size or (-len(data) if quiet else 0)
 
     def _after_eot(self, data: bytes, sender: Direction, quiet: bool) -> int:
-        """Return the size of a request; or of a lone EOT, "no such parameter", while something is asked."""
+        """Return the size of a request, or of a single EOT ("no such parameter") while a request is open."""
         alone = data[1] < SPACE if len(data) > 1 else quiet or sender is Direction.NODE
         if alone and (sender is Direction.NODE or (sender is Direction.UNKNOWN and self._asked)):
             return 1
@@ -109,7 +109,7 @@ class MentorDialect:
         return frame
 
     def _rewrite(self, data: bytes) -> Frame:
-        """Return the frame of a write without an address, which newer drives take."""
+        """Return the frame of a write without an address, which newer drives accept."""
         frame = Frame(Kind.WRITE, Direction.HOST, data, None, "write", _parameter(data[1:5]), characters(data[5:-2]))
         frame.fault = checked(data, 1, bcc)
         if self._armed:
@@ -138,13 +138,13 @@ class MentorDialect:
         if data[0] == STX:
             frame.item, frame.value = _parameter(data[1:5]), characters(data[5:-2])
             if asked and not reading:
-                frame.fault = "a value answers no write"
+                frame.fault = "a value is not a reply to a write"
             elif asked and asked.item != frame.item:
-                frame.fault = f"wrong parameter: {asked.item} was asked"
+                frame.fault = f"wrong parameter: {asked.item} was requested"
             frame.fault = checked(data, 1, bcc) or frame.fault
         elif data[0] == ACK and reading:
-            frame.fault = "an ACK answers no read"
-        if reading and data[0] != ACK:  # EOT, too: a parameter that is not there is where short commands go on from
+            frame.fault = "an ACK is not a reply to a read"
+        if reading and data[0] != ACK:  # also after EOT: short commands start from a missing parameter too
             self._armed = asked
         return frame
 
@@ -158,8 +158,8 @@ class MentorDialect:
         return self.read_run(menu, number, 1 + len(steps), steps[0])
 
     def write(self, menu: int, number: int, text: str) -> Command[None]:
-        """Return the command that writes what a listener has read from the line."""
-        # the form is told by sign and number of characters alone, as a drive tells it
+        """Return the command for a write in a capture."""
+        # Only sign and number of characters show the form, for a drive too.
         signed = text[:1] in ("+", "-")
         value = bool(int(text)) if len(text) == 1 else int(text)
         return Write(menu, number, value, wide=not signed and len(text) == 5, high_resolution=len(text) == 6)

@@ -1,12 +1,12 @@
 """Mentor II (ANSI x3.28-2.5-A4): addresses 1-99, each of their two digits sent twice; parameters as menu and number.
 
     read    EOT a a a a m m p p ENQ                 answered by STX m m p p data ETX BCC; EOT: no such parameter
-    write   EOT a a a a STX m m p p data ETX BCC    answered by ACK or NAK; by nothing when it goes to address 0.
-                                                    An EOT may be an ACK with one bit flipped: it says nothing
+    write   EOT a a a a STX m m p p data ETX BCC    answered by ACK or NAK; no reply if it goes to address 0.
+                                                    An EOT may be an ACK with one flipped bit: it proves nothing
     then    ACK, BS or NAK alone                    the drive read last sends the next, previous or same parameter
 
-Values are whole numbers: where the decimal point belongs is for a table to say. The line has 7 bits and even parity;
-where 8 bits come through, the parity bit is dropped.
+Values are whole numbers: a table defines the position of the decimal point. The line has 7 bits and even parity. If 8
+bits are received, the parity bit is dropped.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ _BS = b"\x08"
 T = TypeVar("T")
 
 _SHORT_COMMANDS = {1: ACK, 0: NAK, -1: _BS}
-_SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))  # a port that knows only 8N1 brings the parity in bit 7
-# of a read: some other makers' nodes say NAK
+_SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))  # a port limited to 8N1 has the parity in bit 7
+# Refusals of a read: nodes of some other makers send a NAK.
 _REFUSALS = {NAK[0]: Refused, EOT[0]: NoSuchParameter}
 _PARAMETER = re.compile(r"(\d{1,2})\.(\d{1,2})", re.ASCII)
 _VALUE = re.compile(rb"[+-]?\d+")
 
 
 def with_parity(starts: bytes) -> bytes:
-    """Return the same characters and what they are where the parity bit comes through."""
+    """Return the same characters, and their forms with the parity bit set."""
     return starts + bytes(byte | 0x80 for byte in starts)
 
 
@@ -100,18 +100,18 @@ class Read:
         return {(self.menu, self.number): value}
 
     def open(self, address: int, timings: Timings) -> Reading:
-        """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
+        """Begin the read. Raises InvalidCommand for the broadcast address: all drives would reply at once."""
         request, header = read_request(address, self.menu, self.number)
         return Reading(request, header, timings.read)
 
 
 @dataclass(frozen=True, slots=True)
 class ReadRun:
-    """Read `count` parameters from one on, in one exchange: a tuple of ints.
+    """Read `count` consecutive parameters in one exchange: a tuple of ints.
 
-    `step` 1 goes on to the next parameter, -1 to the previous, and 0 reads the same one again. Every parameter but the
-    first costs one request byte. It fails as a whole, with NoSuchParameter where the menu has a gap. Another drive's
-    ACK or NAK is the same byte: use it only where each drive forgets its last read when another is addressed.
+    `step`: 1 for the next parameter, -1 for the previous one, 0 for the same one again. Every parameter after the first
+    costs one request byte. It fails as a whole, with NoSuchParameter if the menu has a gap. Another drive's ACK or NAK
+    is the same byte: use it only if each drive forgets its last read when another is addressed.
     Raises InvalidCommand for a run that leaves the menu.
     """
 
@@ -146,9 +146,9 @@ class ReadRun:
 class Write:
     """Write one parameter.
 
-    A number is sent as sign and 4 digits (-9999 to 9999); `wide` as 5 digits without a sign (0 to 65535), for
-    parameters that are wide integers; with `high_resolution` as sign and 5 digits (-99999 to 99999) in tenths of the
-    parameter's own unit; True and False as one digit. Raises InvalidCommand for what does not fit.
+    A number is sent as sign and 4 digits (-9999 to 9999), True and False as one digit. `wide`: 5 digits without a sign
+    (0 to 65535), for parameters that are wide integers. `high_resolution`: sign and 5 digits (-99999 to 99999), in
+    tenths of the parameter's own unit. Raises InvalidCommand for a value that does not fit.
     """
 
     menu: int
@@ -166,7 +166,7 @@ class Write:
         object.__setattr__(self, "text", self._format())
 
     def _format(self) -> str:
-        # a drive goes by the number of characters: +12000, sent with six, would be taken for 1200.0
+        # A drive recognises the form by the number of characters: +12000, with six, would mean 1200.0.
         if self.wide and self.high_resolution:
             raise InvalidCommand("a parameter is written either wide or in high resolution")
         if isinstance(self.value, bool):
@@ -190,7 +190,7 @@ class Write:
 
 
 class ParameterReading(TelegramReader[T]):
-    """One attempt to read a parameter, or one step of a run, whatever its data look like."""
+    """One attempt to read a parameter, or one step of a run, with data of any form."""
 
     __slots__ = ()
 
@@ -203,7 +203,7 @@ class ParameterReading(TelegramReader[T]):
 
 
 class Reading(ParameterReading[int]):
-    """Mentor II's: a whole number."""
+    """One attempt to read a parameter of Mentor II: a whole number."""
 
     __slots__ = ()
 
@@ -222,7 +222,7 @@ class RunReading:
     __slots__ = ("_next", "_short", "_step", "_values", "answers", "later", "request", "timing")
 
     reading: ClassVar[type[ParameterReading[Any]]] = Reading
-    """What reads each step."""
+    """Reader for each step."""
     sizes: ClassVar[Sizes] = Reading.sizes
     starts: ClassVar[bytes] = Reading.starts
     closing: ClassVar[int] = 0
@@ -241,7 +241,7 @@ class RunReading:
 
     @property
     def overdue(self) -> tuple[bytes, ...]:
-        """The parameter asked for last: the next ones take a word from the host."""
+        """The parameter that was requested last: each further one takes a byte from the host."""
         return self._step.answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[tuple[Any, ...]]:
@@ -252,7 +252,7 @@ class RunReading:
         if not self._next:
             return Done(tuple(self._values), rest=step.rest)
         if step.rest:
-            raise FrameError("bytes came before the next parameter was asked for")
+            raise FrameError("bytes came before the next parameter was requested")
         self._step = self.reading(self._short, self._next.pop(), self.timing)
         return Expect(self.timing, self.sizes, self._short)
 
@@ -275,7 +275,7 @@ class Writing(AcknowledgeReader):
 
 
 class Broadcast(SingleStep):
-    """One write to all drives: none answers, and the line is left to them for as long as an answer would take."""
+    """One write to all drives. No drive replies, and the line stays free for as long as a reply would take."""
 
     __slots__ = ()
 
@@ -298,10 +298,10 @@ class Broadcast(SingleStep):
 
 
 def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
-    """Return batches of neighbouring parameters, each read as a run of at most 8; what has no neighbour is left alone.
+    """Return batches of neighbouring parameters, each read as a run of at most 8. Single parameters are not merged.
 
-    Short commands rest on the drive that was read last being the one that hears them (see ReadRun), so the profile has
-    no merge by default: `CHAINED` has.
+    Short commands are safe only if the drive that was read last is the only one that interprets them (see ReadRun). So
+    the profile has no merge by default; `CHAINED` has one.
     """
     wanted: dict[tuple[int, int], int] = {}
     for index, command in enumerate(commands):
@@ -321,24 +321,24 @@ def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
 
 @lru_cache(maxsize=4096)
 def read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
-    """Return the read request, and what its reply begins with. Raises InvalidCommand for address 0."""
+    """Return the read request, and the beginning of its reply. Raises InvalidCommand for address 0."""
     if not address:
-        raise InvalidCommand("a read cannot go to all drives: they would answer at once")
+        raise InvalidCommand("a read cannot go to all drives: they would all reply at once")
     return reset(address) + b"%02d%02d" % (menu, number) + ENQ, header_of(menu, number)
 
 
 def header_of(menu: int, number: int) -> bytes:
-    """Return what the reply to a read begins with: STX, and the parameter as it is echoed."""
+    """Return the beginning of the reply to a read: STX and the echoed parameter."""
     return STX + b"%02d%02d" % (menu, number)
 
 
 def reset(address: int) -> bytes:
-    """Return what a request begins with: EOT and the address, each digit twice."""
+    """Return the beginning of a request: EOT and the address, each digit twice."""
     tens, units = divmod(address, 10)
     return EOT + b"%d%d%d%d" % (tens, tens, units, units)
 
 
-LINE = LineSettings(9600, bytesize=7, parity="E")  # ten bits a character, as 8N1 has
+LINE = LineSettings(9600, bytesize=7, parity="E")  # ten bits per character, like 8N1
 PROFILE = Profile(
     name="mentor",
     title="Mentor II",
@@ -348,10 +348,10 @@ PROFILE = Profile(
     other_lines=LINE.at(4800, 19200, 2400, 38400),  # beyond 9600 with an option module
     timings=Timings.uniform(ReplyTiming(late_after=0.05, window=0.15, max_reply_delay=0.3, inter_byte_timeout=0.05)),
     probe=Read(1, 17),
-    # a reply names its parameter, which tells these apart (R15)
+    # A reply contains its parameter, so these replies differ (R15).
     sync_reads=tuple(Read(1, number) for number in range(17, 22)),
     acks_are_commands=True,
-    shares_line_with=frozenset({"ct-ansi"}),  # with addresses that are drives to both: 11 to 99 without the tens
+    shares_line_with=frozenset({"ct-ansi"}),  # with addresses that both accept: 11 to 99 without the tens
 )
 CHAINED = replace(PROFILE, merge=merge_runs)
-"""For lines on which short commands are safe: poll groups read neighbours as runs."""
+"""For lines on which short commands are safe: poll groups read neighbouring parameters as runs."""

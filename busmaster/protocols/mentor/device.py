@@ -4,7 +4,7 @@
     write   EOT a a a a STX m m p p data ETX BCC    ->  ACK or NAK; nothing, if it went to address 0
     then    ACK, NAK or BS alone                    ->  the next, same or previous parameter, as if it had been read
 
-Characters have 7 bits. Where a line carries 8, bit 7 may hold even parity: it is dropped, and sent if it was heard.
+Characters have 7 bits. If a line carries 8, bit 7 may contain even parity: it is dropped, and sent if it was received.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ ACK, NO_SUCH_PARAMETER = b"\x06", b"\x04"
 STEPS = {0x06: 1, 0x15: 0, 0x08: -1}
 """ACK, NAK and BS as short commands."""
 IDLE = (0x00, 0x7F)
-"""What is no character: a line that is let go, or hosts that pad their frames."""
+"""Bytes that are not characters: from a line that is released, or from hosts that pad their frames."""
 FIRST_PRINTABLE = 0x20
 DIGITS = b"0123456789"
 BROADCAST = b"\x040000"
 TEXT_AT = 5
-"""Where a read has its parameter and a write its STX."""
+"""Position of the parameter of a read, and of the STX of a write."""
 READ_SIZE = 10
 SHORTEST_WRITE = 12
 KEPT = 32
-"""Bytes of a frame that are kept: whatever is longer is refused anyway."""
+"""Stored bytes of a frame: a longer one is refused."""
 ITEM = re.compile(r"(\d{1,2})\.(\d{1,2})(?::wide|:\d+)?", re.ASCII)
 VALUE = re.compile(rb"[+-]?\d{1,5}", re.ASCII)
 LONGEST_VALUE = 5
@@ -45,7 +45,7 @@ HIGH_RESOLUTION = re.compile(rb"[+-]\d{5}", re.ASCII)
 SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
 EVEN_PARITY = bytes(byte & 0x7F | (byte & 0x7F).bit_count() % 2 << 7 for byte in range(256))
 FINE = 10
-"""Steps of the high resolution to one of the ordinary."""
+"""Steps of the high resolution per ordinary step."""
 
 SPEED_REFERENCE, SPEED_FEEDBACK, SERIAL_ADDRESS = 117, 302, 1111
 FULL_SPEED = 1000
@@ -72,15 +72,15 @@ PARAMETERS = {
     SERIAL_ADDRESS: Parameter(0, 99, writable=False),
     **dict.fromkeys((1314, 1560, 1561, 1562, 1563), Parameter(0, 65535, wide=True)),
 }
-"""By menu x 100 + number. The numbers are the document's; what most of them do in a drive is not emulated."""
+"""By menu x 100 + number. The numbers are those of the document; the effect of most of them is not emulated."""
 
 
 class EmulatedMentor(Device):
     """Addresses 1 to 99. The speed feedback 03.02 follows the speed reference 01.17, both in 0.1 %.
 
-    `acceleration` is in 0.1 % per second; `ripple` by how much of itself, 0 to 1, the feedback swings with the shaft.
-    `short_after_write`: short commands work after a write too. `refuse_malformed`: a read request that is none is
-    answered by NAK, not by silence. With a `traceable` every parameter is the traceable's.
+    `acceleration` is in 0.1 % per second. `ripple`: share, 0 to 1, by which the feedback varies with the shaft.
+    `short_after_write`: short commands work after a write too. `refuse_malformed`: the reply to a malformed read
+    request is a NAK, not silence. With a `traceable`, it provides every parameter.
     """
 
     def __init__(
@@ -110,18 +110,18 @@ class EmulatedMentor(Device):
         self.routes = (*plain, *(route.translate(EVEN_PARITY) for route in plain))
         self._motor = Ramp(acceleration)
         self._fine: dict[int, int] = {}
-        """What was written, in steps of the high resolution."""
+        """The written values, in steps of the high resolution."""
         self._last: int | None = None
-        """The parameter that short commands start from."""
+        """The parameter from which short commands start."""
         self._frame = bytearray()
         self._check_due = False
         self._parity = False
         self._known_reads: dict[bytes, int] = {}
 
-    # What is in it
+    # Values
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values in a parameter ("1.17") and those after it; what is not there is added, as a plain integer."""
+        """Set a parameter ("1.17") and those after it. Missing parameters are added, as plain integers."""
         match = ITEM.fullmatch(item)
         if match is None:
             raise InvalidCommand(f"an emulated drive has no {item!r}: use a parameter such as 1.17")
@@ -135,7 +135,7 @@ class EmulatedMentor(Device):
                 self._motor.speed = number
 
     def steps(self, parameter: int, value: float) -> float:
-        """Return the whole number that a value on the line is."""
+        """Return the whole number for a value on the line."""
         return value
 
     def value(self, parameter: int, now: float) -> int:
@@ -151,7 +151,7 @@ class EmulatedMentor(Device):
         return math.trunc(self._fine.get(parameter, 0) / FINE)
 
     def set_value(self, parameter: int, value: float, now: float) -> None:
-        """Hold a value, in units of the ordinary resolution, whatever the limits."""
+        """Set a value, in units of the ordinary resolution, without regard to the limits."""
         self._fine[parameter] = round(value * FINE)
         if parameter == SPEED_REFERENCE:
             self._motor.advance(now)
@@ -170,7 +170,7 @@ class EmulatedMentor(Device):
         self._fine.clear()
         self._motor = Ramp(self._motor.rate, now=now)
 
-    # Hearing
+    # Receiving
 
     def take(self, frame: bytes, now: float) -> bool:
         if self._frame:
@@ -200,7 +200,7 @@ class EmulatedMentor(Device):
 
     def hear_byte(self, byte: int, now: float) -> None:
         character = byte & 0x7F
-        if self._check_due:  # whatever stands here is the check, EOT too
+        if self._check_due:  # this character is the checksum, even if it is EOT
             self._frame.append(character)
             self._handle(bytes(self._frame), now)
             self._ground()
@@ -246,21 +246,21 @@ class EmulatedMentor(Device):
         self._frame.clear()
         self._check_due = False
 
-    # Answering
+    # Replying
 
     def _step(self, character: int, now: float) -> None:
-        """Answer a short command; anything else ends them."""
+        """Reply to a short command. Any other character ends them."""
         step = STEPS.get(character)
         if step is None or self._last is None:
             self._last = None
         else:
-            # what comes next at a menu's end is not said: here the number plus one, be it there or not
+            # The guide does not define the next parameter at the end of a menu: here the number plus one.
             self._answer_read(self._last + step, now)
 
     def _handle(self, frame: bytes, now: float) -> None:
-        """Obey a whole request, to this drive or to all."""
+        """Execute a complete request, to this drive or to all."""
         self._last = None
-        # a damaged check of a write may be ENQ: that makes no read of it
+        # The damaged checksum of a write may be ENQ: that does not make it a read.
         if frame[-1] == ENQ and len(frame) == READ_SIZE:
             if self._is_mine(frame):
                 self._answer_read(int(frame[TEXT_AT:-1]), now)
@@ -268,13 +268,13 @@ class EmulatedMentor(Device):
         taken = bcc(frame[TEXT_AT + 1 : -1]) == frame[-1] and self._write(frame[6:10], frame[10:-2], now)
         if not self._is_mine(frame):
             return
-        # the guide does not say whether short commands work after a write: by default not
+        # The guide does not define whether short commands work after a write. By default they do not.
         if taken and self.short_after_write:
             self._last = int(frame[6:10])
         self._say(ACK if taken else NAK, now)
 
     def _answer_read(self, parameter: int, now: float) -> None:
-        """Answer a read. Short commands start from this parameter, be it there or not."""
+        """Reply to a read. Short commands start from this parameter, even if it does not exist."""
         self._last = parameter
         if parameter not in self.parameters:
             self._say(NO_SUCH_PARAMETER, now)
@@ -297,11 +297,11 @@ class EmulatedMentor(Device):
         return True
 
     def _telegram(self, parameter: int, now: float) -> bytes:
-        """Return the reply to a read of a parameter that is there."""
+        """Return the reply to a read of an existing parameter."""
         return telegram(parameter, self.value(parameter, now), self.parameters[parameter].wide)
 
     def _fine_of(self, parameter: Parameter, data: bytes) -> int | None:
-        """Return the value that a write carries, in steps of the high resolution; None for what is none."""
+        """Return the written value, in steps of the high resolution; None if it is not a value."""
         if HIGH_RESOLUTION.fullmatch(data):
             return int(data) if parameter.fine else None
         if VALUE.fullmatch(data) and len(data) <= LONGEST_VALUE:
@@ -323,14 +323,14 @@ class EmulatedMentor(Device):
 
 
 def _is_read(plain: bytes) -> bool:
-    """Return whether it is a whole read request of 7-bit characters, to any drive."""
+    """Return True for a complete read request of 7-bit characters, to any drive."""
     return len(plain) == READ_SIZE and plain[0] == EOT and plain[-1] == ENQ and plain[1:-1].isdigit()
 
 
 def _is_write(plain: bytes) -> bool:
-    """Return whether it is a whole write request of 7-bit characters, to any drive.
+    """Return True for a complete write request of 7-bit characters, to any drive.
 
-    What is wrong with its text is for its checksum and the drive to find.
+    Faults in its text are detected by its checksum and by the drive.
     """
     return (
         len(plain) >= SHORTEST_WRITE
@@ -362,7 +362,7 @@ def make_device(
     for item, said in (parameters or {}).items():
         match = ITEM.fullmatch(item)
         if match is None:
-            raise InvalidCommand(f"{item!r} is no parameter: write 7.05")
+            raise InvalidCommand(f"{item!r} is not a parameter: write 7.05")
         drive.parameters[int(match[1]) * 100 + int(match[2])] = parameter_of(**said)
     if lively:
         drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
@@ -377,7 +377,7 @@ def parameter_of(
     wide: bool = False,
     fine: bool = False,
 ) -> Parameter:
-    """Return a parameter with these limits; without them, those that its form can carry."""
+    """Return a parameter with these limits; by default the limits of its form."""
     least, most = (0, 65535) if wide else (PLAIN.low, PLAIN.high)
     low = least if low is None else held(low, least, most, "a lower limit")
     high = most if high is None else held(high, low, most, "an upper limit")

@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 _BEYOND_ANY_FORM = 1e9
 FINE = 10
-"""Steps of the high resolution to one of the ordinary."""
+"""Steps of the high resolution per ordinary step."""
 MOST_DECIMALS = 9
 NUMBERS = range(100)
 """The document has no list: any of these may be a parameter of a menu."""
@@ -38,30 +38,31 @@ FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, 1.17:20 for a run of 2
 
 
 class Place(NamedTuple):
-    """Where a parameter is, and how many of its last digits are decimals: None where a value is the number itself."""
+    """Menu and number of a parameter, and how many of its last digits are decimals; None: a value is the number."""
 
     menu: int
     number: int
     decimals: int | None
 
     def write(self, value: float, *, wide: bool, high_resolution: bool) -> Write:
-        """Return the command that writes a value; one that the guide calls wide is sent so. Raises InvalidCommand."""
+        """Return the command that writes a value. Wide parameters of the guide are sent wide. Raises InvalidCommand."""
         decimals = self.decimals if self.decimals is None else self.decimals + high_resolution
         wide = wide or (not high_resolution and self[:2] in WIDE)
         return Write(self.menu, self.number, to_line(value, decimals), wide, high_resolution)
 
 
 class ParameterHandle(Handle):
-    """A handle of a drive whose parameters are known by menu and number. Each protocol says how one and a run are read.
+    """A handle of a drive whose parameters have a menu and a number. Each protocol defines the read commands.
 
-    `decimals` is by parameter. Raises InvalidCommand for what are no digits, or two that differ for one parameter.
+    `decimals` is by parameter. Raises InvalidCommand for an invalid number of digits, or for two different ones of the
+    same parameter.
     """
 
     _read_command: ClassVar[type[Read]] = Read
     _run_command: ClassVar[type[ReadRun]] = ReadRun
     _menus: ClassVar[range] = range(17)
-    """Those that the drives have: Mentor II has 1 to 16, and 0 for what its user puts there. A read of a parameter that
-    does not exist takes two exchanges and the maximum reply delay (R7), so the numbers up to 99 would take an hour."""
+    """The menus of the drives: Mentor II has 1 to 16, and 0 for the user. A read of a parameter that does not exist
+    takes two exchanges and the maximum reply delay (R7), so the menus up to 99 would take an hour."""
 
     def __init__(
         self,
@@ -106,12 +107,12 @@ class ParameterHandle(Handle):
         chain: bool = False,
         **options: Unpack[ReadOptions],
     ) -> float | tuple[float, ...]:
-        """Return a parameter's value, a bit as 0 or 1; with `count`, so many parameters of its menu from there on.
+        """Return a parameter's value, a bit as 0 or 1; with `count`, this many parameters of its menu from there on.
 
-        `step` -1 reads the parameters before it instead of those after it, 0 the same one again and again. They are
-        read one by one. With `chain` they take one exchange, with one request byte for each after the first: only where
-        no other drive can take or send that byte for its own, that is where every node of the line is a drive that
-        forgets what it last sent when another is addressed. Raises NoSuchParameter, also where the menu has a gap, and
+        `step` -1 reads the parameters before it instead of those after it, 0 the same one repeatedly. They are read one
+        by one. With `chain` they take one exchange, with one request byte for each after the first. Use `chain` only if
+        no other drive can interpret or send that byte. Every node of the line must then be a drive that forgets its
+        last parameter when another drive is addressed. Raises NoSuchParameter, also if the menu has a gap, and
         InvalidCommand at address 0.
         """
         if count is None:
@@ -129,7 +130,7 @@ class ParameterHandle(Handle):
 
     @classmethod
     def _known(cls) -> Mapping[tuple[int, int], Parameter]:
-        """Return what a document says of parameters, by their places."""
+        """Return the parameters that a document describes, by menu and number."""
         return {}
 
     def _listed(self) -> Iterable[Parameter]:
@@ -150,7 +151,7 @@ class ParameterHandle(Handle):
         return plain
 
     async def _read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
-        """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
+        """Read as `point(item).read()` does. Without `chain`, read a run parameter by parameter: always safe."""
         parameter, _, count = item_text(item).partition(":")
         if is_decimal(count) and not chain:
             return await self.read(parameter, int(count))
@@ -164,11 +165,11 @@ class MentorDrive(ParameterHandle):
         await drive.write("1.17", -47.6)
         speed = await drive.read("1.17")
 
-    The line carries whole numbers. `decimals` says of how many digits a parameter's last ones are decimals: its values
-    are then in its own unit, rounded to that; without an entry a value is the number on the line. A parameter that the
-    guide names goes by that name too, and then has the guide's decimals: `read("speed_reference_1")` is in %. `chained`
-    lets poll groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read`
-    for when that is safe. The first handle of a drive says so, or none.
+    The line carries whole numbers. `decimals`: number of decimals of a parameter. Its values are then in its own unit,
+    rounded to these decimals; without an entry a value is the number on the line. A parameter with a name in the guide
+    can be used by that name too, and then has the guide's decimals: `read("speed_reference_1")` is in %. With
+    `chained`, poll groups read neighbouring parameters of this drive as runs, for all its handles: `read` states when
+    that is safe. It must be set by the first handle of a drive.
     """
 
     profile: ClassVar[Profile] = mentor.PROFILE
@@ -188,7 +189,7 @@ class MentorDrive(ParameterHandle):
         if address and (address < 10 or address % 10 == 0):
             warnings.warn(
                 "mentor: addresses below 10, and the tens, mean groups to later Control Techniques products: if some "
-                "share the line, use 11 to 99 without the tens",  # in the same words for each: it is shown once
+                "share the line, use 11 to 99 without the tens",  # the same text for each drive, so it is shown once
                 stacklevel=2,
             )
 
@@ -253,11 +254,11 @@ class MentorDrive(ParameterHandle):
 
     @classmethod
     def _same(cls, item: str, one: Value, other: Value) -> bool:
-        # a reply has five characters always, and so not the tenths that were written
+        # A reply always has five characters, and so not the written tenths.
         return abs(one - other) < FINE if item.endswith(":hires") else one == other
 
     def _written_item(self, item: str, before: Value, value: Value) -> str:
-        """Return the item as a wide one where the value before, or this one, has no other form."""
+        """Return the item as a wide one, if the value before or the new one has no other form."""
         return f"{item}:wide" if ":" not in item and max(before, value) > LARGEST_WITH_SIGN else item
 
     async def _read_one(self, item: str, options: ReadOptions) -> float:
@@ -274,12 +275,12 @@ class MentorDrive(ParameterHandle):
         **options: Unpack[WriteOptions],
     ) -> None:
         """Write a parameter, or several of a menu from `item` on, acknowledged; at address 0 to all drives, which do
-        not answer.
+        not reply.
 
-        `wide` is for 16-bit integers; those of the guide (13.14, 15.60 to 15.63) are sent so by themselves. With
-        `high_resolution` a value without declared decimals counts in tenths of what a read returns. `verify` reads
-        back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is sent, for a value
-        that does not fit.
+        `wide` is for 16-bit integers; it is the default for those of the guide (13.14, 15.60 to 15.63). With
+        `high_resolution` a value without declared decimals is in tenths of the unit of a read. `verify` reads back, and
+        raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is sent, for a value that does
+        not fit.
         """
         names = self._names(item, values)
         commands = [
@@ -293,7 +294,7 @@ class MentorDrive(ParameterHandle):
         for name, command in zip(names, commands, strict=True) if requests.verify else ():
             check = Read(command.menu, command.number)
             found = await requests.read_back(check)
-            # a reply has five characters always, and so not the tenths that were written
+            # A reply always has five characters, and so not the written tenths.
             if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
                 raise VerifyFailed(
                     f"{name} reads {found} after {command.text} was written", node=self.node, command=str(check)
@@ -308,7 +309,7 @@ class MentorDrive(ParameterHandle):
         high_resolution: bool = False,
         **options: Unpack[CommandOptions],
     ) -> None:
-        """Write a parameter of every drive on the line at once (address 0). None answers."""
+        """Write a parameter of every drive on the line at once (address 0). No drive replies."""
         command = self._place(parameter).write(value, wide=wide, high_resolution=high_resolution)
         await self.bus.node(mentor.PROFILE, 0).request(command, **options)
 
@@ -318,10 +319,7 @@ class MentorDrive(ParameterHandle):
         return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", **options)
 
     def _place(self, text: str) -> Place:
-        """Return where a parameter is, by number or name.
-
-        A name brings the guide's decimals unless others are declared.
-        """
+        """Return the place of a parameter, by number or name. A name has the guide's decimals by default."""
         where = self._place_of(text)
         decimals = NAMED[text].decimals if text in NAMED else 0
         return Place(*where, self._decimals.get(where, decimals or None))
@@ -332,7 +330,7 @@ class MentorDrive(ParameterHandle):
 
         Raises InvalidCommand for anything else.
         """
-        named = NAMED.get(str(text))  # whatever it is: what is no text is refused below
+        named = NAMED.get(str(text))  # an argument that is not a text is rejected below
         return parse_parameter(text) if named is None else named.place
 
     def _values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
@@ -352,13 +350,13 @@ def places_of(run: ReadRun) -> list[tuple[int, int]]:
 
 
 def to_line(value: float, decimals: int | None) -> int:
-    """Return the whole number that stands for a value, rounded half away from zero. True and False stay what they are.
+    """Return the whole number for a value, rounded half away from zero. True and False are unchanged.
 
-    Raises InvalidCommand for a fraction where no decimals are declared, and for NaN, infinity and what is no number.
+    Raises InvalidCommand for a fraction if no decimals are declared, for NaN and infinity, and if it is not a number.
     """
     if isinstance(value, bool):
         return value
-    # a text has no __float__, and a NaN is unlike itself; a Decimal one cannot be compared otherwise
+    # A text has no __float__. A NaN differs from itself; a Decimal NaN allows no other comparison.
     if not hasattr(value, "__float__") or value != value or not abs(value) < _BEYOND_ANY_FORM:
         raise InvalidCommand(f"{value!r} cannot be sent: a parameter has at most five digits")
     if decimals is None:
@@ -369,5 +367,5 @@ def to_line(value: float, decimals: int | None) -> int:
 
 
 def from_line(number: int, decimals: int | None) -> float:
-    """Return the value that a number on the line stands for."""
+    """Return the value for a number on the line."""
     return number / 10**decimals if decimals else number

@@ -1,4 +1,4 @@
-"""What the Mentor II User Guide's chapter on the serial interface says of parameters."""
+"""The parameters that the Mentor II User Guide describes in its chapter on the serial interface."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from busmaster.contract.items import Access, Item
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Describe one parameter: menu, number, and perhaps a name.
+    """One parameter: menu, number, and an optional name.
 
-    `decimals` says how many of the last digits on the line are decimals of its unit. `wide`: a 16-bit whole number,
-    sent as five digits without a sign.
+    `decimals`: how many of the last digits on the line are decimals of its unit. `wide`: a 16-bit whole number, sent as
+    five digits without a sign.
     """
 
     menu: int
@@ -33,7 +33,7 @@ class Parameter:
 
     @property
     def item(self) -> Item:
-        """What the document says of it, as lists show it."""
+        """Its description in the document, for lists."""
         number = f"{self.menu}.{self.number:02d}"
         return Item(self.name or number, number, self.meaning, self.unit, self.access, decimals=self.decimals)
 
@@ -54,5 +54,5 @@ PARAMETERS = (
 NAMED = {parameter.name: parameter for parameter in PARAMETERS if parameter.name}
 WIDE = frozenset(parameter.place for parameter in PARAMETERS if parameter.wide)
 ANY = Item("0-99.0-99", "0.00-99.99", "a parameter, by menu and number: see the drive's own list")
-"""For drives of this family: what most parameters are is not in the documents of the serial interface."""
+"""For drives of this family: most parameters are not in the documents of the serial interface."""
 ITEMS = (*(parameter.item for parameter in PARAMETERS), ANY)

@@ -16,8 +16,8 @@ PROTOCOL = Protocol(
             ModbusUnit,
             device_of("busmaster.protocols.modbus.device"),
             items="holding:100, input:100, coil:5, discrete:5 (addresses as sent, 0 to 65535); holding:100:10 (ten "
-            "from there on); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
-            "first; :swapped behind it for the other order)",
+            "addresses); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
+            "first, or last with :swapped)",
             probe_item="holding:0",
             documented=(
                 Item("coil:0-65535", "0-65535", "a bit, read by function 1, written by 5 and 15", access="read/write"),

@@ -1,4 +1,4 @@
-"""Modbus RTU as a listener hears it. Frames are cut by the lengths that they say, and told apart by their CRC."""
+"""Reads captures of Modbus RTU. Frames are separated by the lengths that they contain, and verified by their CRC."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ HIGHEST_UNIT = 247
 
 
 class ModbusDialect:
-    """A reply has the unit and function of its request, and nothing says which of the two a frame is.
+    """A reply has the unit and function of its request, and a frame does not contain its direction.
 
-    After a request a frame of the same unit and function is its reply, if it is sound as one.
+    After a request, a frame with the same unit and function is its reply, if its CRC is right with a reply's length.
     """
 
     starts = bytes(range(HIGHEST_UNIT + 1))
@@ -43,7 +43,7 @@ class ModbusDialect:
         self._asked: Frame | None = None
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
-        # cut by what a frame says of its length, never by pauses: adapters and networks make pauses of their own
+        # By the length in the frame, never by pauses: adapters and networks cause pauses of their own.
         refusing = 0 if sender is Direction.HOST else REFUSED
         if data[0] > HIGHEST_UNIT or (len(data) > 1 and data[1] & ~refusing not in FUNCTIONS):
             return -1
@@ -56,9 +56,9 @@ class ModbusDialect:
         return next((length for length in lengths if length <= len(data)), -len(data))
 
     def _lengths(self, data: bytes, sender: Direction) -> list[int]:
-        """Return the lengths that the frame may have, the likelier first.
+        """Return the possible lengths of the frame, the likelier first.
 
-        A length is more than there is, where it cannot be told yet.
+        A length that is not known yet is longer than `data`.
         """
         reply, request = reply_length(data), request_length(data)
         if sender is Direction.HOST:
@@ -68,7 +68,7 @@ class ModbusDialect:
         return [reply, request] if self._answers(data) else [request]
 
     def _answers(self, data: bytes) -> bool:
-        """Return whether it may be the reply to what was asked last."""
+        """Return True if it may be the reply to the last request."""
         asked = self._asked
         return asked is not None and data[0] == asked.raw[0] and (len(data) < 2 or data[1] & ~REFUSED == asked.raw[1])
 
@@ -93,7 +93,7 @@ class ModbusDialect:
             value = words_text(raw[7:-2]) if function == WRITE_REGISTERS else bits_text(raw[7:-2], count)
         item = f"{table}:{first}" if count == 1 else f"{table}:{first}:{count}"
         frame = Frame(kind, Direction.HOST, raw, unit, kind.value, item, value)
-        self._asked = None if unit == BROADCAST else frame  # nobody answers a write to all
+        self._asked = None if unit == BROADCAST else frame  # a write to all has no reply
         return frame
 
     def _reply(self, raw: bytes) -> Frame:
@@ -109,9 +109,9 @@ class ModbusDialect:
         if asked is None:
             frame.fault = UNEXPECTED
         elif raw[0] != asked.raw[0] or raw[1] & ~REFUSED != asked.raw[1]:
-            frame.fault = f"wrong answer: function {asked.raw[1]} of unit {asked.raw[0]} was asked"
+            frame.fault = f"wrong reply: function {asked.raw[1]} of unit {asked.raw[0]} was requested"
         elif frame.kind is Kind.ACK and raw[2:6] != asked.raw[2:6]:
-            frame.fault = "it repeats another write than was asked"
+            frame.fault = "it repeats another write than the requested one"
         elif frame.kind is Kind.VALUE and len(raw) != expected_length(asked.raw):
             frame.fault = f"{raw[2]} bytes of data, not {expected_length(asked.raw) - 5}"
         return frame
@@ -132,7 +132,7 @@ class ModbusDialect:
 
 
 def request_length(data: bytes) -> int:
-    """Return the length of the request that begins so; one more than there is where it cannot be told yet."""
+    """Return the length of the request that begins with `data`; longer than `data` if it is not known yet."""
     if len(data) < 2:
         return len(data) + 1
     if data[1] not in SEVERAL:
@@ -141,7 +141,7 @@ def request_length(data: bytes) -> int:
 
 
 def reply_length(data: bytes) -> int:
-    """Return the length of the reply that begins so; one more than there is where it cannot be told yet."""
+    """Return the length of the reply that begins with `data`; longer than `data` if it is not known yet."""
     if len(data) < 2:
         return len(data) + 1
     if data[1] & REFUSED:
@@ -158,7 +158,7 @@ def expected_length(request: bytes) -> int:
 
 
 def count_of(item: str) -> int:
-    """Return how many places an item names."""
+    """Return the number of addresses of an item."""
     _, _, count = item.partition(":")[2].partition(":")
     return int(count or 1)
 

@@ -6,8 +6,8 @@
                                                                  answered by unit function first first count count crc
     refused                                                      answered by unit function+80 code crc crc
 
-Numbers are big-endian, the CRC is not. A write to unit 0 is for all, and answered by none. A reply to a read does not
-say which register was read.
+Numbers are big-endian, the CRC is not. A write to unit 0 is for all units and has no reply. The reply to a read does
+not contain the address of the register.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MOST_READ, MOST_WRITTEN = 125, 123
 """Registers."""
 HIGHEST = 0xFFFF
 LISTED = 8
-"""Values that a command's text lists; of more it says how many."""
+"""Maximum number of values in a command's text. If there are more, the text has their number."""
 SILENCE = 0.00175
 """Seconds between frames: 3.5 characters, or this above 19200 baud. Here it is the reply's driver release time."""
 EXCEPTIONS = {
@@ -51,9 +51,9 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target did not respond",
 }
-"""What each exception code means."""
-HINTS = {5: "ask again later", 6: "ask again later", 10: "look at the gateway", 11: "look behind the gateway"}
-"""What to do about some of them."""
+"""Meaning of the exception codes."""
+HINTS = {5: "try again later", 6: "try again later", 10: "check the gateway", 11: "check the device behind the gateway"}
+"""Remedies for some of them."""
 
 
 def _crc_table() -> list[int]:
@@ -77,15 +77,15 @@ def with_crc(body: bytes) -> bytes:
 
 
 def is_sound(frame: bytes) -> bool:
-    """Return whether the CRC of a whole frame is right."""
+    """Return True if the CRC of a complete frame is right."""
     return with_crc(frame[:-2]) == frame
 
 
 class Frames:
-    """What is said in a conversation, and what its reply looks like: `header`, then `payload` bytes and the CRC.
+    """The request of a conversation and the form of its reply: `header`, then `payload` bytes and the CRC.
 
-    Those of a read are kept: to put a request together takes longer than all else that is done between the end of a
-    silence and the write.
+    Those of a read are cached: building a request takes longer than all other work between the end of a silence and the
+    write.
     """
 
     __slots__ = ("answered", "answers", "header", "refusal", "request", "size", "sizes", "starts")
@@ -94,7 +94,7 @@ class Frames:
         self.request = with_crc(body)
         self.header = header
         self.answered = body[0] != BROADCAST
-        # it names no register: of two like reads only R15 tells the answers apart
+        # It does not contain the register: only R15 distinguishes the replies to two similar reads.
         self.answers = (header,) if self.answered else ()
         self.starts = header[:1] if self.answered else b""
         self.refusal = bytes((body[0], body[1] | REFUSED))
@@ -103,7 +103,7 @@ class Frames:
 
 
 class Conversation(Generic[T]):
-    """One attempt. `decode` makes the value of the reply's payload."""
+    """One attempt. `decode` converts the reply's payload to the value."""
 
     __slots__ = ("_buffer", "_decode", "_frames", "answered", "answers", "request", "sizes", "starts", "timing")
 
@@ -114,7 +114,7 @@ class Conversation(Generic[T]):
         self._frames = frames
         self.request = frames.request
         self.answered = frames.answered
-        # nobody answers a write to all: the units are left as long as an answer would take
+        # A write to all has no reply: the line stays free for as long as a reply would take.
         self.timing = (
             timing
             if self.answered
@@ -145,19 +145,18 @@ class Conversation(Generic[T]):
         if not is_sound(buffer[:size]):
             if is_sound(buffer):
                 raise other_format(len(buffer), f"the reply to this has {size}")
-            raise FrameError(
-                "bad CRC", whole=len(buffer) == size
-            )  # only a whole frame is spared the maximum reply delay (R3)
+            # After a whole frame the line does not wait for the maximum reply delay (R3).
+            raise FrameError("bad CRC", whole=len(buffer) == size)
         return Done(self._decode(buffer[len(header) : size - 2]), rest=buffer[size:])
 
     def _refused(self, buffer: bytes) -> Progress[T]:
         if len(buffer) < 5:
             return MORE
-        if with_crc(buffer[:3]) != buffer:  # to the byte: a sound frame and the byte 00 have a right CRC, too
-            raise FrameError("bad CRC")  # or a damaged function code before a longer reply: not whole
+        if with_crc(buffer[:3]) != buffer:  # exactly: a valid frame followed by a byte 00 has a right CRC too
+            raise FrameError("bad CRC")  # not `whole`: it may be a longer reply with a damaged function code
         code = buffer[2]
         name = EXCEPTIONS.get(code, f"exception {code}")
-        # the CRC guards a refusal, so it is believed at once
+        # The CRC protects a refusal, so it needs no confirmation.
         raise Refused(f"refused: {name}", confirm=False, hint=HINTS.get(code))
 
     def expired(self, started: bool, /) -> Done[T]:
@@ -206,7 +205,7 @@ class ReadRegisters(_Read):
     most: ClassVar[int] = MOST_READ
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
-        """Begin the read. Raises InvalidCommand for the broadcast address: nobody would answer."""
+        """Begin the read. Raises InvalidCommand for the broadcast address, which has no reply."""
         frames = _read_frames(address, READS[self.table], self.first, self.count, 2 * self.count)
         return Conversation(frames, timings.read, _registers(self.count))
 
@@ -235,8 +234,8 @@ class ReadBits(_Read):
 class WriteRegisters:
     """Write `values`, 0 to 65535 each and 123 at most, to the holding registers from `first` on.
 
-    One value goes as a single register (function 6), more by function 16. `idempotent` is for the caller to say: what a
-    unit does with a register is its own business. Raises InvalidCommand for what does not fit.
+    One value is written by function 6, several by function 16. The caller decides whether it is `idempotent`, because
+    the effect of a register depends on the unit. Raises InvalidCommand for values that do not fit.
     """
 
     first: int
@@ -299,20 +298,20 @@ class WriteCoils:
 
 @lru_cache(maxsize=4096)
 def _read_frames(unit: int, function: int, first: int, count: int, size: int) -> Frames:
-    """Return the frames of a read that is answered by `size` bytes. Raises InvalidCommand for the broadcast address."""
+    """Return the frames of a read whose reply has `size` bytes. Raises InvalidCommand for the broadcast address."""
     if unit == BROADCAST:
-        raise InvalidCommand("nobody answers a read that goes to all: read one unit at a time")
+        raise InvalidCommand("a read of all units has no reply: read one unit at a time")
     return Frames(struct.pack(">BBHH", unit, function, first, count), bytes((unit, function, size)), size)
 
 
 @lru_cache(maxsize=MOST_READ)
 def _registers(count: int) -> Callable[[bytes], tuple[int, ...]]:
-    """Return what makes numbers of so many registers."""
+    """Return the function that converts this many registers to numbers."""
     return struct.Struct(f">{count}H").unpack
 
 
 def _tell(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
-    """Begin a write: the unit says the first six bytes of it again."""
+    """Begin a write: the unit repeats its first six bytes."""
     return Conversation(Frames(header + data, header, 0), timings.write, _nothing)
 
 
@@ -345,7 +344,7 @@ PROFILE = Profile(
     addresses=range(1, 248),
     line=LINE,  # the standard's default
     other_lines=(
-        *NO_PARITY.at(9600, 19200),  # common, though the standard wants a second stop bit then
+        *NO_PARITY.at(9600, 19200),  # common, although the standard requires a second stop bit without parity
         *LINE.at(9600),
         *NO_PARITY.at(38400, 115200, 57600),
         *LINE.at(38400, 115200, 57600),
@@ -356,8 +355,8 @@ PROFILE = Profile(
             late_after=0.05, window=0.2, max_reply_delay=0.4, inter_byte_timeout=0.02, driver_release_time=SILENCE
         )
     ),
-    probe=ReadRegisters(0),  # a unit without it refuses, which is an answer too (R11)
-    # unit, function and length are all that tells answers apart, so the lengths differ (R15)
+    probe=ReadRegisters(0),  # a unit without it refuses, and a refusal is a reply too (R11)
+    # Only unit, function and length distinguish replies, so the lengths differ (R15).
     sync_reads=tuple(ReadRegisters(0, count) for count in range(1, 5)),
     broadcast=BROADCAST,
 )

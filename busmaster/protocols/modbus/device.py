@@ -1,6 +1,6 @@
-"""An emulated Modbus unit: four tables, and exceptions for what it lacks. Its parser is its own.
+"""An emulated Modbus unit: four tables, and exceptions for missing functions and addresses. Its parser is its own.
 
-A request is told by its length where the function is known; of one that is not, by the silence after it.
+The end of a request is known by its length if the function is known, else by the silence after it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from busmaster.emulator.device import NEVER, Delay, Device, held
 from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 
-# none of this is the codec's: a misreading on one side is not to be hidden by the same on the other
+# Nothing here is shared with the codec: otherwise the same misinterpretation on both sides would not be noticed.
 BROADCAST = 0
 ALL = range(1, 248)
 READ_COILS, READ_DISCRETES, READ_HOLDING, READ_INPUTS = 1, 2, 3, 4
@@ -24,14 +24,14 @@ WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS = 5, 6, 15, 16
 FIXED = frozenset({READ_COILS, READ_DISCRETES, READ_HOLDING, READ_INPUTS, WRITE_COIL, WRITE_REGISTER})
 """Functions whose requests have eight bytes."""
 COUNTED = frozenset({WRITE_COILS, WRITE_REGISTERS})
-"""Functions whose requests say in their seventh byte how many follow it."""
+"""Functions whose requests have the number of the following bytes in their seventh byte."""
 MOST = {READ_COILS: 2000, READ_DISCRETES: 2000, READ_HOLDING: 125, READ_INPUTS: 125}
 EXCEPTION = 0x80
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 SHORTEST = 4
 PAUSE_CHARACTERS, SHORTEST_PAUSE = 3.5, 0.00175
 SIZE = 1000
-"""Of each table, where nothing else is said."""
+"""Default size of each table."""
 FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 TABLES = {"holding": "registers", "input": "inputs", "coil": "coils", "discrete": "discretes"}
 ITEM = re.compile(
@@ -45,14 +45,15 @@ SWING, TURN = 10_000, 10.0
 
 
 class Illegal(Exception):
-    """The unit refuses; the argument is the exception's code."""
+    """The unit refuses. The argument is the exception code."""
 
 
 class EmulatedModbus(Device):
-    """A unit, 1 to 247. Each table is as long as what it is given.
+    """A unit, 1 to 247. Each table has the size of its initial values.
 
-    `functions` are those that it has; any other is answered by exception 1. `read_only`: holding registers that refuse
-    writes, with exception 3. `lively`: register 0 of both tables moves. With a `traceable` every register is its.
+    `functions`: those that it supports; it refuses all others with exception 1. `read_only`: holding registers
+    that refuse writes, with exception 3. `lively`: register 0 of both register tables moves. With a `traceable`, it
+    provides every register.
     """
 
     def __init__(
@@ -91,9 +92,9 @@ class EmulatedModbus(Device):
         self._heard_until = 0.0
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values in a table from an address on: "holding:100", "input:40:float32:swapped", "coil:5".
+        """Set values in a table from an address on: "holding:100", "input:40:float32:swapped", "coil:5".
 
-        A register that is given does not move. A count behind the address says nothing more.
+        A register that is set does not move. A count after the address is ignored.
         """
         match = ITEM.fullmatch(item)
         if match is None:
@@ -113,12 +114,12 @@ class EmulatedModbus(Device):
         super().restart(now)
         self._frame = b""
 
-    # Hearing
+    # Receiving
 
     def hear_byte(self, byte: int, now: float) -> None:
-        """Take a byte, and obey the frame that it ends.
+        """Process a byte, and execute the frame that it completes.
 
-        A frame begins after a silence, or where one to this unit ended. What is for others is let pass.
+        A frame begins after a silence, or at the end of a frame to this unit. Frames to other units are ignored.
         """
         # up to the start of this byte, of which `now` is the end
         if now - self.tau - self._heard_until > self._pause:
@@ -128,7 +129,7 @@ class EmulatedModbus(Device):
         self.attentive = self._frame[0] in (self.address, BROADCAST)
         self.wakeup = NEVER
         if not self.attentive:
-            self._frame = self._frame[:1]  # its own address within another's frame begins nothing
+            self._frame = self._frame[:1]  # its own address within another unit's frame does not begin a frame
         elif len(self._frame) == self._length(self._frame):
             frame, self._frame, self.attentive = self._frame, b"", False
             self._obey(frame, now)
@@ -137,7 +138,7 @@ class EmulatedModbus(Device):
 
     def take(self, frame: bytes, now: float) -> bool:
         start = now - len(frame) * self.tau
-        # a request that only silence ends is heard byte by byte
+        # A request that only silence ends is processed byte by byte.
         if (self._frame and start - self._heard_until <= self._pause) or len(frame) != self._length(frame):
             return False
         self._frame = b""
@@ -147,13 +148,13 @@ class EmulatedModbus(Device):
         return True
 
     def wake(self, now: float) -> None:
-        """End whatever was begun: the line has been silent."""
+        """End an incomplete frame: the line has been silent."""
         self._end_of_frame(now)
 
     def _end_of_frame(self, now: float) -> None:
         frame, self._frame = self._frame, b""
         self.attentive, self.wakeup = False, NEVER
-        # half a request is forgotten; a function that it lacks is exception 1, once the silence has shown its end
+        # An incomplete request is dropped. A missing function is refused after the silence that ends its frame.
         unknown = len(frame) >= SHORTEST and frame[0] == self.address and self._length(frame) is None
         if unknown and crc(frame[:-2]) == frame[-2:]:
             self._say(bytes((frame[1] | EXCEPTION, ILLEGAL_FUNCTION)), now)
@@ -163,9 +164,9 @@ class EmulatedModbus(Device):
         return max(PAUSE_CHARACTERS * self.tau, SHORTEST_PAUSE)
 
     def _length(self, frame: bytes) -> int | None:
-        """Return the length of the request that begins so.
+        """Return the length of the request that begins with `frame`.
 
-        It is 0 while it cannot be told, and None where only silence tells.
+        It is 0 if it is not known yet, and None if only silence shows it.
         """
         if len(frame) < 2:
             return 0
@@ -175,10 +176,10 @@ class EmulatedModbus(Device):
             return 8
         return 9 + frame[6] if len(frame) > 6 else 0
 
-    # Answering
+    # Replying
 
     def _obey(self, frame: bytes, now: float) -> None:
-        """Obey a whole request with a known function, to this unit or to all."""
+        """Execute a complete request with a known function, to this unit or to all."""
         if crc(frame[:-2]) != frame[-2:]:
             return
         function, first, count = struct.unpack(">BHH", frame[1:6])
@@ -215,7 +216,7 @@ class EmulatedModbus(Device):
         return words[place]
 
     def _write(self, function: int, first: int, count: int, data: bytes) -> None:
-        """Store what a write carries. Of a single write `count` is the value. Raises Illegal."""
+        """Store the values of a write. For a single write `count` is the value. Raises Illegal."""
         if function == WRITE_COIL:
             if count not in (0x0000, 0xFF00):
                 raise Illegal(ILLEGAL_VALUE)
@@ -250,9 +251,9 @@ class EmulatedModbus(Device):
         self.reply(body + crc(body), now)
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
-        """Return the reply as if another unit had said it."""
+        """Return the reply as if another unit had sent it."""
         if len(reply) < SHORTEST:
-            return reply  # a lone byte names no unit
+            return reply  # a single byte does not contain a unit
         other = chance.randrange(ALL.start, ALL.stop - 1)
         body = bytes((other + (other >= reply[0]),)) + reply[1:-2]
         if self.traceable is not None and reply[1] in (READ_HOLDING, READ_INPUTS):
@@ -261,7 +262,7 @@ class EmulatedModbus(Device):
 
 
 def words_of(value: float, form: str, swapped: str | None, item: str) -> tuple[int, ...]:
-    """Return the registers that hold a number, in the order of their addresses. Raises InvalidCommand."""
+    """Return the registers for a number, in the order of their addresses. Raises InvalidCommand."""
     try:
         data = struct.pack(f">{FORMS[form]}", value if form.startswith("float") else _whole(value))
     except (struct.error, OverflowError, ValueError):

@@ -33,7 +33,7 @@ FORM = (
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Describe what an ITEM names: a number in a table at an address, or a run of `count` coils or registers there."""
+    """The meaning of an ITEM: a number at an address of a table, or a run of `count` coils or registers there."""
 
     table: str
     first: int
@@ -42,7 +42,7 @@ class Place:
 
     @classmethod
     def parse(cls, item: str) -> Place:
-        """Return what an item names. Raises InvalidCommand for an item that does not exist."""
+        """Return the place of an item. Raises InvalidCommand for an item that does not exist."""
         table, _, rest = item_text(item).partition(":")
         address, *kind = rest.split(":")
         if table not in READS or not is_decimal(address):
@@ -66,7 +66,7 @@ class Place:
 
     @property
     def width(self) -> int:
-        """Addresses that one value takes."""
+        """Number of addresses of one value."""
         return 1 if self.is_bit else self.number.registers
 
     def read(self) -> ReadBits | ReadRegisters:
@@ -81,16 +81,16 @@ class Place:
         return raw[0] if self.is_bit else self.number.decode(raw)
 
     def reads(self, count: int, item: str) -> list[ReadBits | ReadRegisters]:
-        """Return what reads `count` values from here on, in as many exchanges as it takes. Raises InvalidCommand."""
+        """Return the commands that read `count` values from here on. Raises InvalidCommand for a run."""
         if self.count is not None:
-            raise InvalidCommand(f"{item} is a run already: read so many values from {self.table}:{self.first} on")
+            raise InvalidCommand(f"{item} is a run already: read {count} values from {self.table}:{self.first} on")
         kind = ReadBits if self.is_bit else ReadRegisters
-        most = kind.most - kind.most % self.width  # a number is never torn
+        most = kind.most - kind.most % self.width  # a number is never split: its words would be of two moments
         end = self.first + count * self.width
         return [kind(at, min(most, end - at), self.table) for at in range(self.first, end, most)]
 
     def decode_each(self, raw: Sequence[Any]) -> tuple[Any, ...]:
-        """Return the values of what `reads` has read."""
+        """Return the values from the results of the commands of `reads`."""
         if self.is_bit:
             return tuple(raw)
         return tuple(self.number.decode(raw[at : at + self.width]) for at in range(0, len(raw), self.width))
@@ -100,12 +100,12 @@ class Place:
         if self.count is not None and not isinstance(value, Iterable):
             raise InvalidCommand(f"{item} takes {self.count} values, not {value!r}")
         command, *further = self.write((value,) if self.count is None else tuple(value))
-        if further:  # the first of several alone would leave the rest as it was, and be confirmed
+        if further:  # the first command alone would be confirmed although the other values are not written
             raise InvalidCommand(f"{item} takes more than one exchange to write: use the handle's write")
         return command
 
     def write(self, values: Sequence[Any]) -> list[WriteCoils | WriteRegisters]:
-        """Return what writes the values here and behind, in as many exchanges as it takes. Raises InvalidCommand."""
+        """Return the commands that write the values from here on. Raises InvalidCommand."""
         if not values or (self.count is not None and len(values) != self.count):
             wanted = "a value" if self.count is None else f"{self.count} values"
             raise InvalidCommand(f"{self.table} {self.first} takes {wanted}, not {len(values)}")
@@ -115,17 +115,17 @@ class Place:
                 for i in range(0, len(values), MOST_BITS_WRITTEN)
             ]
         words = [word for value in values for word in self.number.encode(value)]
-        most = MOST_WRITTEN - MOST_WRITTEN % self.width  # a number is never torn
+        most = MOST_WRITTEN - MOST_WRITTEN % self.width  # a number is never split
         return [WriteRegisters(self.first + i, tuple(words[i : i + most])) for i in range(0, len(words), most)]
 
 
 def is_whole(item: str) -> bool:
-    """Return whether what an item names carries whole numbers alone."""
+    """Return True if the values of an item are whole numbers."""
     return not Place.parse(item).number.kind.startswith("float")
 
 
 def width_of(item: str) -> int:
-    """Return how many bits what an item names has; 0 for a run."""
+    """Return the number of bits of an item; 0 for a run."""
     place = Place.parse(item)
     if place.count is not None:
         return 0
@@ -140,15 +140,15 @@ class ModbusUnit(Handle):
         await press.write("holding:100", 215)
         inputs = await press.read("discrete:0:16")
 
-    An item is a table (`coil`, `discrete`, `holding`, `input`), an address, and how to take what is there: nothing for
-    a bit or an unsigned register, a count for a run of them, or a kind of number (`int16 uint16 int32 uint32 float32
-    float64`), whose words come most significant first, or last with `:swapped`.
+    An item is a table (`coil`, `discrete`, `holding`, `input`), an address, and an optional form. Without a form it is
+    a bit or an unsigned register. A count means a run of them. A kind of number (`int16 uint16 int32 uint32 float32
+    float64`) has its most significant word first, or last with `:swapped`.
     """
 
     profile: ClassVar[Profile] = PROFILE
 
     def point(self, item: str) -> Point[Any]:
-        """Return the point that an item names. That of a run takes as many values as it has. Inputs are read-only.
+        """Return the point of an item. The point of a run has a tuple of values. Inputs are read-only.
 
         A point is written in one exchange: a run of more than 123 registers or 1968 coils only by `write`.
         """
@@ -170,10 +170,10 @@ class ModbusUnit(Handle):
         return ()
 
     async def read(self, item: str, count: int | None = None, **options: Unpack[ReadOptions]) -> Any:
-        """Return the value of an item; with `count`, a tuple of so many values from there on.
+        """Return the value of an item; with `count`, a tuple of this many values from there on.
 
-        More than 125 registers or 2000 bits take several exchanges: their values are not all of one moment, but no
-        number is torn. Raises Refused, with the exception's name, for what the unit does not have.
+        More than 125 registers or 2000 bits take several exchanges, so their values are not all of one moment. No
+        number is split. Raises Refused, with the exception's name, if the unit does not have the addresses.
         """
         if count is None:
             return await self.point(item).read(**options)
@@ -182,10 +182,10 @@ class ModbusUnit(Handle):
         return place.decode_each([one for part in raw for one in part])
 
     async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
-        """Write values to an item and what lies behind it, acknowledged; at address 0 to all units: none answers.
+        """Write values from an item on, acknowledged. At address 0 all units are written, and none replies.
 
-        More than 123 registers or 1968 coils go in several exchanges: if one fails, those before it are stored.
-        `verify` reads back, and raises VerifyFailed where a value differs. `idempotent` allows a retry after an unknown
+        More than 123 registers or 1968 coils take several exchanges: if one fails, those before it are stored.
+        `verify` reads back, and raises VerifyFailed if a value differs. `idempotent` allows a retry after an unknown
         outcome. Raises InvalidCommand, before anything is sent, for a value that does not fit.
         """
         commands = self._writes(item, values, options)
@@ -196,12 +196,12 @@ class ModbusUnit(Handle):
             await self._verify(requests, command)
 
     def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-        """Prepare to write consecutive places, in as few exchanges as they fit."""
+        """Prepare to write consecutive addresses, in as few exchanges as possible."""
         self._writes(item, values, options)
         return [lambda: self.write(item, *values, **options)]
 
     def _run_items(self, item: str, count: int) -> tuple[str, ...]:
-        """Return what each value from an item on is called, each at its own address."""
+        """Return the item of each value from an item on, each with its own address."""
         place = Place.parse(item)
         kind = "" if place.count is not None else item.partition(":")[2].partition(":")[2]
         suffix = f":{kind}" if kind else ""

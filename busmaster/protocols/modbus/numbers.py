@@ -11,12 +11,12 @@ from busmaster.contract.arguments import whole_number
 from busmaster.errors import InvalidCommand
 
 FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
-"""Each kind of number, as `struct` has it."""
+"""The kinds of numbers, with their formats for `struct`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """Describe how a number stands in registers: most significant word first, or last if `swapped`.
+    """The form of a number in registers: most significant word first, or last if `swapped`.
 
     Within a word the most significant byte is always first. Raises InvalidCommand for a kind that does not exist.
     """
@@ -30,18 +30,18 @@ class Number:
 
     @property
     def registers(self) -> int:
-        """How many registers it takes."""
+        """Number of registers of one number."""
         return struct.calcsize(f">{FORMS[self.kind]}") // 2
 
     def decode(self, words: Sequence[int]) -> int | float:
-        """Return the number that `words`, as many as it takes, hold."""
+        """Return the number in these words. There must be `registers` of them."""
         if self.swapped:
             words = words[::-1]
         number: int | float = struct.unpack(f">{FORMS[self.kind]}", struct.pack(f">{len(words)}H", *words))[0]
         return number
 
     def encode(self, value: float) -> tuple[int, ...]:
-        """Return the words that hold a value. Raises InvalidCommand for one that does not fit."""
+        """Return the words for a value. Raises InvalidCommand for one that does not fit."""
         if self.kind.startswith("float"):
             data = self._float(value)
         else:
