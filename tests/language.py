@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 CHECKED = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs", "busmaster"]
-CLEAN = """busmaster/arbiter busmaster/bus busmaster/transport README.md CONTRIBUTING.md SECURITY.md
+CLEAN = """busmaster/arbiter busmaster/bus busmaster/protocols busmaster/transport README.md CONTRIBUTING.md SECURITY.md
 CODE_OF_CONDUCT.md benchmarks/README.md docs/README.md docs/adding-*.md docs/architecture.md docs/explanation
 docs/howto docs/interfaces.md docs/monitoring.md docs/p*.md docs/protocols docs/questions.md docs/service.md
 docs/tutorial.md docs/upgrading.md"""

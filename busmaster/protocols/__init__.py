@@ -1,5 +1,5 @@
-"""The protocols, a folder each: `PROTOCOL` in it says all that the rest of the package knows of it.
+"""The protocols, a folder each. Its `PROTOCOL` describes it to the rest of the package.
 
-In a folder are its codec (commands and their exchanges), its handles, its emulated devices, its reader of captures,
-and its maps as data. Nothing outside names a protocol: see `busmaster.registry`.
+A folder contains the codec (commands and their exchanges), the handles, the emulated devices, the reader for captures,
+and the maps as data. No code outside names a protocol: see `busmaster.registry`.
 """

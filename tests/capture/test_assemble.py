@@ -160,7 +160,7 @@ def test_without_a_verdict_the_frames_are_judged() -> None:
         (REFUSED, ""),
         (GARBLED, "bad checksum 38, not 37"),
         (GARBLED, "cut short after 3 bytes"),
-        (GARBLED, "wrong element: 1 was asked"),
+        (GARBLED, "wrong element: 1 was requested"),
         (NO_REPLY, "no reply"),
     ]
 

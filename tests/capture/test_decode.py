@@ -200,8 +200,8 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
     )
     assert said(frames)[1::2] == [
         "node 2 1 = 123.456 [bad checksum 2C, not 2B]",
-        "node 2 2 = 5 [wrong element: 1 was asked]",
-        "node 2 ACK [an ACK answers no read]",
+        "node 2 2 = 5 [wrong element: 1 was requested]",
+        "node 2 ACK [an ACK is not a reply to a read]",
     ]
     assert said(frames)[-1] == "node ACK [unexpected]"
 
@@ -213,7 +213,7 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
         ("hcp", "04 31 31 02 41 31 05", "host 1 read 'A1'"),
         ("hcp2", "07 30 61 02 30 31 05 54", "host read 1 [no node address: '0a']"),
         ("hcp2", "07 30 32 02 30 61 05 54", "host 2 read '0a'"),
-        ("hcp2", "07 30 31 02 30 31 35 03 34 02 30 31 35 03 37", "node 1 1 = 5 [a value answers no write]"),
+        ("hcp2", "07 30 31 02 30 31 35 03 34 02 30 31 35 03 37", "node 1 1 = 5 [a value is not a reply to a write]"),
         ("hcp2", "07 30 31 02 30 31 35 03 34 15 15", "node NAK [unexpected]"),
         ("mentor", "04 31 32 33 34 30 31 31 37 05", "host read 01.17 [no drive address: '1234']"),
         ("mentor", "04 31 31 32 32 30 31 41 37 05", "host 12 read '01A7'"),
@@ -235,13 +235,13 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
         (
             "msc",
             "02 02 00 08 00 00 44 52 45 41 44 2C 07 D8 02 75 06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",
-            "node 1 2008 = 1234 [wrong answer: DREAD of unit 2 was asked]",
+            "node 1 2008 = 1234 [wrong reply: DREAD of unit 2 was requested]",
         ),
         ("msc", "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", "node 1 ? = 1234 [unexpected]"),
         ("msc", "06", "node ACK [unexpected]"),
-        ("dc104", "02 AA 01 AB 06", "node ACK [an ACK answers no read]"),
-        ("dc104", "02 AA 01 AB 02 02 00 00 02", "node 2 = 0 [wrong parameter: 1 was asked]"),
-        ("dc104", "02 55 01 04 D2 2C 02 01 04 D2 D7", "node 1 = 1234 [a value answers no write]"),
+        ("dc104", "02 AA 01 AB 06", "node ACK [an ACK is not a reply to a read]"),
+        ("dc104", "02 AA 01 AB 02 02 00 00 02", "node 2 = 0 [wrong parameter: 1 was requested]"),
+        ("dc104", "02 55 01 04 D2 2C 02 01 04 D2 D7", "node 1 = 1234 [a value is not a reply to a write]"),
         ("dc104", "02 AA 01 AC", "host read 1 [bad checksum AC, not AB]"),
     ],
 )

@@ -230,7 +230,7 @@ async def test_values_that_do_not_tell_the_step_leave_it_unknown(step: int, valu
     line = Controller(step=step)
     line.data = values
     press = MscController(line, 3)
-    with pytest.raises(InvalidCommand, match="do not tell"):
+    with pytest.raises(InvalidCommand, match="do not show the address step"):
         await press.find_address_step(2000)
     assert press.address_step is None
 

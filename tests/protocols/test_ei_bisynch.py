@@ -233,7 +233,7 @@ def test_every_tag_has_a_mnemonic_of_its_own() -> None:
         (0x07C8, "invalid format"),
         (0x08C8, "out of range"),
         (8, ">0008: the value is out of range"),
-        (0x1234, ">1234: a code that the documents do not name"),
+        (0x1234, ">1234: a code that the documents do not define"),
     ],
 )
 def test_the_codes_of_the_last_error_are_put_into_words(code: int, text: str) -> None:

@@ -100,7 +100,7 @@ def test_an_ack_after_two_naks_is_as_good_as_at_once() -> None:
 def test_a_byte_behind_a_nak_is_never_taken_for_the_ack_of_the_packet_sent_again() -> None:
     exchange = writing()
     assert exchange.feed(NAK + ACK) is MORE
-    with pytest.raises(FrameError, match="2 bytes that are no packet"):
+    with pytest.raises(FrameError, match="2 bytes that are not a packet"):
         exchange.expired(True)
 
 
@@ -188,7 +188,7 @@ def test_a_packet_of_another_length_than_asked_for_is_another_format_if_none_fol
     assert says(exchange.feed(packet(1, b"DREAD," + bytes(6)))) == ACK
     with pytest.raises(FrameError) as error:
         exchange.expired(False)
-    assert error.value.what == "20 bytes came, right in their check but of another format: the packet asked for has 18"
+    assert error.value.what == "20 bytes came, right in their check but of another format: the requested packet has 18"
     assert (error.value.hint, error.value.send) == (OTHER_FORMAT, ACK)
 
 
@@ -249,7 +249,7 @@ def test_a_stale_packet_said_twice_is_no_reads_ack_and_the_reply_is_not_asked_fo
     assert says(exchange.feed(TWICE)) == ACK
     assert says(exchange.feed(TWICE[1:2])) == b""
     assert exchange.feed(TWICE[2:]) is MORE
-    with pytest.raises(FrameError, match="no packet"):
+    with pytest.raises(FrameError, match="that are not a packet"):
         exchange.expired(True)
 
 
@@ -257,7 +257,7 @@ def test_six_stale_packets_are_dropped_and_the_seventh_ends_the_attempt() -> Non
     for exchange in (reading(), acked()):
         for _ in range(6):
             assert says(exchange.feed(STALE)) == ACK
-        with pytest.raises(FrameError, match="answers something else") as error:
+        with pytest.raises(FrameError, match="a packet for another request") as error:
             exchange.feed(STALE)
         assert error.value.send == ACK
 
@@ -281,7 +281,7 @@ def test_a_damaged_packet_before_the_ack_ends_the_attempt_when_the_line_pauses()
     """No byte in the middle of it may be taken for the ACK."""
     exchange = writing()
     assert exchange.feed(BAD + ACK) is MORE
-    with pytest.raises(FrameError, match="no packet") as error:
+    with pytest.raises(FrameError, match="that are not a packet") as error:
         exchange.expired(True)
     assert error.value.send == ACK
 
@@ -289,7 +289,7 @@ def test_a_damaged_packet_before_the_ack_ends_the_attempt_when_the_line_pauses()
 def test_bytes_that_are_no_packet_are_told_by_their_number_and_the_first_of_them() -> None:
     exchange = reading()
     exchange.feed(b"\x41\x42\x43")
-    with pytest.raises(FrameError, match="3 bytes that are no packet, the first of them 41"):
+    with pytest.raises(FrameError, match="3 bytes that are not a packet, the first of them 41"):
         exchange.expired(True)
 
 
@@ -431,7 +431,7 @@ def test_what_never_becomes_a_packet_is_passed_over_a_few_times_and_no_more() ->
         exchange.feed(b"\x55")
         assert says(exchange.expired(True)) == b""
     exchange.feed(b"\x55")
-    with pytest.raises(FrameError, match="no packet"):
+    with pytest.raises(FrameError, match="that are not a packet"):
         exchange.expired(True)
 
 

@@ -94,7 +94,7 @@ def test_many_bad_lines_are_counted_and_the_first_are_named() -> None:
 
 @pytest.mark.parametrize("text", ["", "a 2008", "Data Table", "Data Table\nSYMBOL ADDRESS\n---\n"])
 def test_a_listing_without_a_table_is_refused(text: str) -> None:
-    with pytest.raises(InvalidCommand, match="there is no data table in it, or an empty one"):
+    with pytest.raises(InvalidCommand, match="it has no data table, or an empty one"):
         read_listing(text)
 
 

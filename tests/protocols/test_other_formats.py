@@ -68,7 +68,11 @@ OTHERS = [
         id="dc104, long",
     ),
     pytest.param(
-        msc.PROFILE, msc.DataRead(2008), b"\x06" + packet(1, b"DREAD," + bytes(6)), "asked for has 18", id="msc, long"
+        msc.PROFILE,
+        msc.DataRead(2008),
+        b"\x06" + packet(1, b"DREAD," + bytes(6)),
+        "the requested packet has 18",
+        id="msc, long",
     ),
     pytest.param(
         modbus.PROFILE,

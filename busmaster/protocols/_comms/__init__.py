@@ -1,4 +1,4 @@
-"""What HCP and HCP2 share: numbered elements of a comms array, and the controllers that have one."""
+"""The common part of HCP and HCP2: numbered elements of a comms array, and the controllers that have one."""
 
 from __future__ import annotations
 
@@ -26,4 +26,4 @@ EMULATED = (
     Option("refuse_reserved", "flag", about="It refuses to read elements that are reserved; else they read 0."),
     Option("single_precision", "flag", about="It keeps values with 24 bits, as a real one does."),
 )
-"""What can be said of an emulated controller."""
+"""Options of an emulated controller."""

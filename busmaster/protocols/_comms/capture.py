@@ -1,4 +1,4 @@
-"""HCP and HCP2 as a listener hears them: what the two share."""
+"""Reads captures of HCP and HCP2: the common part."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from busmaster.wire.checks import xor
 
 
 class CommsDialect:
-    """What HCP and HCP2 share: a reset byte, the node as two characters, the element as two characters."""
+    """The frames of both: a reset byte, the node as two characters, the element as two characters."""
 
     starts: bytes
     reset: ClassVar[int]
@@ -38,15 +38,15 @@ class CommsDialect:
         self._asked: Frame | None = None
 
     def node(self, field: bytes) -> int | None:
-        """Return the node that the field of a request names, or None if it names none."""
+        """Return the node in the field of a request, or None if it is not a node."""
         raise NotImplementedError
 
     def element(self, field: bytes) -> str:
-        """Return the element's decimal number, or the field as it stands, quoted, if it is none."""
+        """Return the element's decimal number, or the field itself, quoted, if it is not an element."""
         raise NotImplementedError
 
     def request_fault(self, raw: bytes) -> str:
-        """Return what is wrong with a whole request, or an empty text."""
+        """Return the fault of a complete request, or an empty text."""
         raise NotImplementedError
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
@@ -96,13 +96,13 @@ class CommsDialect:
         fault = "" if asked else UNEXPECTED
         if raw[0] != STX:
             if asked and asked.kind is Kind.READ and raw[0] == ACK:
-                fault = "an ACK answers no read"
+                fault = "an ACK is not a reply to a read"
             return Frame(ANSWERS[raw[0]], Direction.NODE, raw, node, fault=fault, answers=asked is not None)
         item, value = self.element(raw[1:3]), characters(raw[3:-2])
         if asked and asked.kind is Kind.WRITE:
-            fault = "a value answers no write"
+            fault = "a value is not a reply to a write"
         elif asked and asked.item != item:
-            fault = f"wrong element: {asked.item} was asked"
+            fault = f"wrong element: {asked.item} was requested"
         fault = checked(raw, 1, xor) or fault
         return Frame(Kind.VALUE, Direction.NODE, raw, node, "", item, value, fault, asked is not None)
 

@@ -1,6 +1,6 @@
-"""What HCP and HCP2 share: numbered elements of the comms array, read one at a time and written one or many.
+"""The common part of HCP and HCP2: numbered elements of the comms array, read one at a time and written one or many.
 
-The two differ in how they address a node, count elements and check a telegram: see `hcp` and `hcp2`.
+They differ in the addresses of nodes, the numbers of elements and the checksums: see `hcp` and `hcp2`.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, teleg
 LINE = LineSettings(57600)
 OTHER_LINES = LINE.at(9600, 19200, 38400, 115200)
 CHECKED = (1, 2, 3, 4, 5, 6, 7, 99)
-"""Elements that every controller has, the cheap reads that tell one answer from another (R15)."""
-# read to the letter, the 50 ms and 100 ms more make the maximum reply delay
+"""Elements that every controller has: cheap reads whose replies differ (R15)."""
+# Taken literally, the 50 ms and the further 100 ms are the maximum reply delay.
 TIMINGS = Timings.uniform(ReplyTiming(late_after=0.05, window=0.1, max_reply_delay=0.15, inter_byte_timeout=0.02))
 """Both documents: "normally within 50ms", but other work "could delay the reply by 100mS"."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReadElement:
-    """Read one element. Raises InvalidCommand for one that the protocol cannot name."""
+    """Read one element. Raises InvalidCommand for a number that the protocol does not have."""
 
     element: int
 
@@ -55,7 +55,7 @@ class ReadElement:
 
     @staticmethod
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
-        """Return the request, and what its reply begins with: STX, and the element as it is echoed."""
+        """Return the request, and the beginning of its reply: STX and the echoed element."""
         raise NotImplementedError
 
     def open(self, address: int, timings: Timings) -> Reading:
@@ -67,9 +67,9 @@ class ReadElement:
 class WriteElements:
     """Write `values` to `element` and those after it, in one telegram.
 
-    Writing Comms 1 to 5 starts a Mint event, even of an equal value: `idempotent` is for the caller to say. Raises
-    InvalidCommand for no value, for elements that do not exist, and for values that cannot be sent or do not fit into
-    60 characters.
+    Writing Comms 1 to 5 starts a Mint event, even if the value is the same. So the caller decides whether it is
+    `idempotent`. Raises InvalidCommand if there is no value, for elements that do not exist, and for values that cannot
+    be sent or do not fit into 60 characters.
     """
 
     element: int
@@ -96,12 +96,12 @@ class WriteElements:
         return f"write {which} = {self.text}"
 
     def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
-        """Return what goes over the line: a value is rounded to what its text says."""
+        """Return the values as they are sent: rounded to the digits of the text."""
         return dict(enumerate(map(float, self.text.split(",")), self.element))
 
     @staticmethod
     def encode(address: int, element: int, text: bytes) -> bytes:
-        """Return the request that writes the numbers of a text."""
+        """Return the request that writes the numbers in this text."""
         raise NotImplementedError
 
     def open(self, address: int, timings: Timings) -> Writing | WritingMany:
@@ -127,12 +127,13 @@ class Writing(AcknowledgeReader):
 
 
 class WritingMany(AcknowledgeReader):
-    """One attempt to write several elements: a NAK is final, for values before the refused one may be stored."""
+    """One attempt to write several elements. A NAK is final, because the values before the refused one may be
+    stored."""
 
     __slots__ = ()
 
     def reject(self, heard: bytes) -> NoReturn:
-        """Raise the failure that the heard byte means: for a NAK Refused, unconfirmed."""
+        """Raise the failure for the received byte. A NAK is Refused and is not confirmed by a second request."""
         if heard[0] == NAK[0]:
             raise Refused(
                 "refused; the values before the one refused may be stored",
@@ -143,7 +144,7 @@ class WritingMany(AcknowledgeReader):
 
 
 def telegrams(values: Sequence[float]) -> Iterator[tuple[int, tuple[float, ...]]]:
-    """Cut a list so that each part fits one telegram: (offset of its first value, its values)."""
+    """Split a list so that each part fits into one telegram: (offset of its first value, its values)."""
     start = used = 0
     for index, value in enumerate(values):
         size = len(format_number(value))
@@ -156,5 +157,5 @@ def telegrams(values: Sequence[float]) -> Iterator[tuple[int, tuple[float, ...]]
 
 
 def is_read_back(written: float, read: float) -> bool:
-    """Return whether `read` is what a controller of single-precision numbers shows of `written`, at 4 decimals."""
+    """Return True if a controller with single-precision numbers returns `read` for `written`, at 4 decimals."""
     return c_float(float(format_number(written))).value == c_float(round(read, 4)).value

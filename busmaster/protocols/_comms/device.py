@@ -1,6 +1,6 @@
 """The node's side of Host Comms Protocol (AN00110) and Host Comms Protocol 2 (AN00129): frames, numbers, ACK and NAK.
 
-What the elements mean is the business of the kinds of device: a Mint controller, a MicroFlex drive.
+The kinds of device define the meaning of the elements: a Mint controller, a MicroFlex drive.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ FIRST_PRINTABLE = 0x20
 LONGEST_WRITE = 60
 LONGEST_REPLY_TEXT = 20
 GREATEST = 1e9
-"""What a value may be that is there from the start."""
+"""Largest magnitude of an initial value."""
 DECIMALS = Decimal("0.0001")
 ROUNDING = Context(prec=LONGEST_WRITE + 20, rounding=ROUND_HALF_UP)
 ELEMENT_AT = 4
-"""Where the element's two characters stand: after the reset byte, two node characters and STX."""
+"""Position of the element's two characters: after the reset byte, two node characters and STX."""
 DATA_AT = 6
 KEPT = 80
-"""Bytes of a frame that are kept. A data field that is longer is only counted, and refused at its end."""
-# a space behind digits ends a value, and what follows up to the next comma is skipped
+"""Stored bytes of a frame. A longer data field is only counted, and refused at its end."""
+# A space behind digits ends a value, and the characters up to the next comma are skipped.
 NUMBER = re.compile(rb" *([+-]?(?:\d+\.?\d*|\.\d+))(?: .*)?")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Framing:
-    """What tells the two protocols apart."""
+    """The differences between the two protocols."""
 
     name: str
     reset: int
@@ -45,17 +45,17 @@ class Framing:
     digits: bytes
     last_element: int
     check_from: int
-    """Where in a request the bytes begin that its checksum covers."""
+    """Position of the first byte of a request that its checksum covers."""
     read_checked: bool
     """Whether a read carries a checksum."""
 
     def prefix(self, address: int) -> bytes:
-        """Return what a request to that node begins with."""
+        """Return the first bytes of a request to this node."""
         node = f"{address:X}" * 2 if self.base == 10 else f"{address:02X}"
         return bytes((self.reset,)) + node.encode()
 
     def element(self, number: int) -> bytes:
-        """Return the two characters that name an element."""
+        """Return the two characters of an element number."""
         return (f"{number:02d}" if self.base == 10 else f"{number:02X}").encode()
 
 
@@ -64,17 +64,17 @@ HCP2 = Framing("hcp2", BEL, 16, b"0123456789ABCDEF", 255, 1, True)
 
 
 def sendable(value: float, element: int) -> float:
-    """Return a value that a reply can carry. Raises InvalidCommand for any other."""
+    """Return the value. Raises InvalidCommand if a reply cannot carry it."""
     if not abs(value) <= GREATEST:
         raise InvalidCommand(f"element {element} holds {-GREATEST:g} to {GREATEST:g}, not {value:g}")
     return value
 
 
 class HostCommsDevice(Device):
-    """A node of either protocol. A kind of device says what its elements hold: `read_element`, `write_element`.
+    """A node of either protocol. Each kind of device implements its elements: `read_element`, `write_element`.
 
     `fixed_decimals` sends "12.5000" instead of "12.5". `all_or_nothing` refuses a multi-value write before it stores
-    any of it. With a `traceable` every element is the traceable's.
+    any of it. With a `traceable`, it provides every element.
     """
 
     def __init__(
@@ -101,17 +101,17 @@ class HostCommsDevice(Device):
 
     @abstractmethod
     def read_element(self, element: int, now: float) -> float | None:
-        """Return its value, or None to refuse. `element` is one that the protocol can name."""
+        """Return its value, or None to refuse. The protocol can address `element`."""
 
     @abstractmethod
     def write_element(self, element: int, value: float, now: float) -> bool:
-        """Take the value and return True, or refuse it with False."""
+        """Store the value and return True, or return False to refuse it."""
 
     def writable(self, element: int) -> bool:
-        """Return whether `write_element` would take a value for it now. Only `all_or_nothing` asks."""
+        """Return True if `write_element` would store a value for it now. Used only with `all_or_nothing`."""
         return True
 
-    # Hearing
+    # Receiving
 
     def take(self, frame: bytes, now: float) -> bool:
         if self.attentive:
@@ -136,7 +136,7 @@ class HostCommsDevice(Device):
 
     def hear_byte(self, byte: int, now: float) -> None:
         frame = self._frame
-        if self._check_due:  # whatever stands here is the check, the reset byte too
+        if self._check_due:  # this byte is the checksum, even if it is the reset byte
             frame.append(byte)
             self._handle(bytes(frame), self._data_length, now)
             self._ground()
@@ -148,7 +148,7 @@ class HostCommsDevice(Device):
             self._ground()
 
     def _goes_on(self, byte: int, now: float) -> bool:
-        """Return whether `byte` may come next, and more after it."""
+        """Return True if `byte` continues the frame, and more bytes must follow."""
         frame = self._frame
         position = len(frame)
         if position < ELEMENT_AT - 1:
@@ -190,16 +190,16 @@ class HostCommsDevice(Device):
         super().restart(now)
         self._ground()
 
-    # Answering
+    # Replying
 
     def _handle(self, frame: bytes, data_length: int, now: float) -> None:
-        """Obey a whole request to this node, up to and with its checksum."""
+        """Execute a complete request to this node, checksum included."""
         framing = self.framing
         reads = frame[DATA_AT] == ENQ
         name = frame[ELEMENT_AT:DATA_AT]
         checked = not reads or framing.read_checked
         right = not checked or xor(frame[framing.check_from : -1]) == frame[-1]
-        # a lower-case digit in an element is refused like element 00; in a node it meets silence
+        # A lower-case digit in an element is refused like element 00. In a node address it has no reply.
         element = int(name, framing.base) if not name.strip(framing.digits) else 0
         if not right or not 1 <= element <= framing.last_element:
             self.reply(NAK, now)
@@ -228,7 +228,7 @@ class HostCommsDevice(Device):
         if self.all_or_nothing and (None in values or not all(map(self._may_write, elements))):
             return False
         for number, value in zip(elements, values, strict=True):
-            if value is None or number > self.framing.last_element:  # those before it stay stored, says HCP2's note
+            if value is None or number > self.framing.last_element:  # the values before it stay stored (AN00129)
                 return False
             if self.traceable is not None:
                 self.traceable.write(number, value)
@@ -250,14 +250,14 @@ class HostCommsDevice(Device):
 
 @lru_cache(maxsize=4096)
 def telegram(framing: Framing, element: int, text: bytes) -> bytes:
-    """Return a reply to a read: STX, element, data, ETX, and the exclusive-or of all after STX."""
+    """Return a reply to a read: STX, element, data, ETX, and the exclusive-or of all bytes after STX."""
     covered = framing.element(element) + text + b"\x03"
     return b"\x02" + covered + bytes((xor(covered),))
 
 
 @lru_cache(maxsize=4096)
 def numbers(data: bytes) -> tuple[float | None, ...]:
-    """Return the values of a data field, to 4 decimals, half up on the fifth. A malformed one ends them as None."""
+    """Return the values of a data field, rounded half up to 4 decimals. A malformed value ends the list as None."""
     values: list[float | None] = []
     for part in data.split(b","):
         match = NUMBER.fullmatch(part)
@@ -270,7 +270,7 @@ def numbers(data: bytes) -> tuple[float | None, ...]:
 
 @lru_cache(maxsize=4096)
 def number_text(value: float, fixed_decimals: bool = False) -> bytes:
-    """Return the text of a value: at most 4 decimals, half up on the fifth, as few as it takes; never "-0"."""
+    """Return the text of a value: rounded half up to 4 decimals, without trailing zeros; never "-0"."""
     if fixed_decimals:
         return f"{_rounded(value) + 0:.4f}".encode()
     whole = int(value)

@@ -1,4 +1,4 @@
-"""Named elements of a comms array: what the number of each means, and what the documents say of it."""
+"""Named elements of a comms array: the meaning of their numbers, and their description in the documents."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ STARTS_EVENT = range(1, 6)
 
 @dataclass(frozen=True, slots=True)
 class Element(Generic[T_co]):
-    """Describe one named element: what its number means (`decode`), in which unit, and whether the map says R/W.
+    """One named element: the meaning of its number (`decode`), its unit, and whether it is R/W in the map.
 
-    `kept` is why a load of parameters never writes it. `keyword` is the Mint keyword that it stands for. A writable
-    element is a level, such as outputs or a reference: writing it again changes nothing.
+    `kept`: why a load of parameters never writes it. `keyword`: its Mint keyword. A writable element is a level, such
+    as outputs or a reference: writing it again changes nothing.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Element(Generic[T_co]):
 
     @property
     def item(self) -> Item:
-        """What the document says of it, as lists show it."""
+        """Its description in the document, for lists."""
         access: Access = "read/write" if self.writable else "read"
         return Item(self.name, str(self.number), self.meaning, self.unit, access, self.keyword, self.bits)
 
@@ -44,11 +44,11 @@ COMMS = (
     Item("1-5", "1-5", "the program's own; a write starts Event comms1 to comms5", "", "read/write", "COMMS"),
     Item("6-99", "6-99", "the program's own", "", "read/write", "COMMS"),
 )
-"""The elements that HCP and HCP2 have in common: what each means is for the Mint program in the controller to say."""
+"""The elements that HCP and HCP2 have in common. The Mint program in the controller defines their meaning."""
 
 
 def whole(value: float) -> int:
-    """Return a count or a code, which travels as a decimal number."""
+    """Return a count or a code, which is sent as a decimal number."""
     return round(value)
 
 

@@ -1,4 +1,4 @@
-"""What the handles of a comms array share (HCP, HCP2, MicroFlex): elements by number or name, written and verified."""
+"""The common base of the handles of a comms array (HCP, HCP2, MicroFlex): elements by number or name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from busmaster.protocols._comms.elements import STARTS_EVENT, Element
 T = TypeVar("T")
 
 LAST_OF_PROGRAM = 99
-"""The elements up to it are the Mint program's own."""
+"""The elements up to this number belong to the Mint program."""
 COMMAND_ELEMENT = 1
 """The element of the documents' handshake that takes the command. The elements after it have the data."""
 LOOK_AGAIN = 0.02
@@ -32,15 +32,15 @@ LONGEST_HANDOVER = 2.0
 
 
 class CommsHandle(Handle):
-    """A handle of a node with a comms array. Each protocol says how an element is read and written, and its names."""
+    """A handle of a node with a comms array. Each protocol defines the commands and the names of the elements."""
 
     _read_command: ClassVar[type[ReadElement]]
     _write_command: ClassVar[type[WriteElements]]
     elements: ClassVar[Mapping[str, Element[object]]] = {}
     _definite: ClassVar[bool] = False
-    """Whether every node has the map as it is: what it calls read-only is then refused by number, too."""
+    """True if every node has exactly this map: its read-only elements are then rejected by number, too."""
     _form: ClassVar[str]
-    """What an item looks like, for the message to someone who mistyped it."""
+    """The valid form of an item, for the message after a wrong one."""
 
     @classmethod
     def items(cls) -> tuple[str, ...]:
@@ -59,7 +59,7 @@ class CommsHandle(Handle):
     def element(self, number: int) -> Point[float]:
         """Return the point of an element number.
 
-        It is read and written as it is, for the node to refuse unless the map is definite.
+        It is read and written without a check, unless the map is definite: the node refuses missing elements.
         """
 
         def encode(value: float) -> Command[None]:
@@ -69,10 +69,10 @@ class CommsHandle(Handle):
         return Point(self.node, str(number), self._read_command(number), encode=None if read_only else encode)
 
     def named(self, element: Element[T]) -> Point[T]:
-        """Return the point of a named element: decoded, with its unit, and read-only if the map says so."""
+        """Return the point of a named element: decoded, with its unit, and read-only if it is so in the map."""
 
         def encode(value: Any) -> Command[None]:
-            # what a map names is a level, which may be written twice (R7); only Comms 1 to 5 start events
+            # Named elements are levels, which may be written twice (R7). Only Comms 1 to 5 start events.
             return self._write_command(element.number, (value,), idempotent=True)
 
         return Point(
@@ -93,8 +93,9 @@ class CommsHandle(Handle):
     async def read(
         self, item: int | str, count: int | None = None, **options: Unpack[ReadOptions]
     ) -> float | tuple[float, ...]:
-        """Return the number that an element holds; with `count`, those of so many elements from there on, read one by
-        one. Raises Refused for an element that the node does not have.
+        """Return the number in an element; with `count`, a tuple of this many from there on, read one by one.
+
+        Raises Refused for an element that the node does not have.
         """
         number = item if isinstance(item, int) else self._lookup(item).number
         if count is None:
@@ -105,10 +106,10 @@ class CommsHandle(Handle):
     async def write(self, item: int | str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write values to an element and those after it, acknowledged.
 
-        A list that does not fit one telegram of 60 characters is sent in several; if one of them fails, those before
-        it are stored. `verify` reads every element back and compares at single precision and 4 decimals: it raises
-        VerifyFailed for the first that differs. `idempotent` allows a retry after an unknown outcome: not for
-        elements whose writing starts a Mint event (Comms 1 to 5). `start_within` is for each telegram.
+        A list that does not fit into one telegram of 60 characters is sent in several; if one of them fails, the values
+        before it are stored. `verify` reads every element back, compares at single precision and 4 decimals, and raises
+        VerifyFailed for the first difference. `idempotent` allows a retry after an unknown outcome; do not use it for
+        elements that start a Mint event (Comms 1 to 5). `start_within` applies to each telegram.
 
         Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
         """
@@ -120,11 +121,10 @@ class CommsHandle(Handle):
             await self._verify(requests, number, value)
 
     def _writes(self, element: int | str, values: Sequence[float], *, stop: bool | None = None) -> list[WriteElements]:
-        """Return what `write` sends.
+        """Return the commands that `write` sends.
 
-        Raises InvalidCommand for a value that cannot be sent, or is beyond a limit, by which no `stop` is held; and
-        where the map has names, for a name that it calls read-only, or that another value of the list would go to; for
-        its number where it is definite.
+        Raises InvalidCommand for a value that cannot be sent or violates a limit; a `stop` is not limited. Also for a
+        read-only name, or a list that reaches one. If the map is definite, this applies to numbers too.
         """
         number = element if isinstance(element, int) else self._lookup(element).number
         if self._definite or not isinstance(element, int):
@@ -138,13 +138,13 @@ class CommsHandle(Handle):
         return commands
 
     def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-        """Prepare to write consecutive elements, in as many telegrams as it takes."""
+        """Return the write of consecutive elements, in as many telegrams as necessary."""
         element = int(item) if is_decimal(item) else item
         self._writes(element, values, stop=options.get("safe"))
         return [lambda: self.write(element, *values, **options)]
 
     def _listed(self) -> Iterable[Parameter]:
-        """Return the program's own elements, if the map has them, then those that the map names."""
+        """Return the elements of the Mint program, if the map has them, then the named elements."""
         for number in () if self._definite else range(1, LAST_OF_PROGRAM + 1):
             kept = "a write starts an event of the Mint program" if number in STARTS_EVENT else ""
             yield Parameter(item=str(number), kept=kept)
@@ -216,7 +216,7 @@ class MintHandle(CommsHandle):
         """Return the write that starts a command. Raises InvalidCommand for one that cannot be sent, or its data."""
         start = self._write_command(element, (command,))
         if float(start.text) == 0:
-            raise InvalidCommand(f"{self.node.label}: 0 is no command: the program reports with it that one is done")
+            raise InvalidCommand(f"{self.node.label}: 0 is not a command: with it the program reports that a command is done")
         whole_number(start.element + len(data), 1, LAST_OF_PROGRAM, f"{self.node.label}: the last element of a command")
         if data:
             self._writes(start.element + 1, data)
@@ -311,7 +311,7 @@ class MintHandle(CommsHandle):
 
 
 class HasElements(typing.Protocol):
-    """Whatever makes a point of a named element."""
+    """An object that makes points of named elements."""
 
     @property
     def named(self) -> Callable[[Element[T]], Point[T]]: ...

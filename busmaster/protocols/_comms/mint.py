@@ -23,17 +23,17 @@ FIRST_ADC, LAST_ADC = 224, 231
 IO = {220: "inputs", OUTPUTS: "outputs", 239: "firmware"}
 LAST_EVENT = 5
 REPORTED = range(11, 11 + AXES)
-"""Where `report_positions` writes."""
+"""Elements that `report_positions` writes."""
 COUNTS = 1000.0
 """Encoder counts per unit of position."""
 FULL_SPEED = 100.0
 """Units per second at a drive demand of 100 %."""
 LAG = 0.002
-"""Seconds by which the position stays behind: following error over speed."""
+"""Following error divided by speed, in seconds."""
 GREATEST_SINGLE = struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]
 
 Program = Callable[["EmulatedMint"], Generator[int, None, None]]
-"""What a controller runs, statement by statement: a generator that yields the number of the line it has executed."""
+"""A program of a controller: a generator that executes one statement per step and yields the number of its line."""
 Event = Callable[["EmulatedMint", int, float], None]
 """`Event commsX`: called with the controller, the element (1 to 5) and the time."""
 
@@ -41,9 +41,9 @@ Event = Callable[["EmulatedMint", int, float], None]
 class EmulatedMint(HostCommsDevice):
     """Eight axes, I/O, and a comms array. By default it runs no program and has no events.
 
-    `axes` fewer than 8: the others' elements are reserved. Reserved elements read 0 and refuse writes;
-    `refuse_reserved` refuses reads too. `single_precision` keeps values as the real one does, with 24 bits.
-    `statement` is how many seconds a program's statement takes.
+    With fewer than 8 `axes`, the elements of the others are reserved. Reserved elements read 0 and refuse writes;
+    `refuse_reserved` refuses reads too. `single_precision` stores values with 24 bits, like a real controller.
+    `statement`: seconds that a statement of the program takes.
     """
 
     def __init__(
@@ -84,16 +84,16 @@ class EmulatedMint(HostCommsDevice):
         self.single_precision = single_precision
         self.statement = statement
         self.now = NEVER
-        """Of the statement that is being executed; NEVER before the first."""
+        """Time of the running statement; NEVER before the first."""
         self.line_number = 0
         self.program = program
         self._run: Generator[int, None, None] | None = None
         self.start_program()
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values in an element and those after it: of the comms array, a position, an axis error, or I/O.
+        """Set an element and those after it: of the comms array, a position, an axis error, or I/O.
 
-        An axis whose position is given stands still, and nothing reports positions over elements that are given.
+        An axis whose position is given stands still. Positions are not reported into elements that are given.
         """
         first = int(item) if is_decimal(item) else 0
         for element, value in enumerate(values, first):
@@ -123,7 +123,7 @@ class EmulatedMint(HostCommsDevice):
     # The program
 
     def start_program(self) -> None:
-        """Start from its first statement, with the comms array as it is. Its time begins when it is next asked."""
+        """Start with the first statement and the current comms array. Its time begins with the next request."""
         self.now = NEVER
         self._run = None if self.program is None else self.program(self)
 
@@ -154,7 +154,7 @@ class EmulatedMint(HostCommsDevice):
             return self.comms[element]
         value = self._read_io(element) if element >= FIRST_IO else self._read_axis(element, now)
         if value is None and not self.refuse_reserved:
-            return 0  # the note does not say how reserved elements answer
+            return 0  # AN00129 does not define the reply of reserved elements
         return value
 
     def write_element(self, element: int, value: float, now: float) -> bool:
@@ -220,7 +220,7 @@ class EmulatedMint(HostCommsDevice):
 
 
 def single(value: float) -> float:
-    """Return the value as a single-precision float keeps it; beyond its range, its greatest."""
+    """Return the value in single precision; outside its range, the largest value of that sign."""
     value = max(-GREATEST_SINGLE, min(value, GREATEST_SINGLE))
     kept: float = struct.unpack("f", struct.pack("f", value))[0]
     return kept
@@ -250,10 +250,10 @@ def winding(mint: EmulatedMint) -> Generator[int, None, None]:
 
 
 def command_handshake(mint: EmulatedMint) -> Generator[int, None, None]:
-    """Obey a command in Comms(1), its data in Comms(2) to Comms(4); Comms(1) becomes 0 when it is done.
+    """Execute a command in Comms(1) with its data in Comms(2) to Comms(4). Comms(1) is 0 when it is done.
 
-    The race is the document's: the last line clears Comms(1) whether or not a command was seen, so one that is
-    written between the read and the clear is lost although the host sees zero.
+    The race is in the document's program: its last line clears Comms(1) in any case. A command that is written between
+    the read and the clear is lost, although the host reads zero.
     """
     comms, axis = mint.comms, mint.axes[1]
     comms[1] = 0
@@ -317,7 +317,7 @@ def make_mint(
     """
     if not AXES_NEEDED.get(program, 1) <= axes <= AXES:
         raise InvalidCommand(
-            f"a controller has {AXES_NEEDED.get(program, 1)} to {AXES} axes for what it runs, not {axes}"
+            f"a controller has {AXES_NEEDED.get(program, 1)} to {AXES} axes for its program, not {axes}"
         )
     if statement is not None and statement < SHORTEST_STATEMENT:
         raise InvalidCommand(f"a statement takes {SHORTEST_STATEMENT} s at least, not {statement:g} s")

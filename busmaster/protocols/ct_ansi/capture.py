@@ -1,4 +1,4 @@
-"""CT-ANSI with decimal points as a listener hears it: as Mentor II."""
+"""Reads captures of CT-ANSI with decimal points, like those of Mentor II."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""CT-ANSI as Control Techniques' later drives speak it (Unidrive, Commander; option modules UD70 and UD78).
+"""CT-ANSI of Control Techniques' later drives (Unidrive, Commander; option modules UD70 and UD78).
 
-The frames are Mentor II's; the data have a decimal point, and up to twelve characters. No drive has an address whose
-second digit is 0: that means a group, and 00 all drives.
+The frames are those of Mentor II. The data have a decimal point, and up to twelve characters. No drive has an address
+whose second digit is 0: such addresses are groups, and 00 is all drives.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from busmaster.wire.readers import ETX, STX, telegram_sizes
 
 LONGEST_DATA = 12
 _NUMBER = re.compile(rb" *([+-]?(?:\d+\.?\d*|\.\d+))", re.ASCII)
-_HEXADECIMAL = re.compile(rb" *X([0-9A-Fa-f]+)")  # which products send spaces or an X is not known: both are taken
+_HEXADECIMAL = re.compile(rb" *X([0-9A-Fa-f]+)")  # some products may send spaces or an X: both are accepted
 
 
 class Reading(ParameterReading[float]):
@@ -40,7 +40,7 @@ class Reading(ParameterReading[float]):
             return float(match[1]) if b"." in match[1] else int(match[1])
         if match := _HEXADECIMAL.fullmatch(field):
             return int(match[1], 16)
-        raise FrameError(f"{field!r} is no number")
+        raise FrameError(f"{field!r} is not a number")
 
 
 class RunReading(mentor.RunReading):
@@ -54,17 +54,17 @@ class RunReading(mentor.RunReading):
 
 @dataclass(frozen=True, slots=True)
 class Read(mentor.Read):
-    """Read one parameter: an int, or a float where the drive sends a decimal point."""
+    """Read one parameter: an int, or a float if the drive sends a decimal point."""
 
     def open(self, address: int, timings: Timings) -> Reading:  # type: ignore[override]  # its value may be a float
-        """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
+        """Begin the read. Raises InvalidCommand for the broadcast address: all drives would reply at once."""
         request, header = read_request(address, self.menu, self.number)
         return Reading(request, header, timings.read)
 
 
 @dataclass(frozen=True, slots=True)
 class ReadRun(mentor.ReadRun):
-    """Read `count` parameters from one on, in one exchange: a tuple. See Mentor II's for when that is safe."""
+    """Read `count` consecutive parameters in one exchange: a tuple. Mentor II's ReadRun states when this is safe."""
 
     def open(self, address: int, timings: Timings) -> RunReading:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
@@ -73,9 +73,9 @@ class ReadRun(mentor.ReadRun):
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Write one parameter: a number, shortest exact, with a decimal point if it needs one; a bit as 1 or 0.
+    """Write one parameter: a number in its shortest exact form, with a decimal point if necessary; a bit as 1 or 0.
 
-    Raises InvalidCommand for what does not fit into twelve characters.
+    Raises InvalidCommand for a value that does not fit into twelve characters.
     """
 
     menu: int
@@ -95,7 +95,7 @@ class Write:
         if isinstance(self.value, bool):
             return str(int(self.value))
         if not is_sendable(self.value):
-            raise InvalidCommand(f"{self.value!r} is no number that can be sent")
+            raise InvalidCommand(f"{self.value!r} is not a number that can be sent")
         text = f"{Decimal(str(self.value)):+f}"
         if "." in text:
             text = text.rstrip("0").rstrip(".")
@@ -116,11 +116,10 @@ class Write:
 
 
 def is_sendable(value: SupportsFloat) -> bool:
-    """Return whether it is a number that has room before its decimal point."""
+    """Return True for a number whose digits before the decimal point fit. Text is not a number."""
     try:
-        return (
-            hasattr(value, "__float__") and abs(float(value)) < 10**LONGEST_DATA
-        )  # text has none: float() would take it
+        # Text has no __float__, but float() would accept it.
+        return hasattr(value, "__float__") and abs(float(value)) < 10**LONGEST_DATA
     except (ValueError, OverflowError):
         return False
 
@@ -129,7 +128,7 @@ LINE = LineSettings(9600, bytesize=7, parity="E")
 PROFILE = Profile(
     name="ct-ansi",
     title="CT-ANSI",
-    # a second digit of 0 means a group, and nobody answers
+    # A second digit of 0 means a group, and no drive replies.
     addresses=tuple(address for address in range(11, 100) if address % 10),
     broadcast=0,
     line=LINE,

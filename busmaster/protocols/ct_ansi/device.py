@@ -17,10 +17,10 @@ LONGEST_VALUE = 12
 
 
 class EmulatedCtAnsi(EmulatedMentor):
-    """Addresses 11 to 99 without the tens. Menus are Mentor II's; references and feedback have one decimal, in %.
+    """Addresses 11 to 99 without the tens. Menus as in Mentor II; references and feedback have one decimal, in %.
 
-    Other options are those of a Mentor II. `plus`: a value that is not negative is sent with a sign. `width`: how many
-    characters zeros fill a value up to.
+    Other options are those of a Mentor II. `plus`: values from 0 up are sent with a sign. `width`: values are filled
+    with zeros to this number of characters.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class EmulatedCtAnsi(EmulatedMentor):
         self.width = width
 
     def has_decimal(self, parameter: int) -> bool:
-        """Return whether the parameter has a decimal: 117 is 01.17."""
+        """Return True if the parameter has a decimal. 117 is 01.17."""
         return self.parameters[parameter].fine or parameter == SPEED_FEEDBACK
 
     def steps(self, parameter: int, value: float) -> float:
-        """Return the whole number that a value on the line is: tenths for a parameter that has a decimal."""
+        """Return the whole number for a value on the line: tenths for a parameter with a decimal."""
         return round(value * FINE, 6) if self.has_decimal(parameter) else value
 
     def _telegram(self, parameter: int, now: float) -> bytes:
@@ -57,9 +57,9 @@ class EmulatedCtAnsi(EmulatedMentor):
         return b"\x02" + summed + bytes((bcc(summed),))
 
     def _fine_of(self, parameter: Parameter, data: bytes) -> int | None:
-        """Return the steps that a write carries, or None if it is refused.
+        """Return the steps of a written value, or None if it is refused.
 
-        A parameter with a decimal counts in tenths of a percent, and takes no finer value.
+        A parameter with a decimal counts in tenths of a percent, and refuses finer values.
         """
         if not VALUE.fullmatch(data) or len(data) > LONGEST_VALUE:
             return None

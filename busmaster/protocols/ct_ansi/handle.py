@@ -1,4 +1,4 @@
-"""The handle of a drive that speaks CT-ANSI with decimal points."""
+"""The handle of a drive with CT-ANSI and decimal points."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class CtAnsiDrive(ParameterHandle):
         await drive.write("1.21", -47.6)
         speed = await drive.read("1.21")
 
-    The drive sends decimal points itself. `decimals` says to how many digits a parameter's values are rounded before
-    they are written, half away from zero; without an entry a value is sent as it is.
+    The drive sends decimal points itself. `decimals`: number of digits to which a parameter's values are rounded before
+    they are written, half away from zero; without an entry a value is sent unchanged.
     """
 
     profile: ClassVar[Profile] = PROFILE
@@ -56,7 +56,7 @@ class CtAnsiDrive(ParameterHandle):
 
     async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write a parameter, or several of a menu from `item` on, acknowledged; at address 0 to all drives, which do
-        not answer.
+        not reply.
 
         `verify` reads back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is
         sent, for a value that does not fit.
@@ -89,7 +89,7 @@ class CtAnsiDrive(ParameterHandle):
 
     def _write(self, menu: int, number: int, value: float) -> Write:
         digits = self._decimals.get((menu, number))
-        # what is not rounded is refused below, or is a bit
+        # A value that cannot be sent is rejected by the command below; a bit is not rounded.
         if digits is not None and is_sendable(value) and not isinstance(value, bool):
             value = float(Decimal(str(value)).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
         return Write(menu, number, value)

@@ -27,7 +27,7 @@ PROTOCOL = Protocol(
                 ALLOW_ZERO,
                 Option("read_only", "numbers", about="The parameters that refuse writes."),
                 Option("eeprom", "delay", about="How long storing a value takes; 0.01 by default."),
-                Option("silent", "flag", about="A read of what is not there gets no answer, in place of NAK."),
+                Option("silent", "flag", about="A read of a missing parameter has no reply, instead of a NAK."),
             ),
             whole_numbers=everywhere,
             width=lambda item: 16,

@@ -1,4 +1,4 @@
-"""DC104 as a listener hears it."""
+"""Reads captures of DC104."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ STX, ACK, NAK = 0x02, 0x06, 0x15
 class Dc104Dialect:
     """STX AA parameter check; STX 55 parameter high low check; STX parameter high low check.
 
-    Only the host's packets say their direction, and a reply for parameter 170 or 85 looks like one of them: then what
-    was asked decides, and the checksum.
+    Only the host's packets contain their direction, and a reply for parameter 170 or 85 looks like one of them. Then
+    the last request and the checksum decide.
     """
 
     starts = bytes((STX,))
@@ -54,14 +54,14 @@ class Dc104Dialect:
         if len(raw) == 1:
             frame = Frame(Kind.ACK if raw[0] == ACK else Kind.NAK, Direction.NODE, raw)
             if asked and asked.kind is Kind.READ and frame.kind is Kind.ACK:
-                frame.fault = "an ACK answers no read"
+                frame.fault = "an ACK is not a reply to a read"
         else:
             item, value = str(raw[1]), str(int.from_bytes(raw[2:4], "big"))
             frame = Frame(Kind.VALUE, Direction.NODE, raw, item=item, value=value)
             if asked and asked.kind is Kind.WRITE:
-                frame.fault = "a value answers no write"
+                frame.fault = "a value is not a reply to a write"
             elif asked and asked.item != item:
-                frame.fault = f"wrong parameter: {asked.item} was asked"
+                frame.fault = f"wrong parameter: {asked.item} was requested"
         frame.answers = asked is not None
         frame.fault = (_summed(raw) if len(raw) > 1 else "") or frame.fault or ("" if asked else UNEXPECTED)
         return frame

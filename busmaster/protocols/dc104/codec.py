@@ -32,13 +32,13 @@ def packet(*between: int) -> bytes:
 
 
 class Reading(SingleStep):
-    """One attempt to read: five bytes that name the parameter, or a lone NAK."""
+    """One attempt to read: five bytes with the parameter, or a single NAK."""
 
     __slots__ = ("_buffer", "_parameter", "answers")
 
     length: ClassVar[int] = 5
     sizes: ClassVar[Sizes] = Sizes(length, length)
-    starts: ClassVar[bytes] = STX + NAK  # the manual has NAK for writes alone: here it is taken for a refusal
+    starts: ClassVar[bytes] = STX + NAK  # the manual defines NAK only for writes; here it is a refusal
 
     def __init__(self, parameter: int, timing: ReplyTiming) -> None:
         super().__init__(packet(READ, parameter), timing)
@@ -65,9 +65,8 @@ class Reading(SingleStep):
         if check != sum8(bytes((parameter, high, low))):
             if rest and buffer[-1] == sum8(buffer[1:-1]):
                 raise other_format(len(buffer), f"a reply has {self.length}")
-            raise FrameError(
-                "bad checksum", whole=not rest
-            )  # only a whole frame is spared the maximum reply delay (R3)
+            # After a whole frame the line does not wait for the maximum reply delay (R3).
+            raise FrameError("bad checksum", whole=not rest)
         return Done(high << 8 | low, rest=rest)
 
     def expired(self, started: bool, /) -> Done[int]:
@@ -75,7 +74,7 @@ class Reading(SingleStep):
 
 
 class Writing(AcknowledgeReader):
-    """One attempt to write: a lone ACK or NAK."""
+    """One attempt to write: a single ACK or NAK."""
 
     __slots__ = ()
 
@@ -84,7 +83,7 @@ class Writing(AcknowledgeReader):
 class Read:
     """Read one parameter, 1 to `maximum`: its value is 0 to 65535.
 
-    A packet could name parameter 0 too. Both of the document's routines exclude it: it takes `minimum=0`.
+    A packet can contain parameter 0 too. Both routines of the document exclude it; it requires `minimum=0`.
     """
 
     parameter: int
@@ -116,7 +115,7 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Write 0 to 65535 into one parameter, 1 to `maximum` (0 takes `minimum=0`)."""
+    """Write 0 to 65535 to one parameter, 1 to `maximum` (0 requires `minimum=0`)."""
 
     parameter: int
     value: int
@@ -156,8 +155,9 @@ PROFILE = Profile(
     line=LineSettings(19200),
     timings=Timings(_READ_TIMING, _WRITE_TIMING, packet=_READ_TIMING),
     probe=Read(1),
-    # a reply names its parameter, which tells these apart (R15)
+    # A reply contains its parameter, so these replies differ (R15).
     sync_reads=tuple(Read(parameter) for parameter in range(1, 9)),
-    fixed_rate=True,  # 19200 baud and no other
+    fixed_rate=True,  # only 19200 baud
 )
-"""The document gives no times. A write is answered when it is completed, EEPROM included: hence its longer window."""
+"""The document contains no times. The reply to a write comes after its completion, EEPROM included, so its window is
+longer."""

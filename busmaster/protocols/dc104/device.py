@@ -1,4 +1,4 @@
-"""A DC104-SER drive: 255 registers of 16 bits behind packets without an address. What they mean is not published.
+"""A DC104-SER drive: 255 registers of 16 bits behind packets without an address. Their meaning is not published.
 
     read   STX AA parameter sum              ->  STX parameter high low sum
     write  STX 55 parameter high low sum     ->  ACK once it is in the EEPROM, or NAK
@@ -21,8 +21,8 @@ STX, READ, WRITE = 0x02, 0xAA, 0x55
 ACK = b"\x06"
 SIZES = {READ: 4, WRITE: 6}
 LAST_PARAMETER = 255
-INTER_BYTE_TIMEOUT = 0.05  # the manual does not say how a drive finds the start of a packet again
-"""Seconds after which what was begun is forgotten."""
+INTER_BYTE_TIMEOUT = 0.05  # the manual does not define how a drive finds the start of a packet again
+"""Seconds after which an incomplete packet is dropped."""
 LIVE = 1
 """The parameter that moves on a lively drive: a sine about the middle of its range."""
 SWING, TURN = 10_000, 10.0
@@ -31,8 +31,9 @@ SWING, TURN = 10_000, 10.0
 class EmulatedDc104(Device):
     """The drive of a line. Parameters 1 to `maximum`; `allow_zero`: 0 too. `read_only` ones refuse writes.
 
-    `eeprom` is the time that storing takes. `silent`: a read of what is not there gets no answer, in place of NAK,
-    since the document names none. `lively`: parameter 1 moves. With a `traceable` every value is the traceable's.
+    `eeprom`: the time for storing a value. `silent`: a read of a missing parameter has no reply, instead of a NAK,
+    because the document defines NAK only for writes. `lively`: parameter 1 moves. With a `traceable`, it
+    provides every value.
     """
 
     def __init__(
@@ -65,22 +66,20 @@ class EmulatedDc104(Device):
         self._heard_at = 0.0
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values from a parameter on. One that is given does not move."""
+        """Set values from a parameter on. A parameter that is set does not move."""
         if not is_decimal(item) or not {int(item), int(item) + len(values) - 1} <= set(self.parameters):
             last = self.parameters.stop - 1
-            raise InvalidCommand(
-                f"an emulated DC104 cannot hold what is given at {item!r}: its last parameter is {last}"
-            )
+            raise InvalidCommand(f"an emulated DC104 cannot store the values at {item!r}: its last parameter is {last}")
         for parameter, value in enumerate(values, int(item)):
             self.registers[parameter] = held(value, 0, 0xFFFF, f"parameter {parameter}")
             self.lively &= parameter != LIVE
 
     def restart(self, now: float) -> None:
-        """Restart with the same parameters, which are in the EEPROM; a frame begun is forgotten."""
+        """Restart with the same parameters, which are in the EEPROM; an incomplete frame is dropped."""
         super().restart(now)
         self._frame.clear()
 
-    # Hearing
+    # Receiving
 
     def take(self, frame: bytes, now: float) -> bool:
         if self._frame or len(frame) != SIZES[frame[1]]:
@@ -102,7 +101,7 @@ class EmulatedDc104(Device):
             frame.clear()
         self.attentive = bool(frame)
 
-    # Answering
+    # Replying
 
     def _handle(self, frame: bytes, now: float) -> None:
         parameter = frame[2]

@@ -20,13 +20,13 @@ from busmaster.protocols.dc104.codec import Read, Write
 
 
 class Dc104Drive(Handle):
-    """The one drive of its line: parameters 1 to `maximum`, each 0 to 65535. What they mean is not published.
+    """The only drive of its line: parameters 1 to `maximum`, each 0 to 65535. Their meaning is not published.
 
         drive = Dc104Drive(bus)
         await drive.write(12, 1500)
         value = await drive.read(12)
 
-    `allow_zero` lets parameter 0 be asked for, which the document's own routines never do.
+    `allow_zero` permits requests for parameter 0, which the document's own routines never send.
     """
 
     profile: ClassVar[Profile] = dc104.PROFILE
@@ -71,9 +71,9 @@ class Dc104Drive(Handle):
     async def read(self, item: int, count: int, **options: Unpack[ReadOptions]) -> tuple[int, ...]: ...
 
     async def read(self, item: int, count: int | None = None, **options: Unpack[ReadOptions]) -> int | tuple[int, ...]:
-        """Return a parameter's value; with `count`, those of so many parameters from there on, read one by one.
+        """Return a parameter's value; with `count`, a tuple of this many from there on, read one by one.
 
-        Raises Refused where the drive says NAK.
+        Raises Refused if the drive replies with a NAK.
         """
         if count is None:
             return await self.node.request(self._read(item), **options)
@@ -105,7 +105,7 @@ class Dc104Drive(Handle):
         return lambda: self.write(int(item), value, **options)
 
     def _listed(self) -> Iterable[Parameter]:
-        """Return every number that the drive can have: what they mean is not published."""
+        """Return every number that the drive can have: their meaning is not published."""
         return (Parameter(item=str(number)) for number in range(self._minimum, self._maximum + 1))
 
     def _read(self, parameter: int) -> Read:

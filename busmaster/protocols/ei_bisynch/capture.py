@@ -1,4 +1,4 @@
-"""EI-Bisynch as a listener reads it."""
+"""Reads captures of EI-Bisynch."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from busmaster.wire.checks import bcc, xor
 _SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
 _TEXT_AT = 5
 _WITH_CHANNEL = re.compile(r"\d(?:[A-Za-z][A-Za-z]|[G-Zg-z].)", re.ASCII)
-"""A channel and a mnemonic, where data follow: a digit and a hexadecimal digit may also be a parameter number."""
+"""A channel and a mnemonic before data. A digit and a hexadecimal digit may also be a parameter number."""
 
 
 class BisynchDialect:
     """EOT g g u u name ENQ, EOT g g u u STX name data ETX BCC, and ACK and NAK for next and again.
 
-    Bit 7 is parity, or nothing: it is not looked at. ACK and NAK are the instrument's while something is requested, and
-    the host's after a read that was answered. A BCC may have 32 added, if it would be below 32.
+    Bit 7 is parity or unused, and ignored. ACK and NAK are the instrument's while a request is open, and the host's
+    after the reply to a read. 32 may be added to a BCC below 32.
     """
 
     starts = bytes((EOT, STX))
@@ -46,7 +46,7 @@ class BisynchDialect:
     def __init__(self) -> None:
         self._asked: Frame | None = None
         self._armed: Frame | None = None
-        """The last read that was answered: what a short command refers to."""
+        """The last read with a reply, to which a short command refers."""
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
         data = data.translate(_SEVEN_BITS)
@@ -62,7 +62,7 @@ class BisynchDialect:
         return size or (-len(data) if quiet else 0)
 
     def _after_eot(self, data: bytes, sender: Direction, quiet: bool) -> int:
-        """Return the size of a request; or of a lone EOT, "no such parameter", while something is requested."""
+        """Return the size of a request, or of a single EOT ("no such parameter") while a request is open."""
         alone = data[1] < SPACE if len(data) > 1 else quiet or sender is Direction.NODE
         if alone and (sender is Direction.NODE or (sender is Direction.UNKNOWN and self._asked)):
             return 1
@@ -128,7 +128,7 @@ class BisynchDialect:
         if data[0] == STX:
             frame.item, frame.value = _parts(characters(data[1:-2]), asked.item if asked else "")
             if asked and not reading:
-                frame.fault = "a value answers no write"
+                frame.fault = "a value is not a reply to a write"
             elif asked and not asked.item:
                 asked.item = frame.item
             elif asked and asked.item != frame.item:
@@ -137,7 +137,7 @@ class BisynchDialect:
             if reading:
                 self._armed = asked
         elif data[0] == ACK and reading:
-            frame.fault = "an ACK answers no read"
+            frame.fault = "an ACK is not a reply to a read"
         return frame
 
     def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
@@ -163,16 +163,16 @@ def _write(name: str, text: str, printable: bool) -> Write:
 
 
 def _parts(text: str, name: str) -> tuple[str, str]:
-    """Return name and data. `name` is what was requested, which says whether there is a channel."""
+    """Return name and data. `name`: the requested name, which shows whether there is a channel."""
     size = len(name) or (3 if _WITH_CHANNEL.match(text) else 2)
     return text[:size], text[size:]
 
 
 def _checked(data: bytes, start: int) -> str:
-    """Say what is wrong with the BCC. Which rule an instrument has is not known to a listener."""
+    """Return the fault of the BCC. A listener does not know which rule an instrument uses."""
     return "" if data[-1] == bcc(data[start:-1]) else checked(data, start, xor)
 
 
 def _adds_32(data: bytes) -> bool:
-    """Return whether 32 was added to the BCC of a write."""
+    """Return True if 32 was added to the BCC of a write."""
     return data[0] == EOT and data[_TEXT_AT] == STX and xor(data[_TEXT_AT + 1 : -1]) != data[-1]

@@ -94,10 +94,10 @@ class Read:
 class ReadRun:
     """Read several parameters in one exchange: a tuple.
 
-    The first is requested by address. A NAK requests the parameter before again where its name is repeated, and an ACK
-    requests the next one: `names` must follow each other in the instrument's own list, and each reply is compared with
+    The first is requested by address. A NAK requests the same parameter again, if its name is repeated, and an ACK
+    requests the next one. So `names` must be in the order of the instrument's own list, and each reply is compared with
     its name. Every parameter after the first costs one byte. Another instrument's ACK or NAK is the same byte: use it
-    only where each instrument forgets its last read when another is addressed.
+    only if each instrument forgets its last read when another is addressed.
     """
 
     names: tuple[str, ...]
@@ -126,8 +126,8 @@ class ReadRun:
 class Write:
     """Write one parameter.
 
-    A number is sent with its decimal point, without zeros around it (free format); `width` fills it with zeros to so
-    many characters (fixed format). `hexadecimal` sends `>` and four digits, 0 to 65535, or two for True and False.
+    A number is sent with its decimal point and without zeros around it (free format). `width` fills it with zeros to
+    this number of characters (fixed format). `hexadecimal` sends `>` and four digits, 0 to 65535, or two for a bool.
     Raises InvalidCommand for a value that does not fit.
     """
 
@@ -169,7 +169,7 @@ class Write:
 
     @property
     def number(self) -> float:
-        """The value that a read returns if the instrument keeps what was written."""
+        """The value that a read returns if the instrument stores the written value."""
         return int(self.text[1:], 16) if self.hexadecimal else float(self.text)
 
     def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
@@ -256,14 +256,14 @@ class RunReading:
 
 
 def whole_word(value: Any) -> int:
-    """Return a value as a word of 16 bits. Raises InvalidCommand for what is none, a fraction among them."""
+    """Return a value as a word of 16 bits. Raises InvalidCommand for any other value, such as a fraction."""
     if isinstance(value, float) and value.is_integer():  # as JSON and scaled points have it
         value = int(value)
     return whole_number(value, 0, _HIGHEST_WORD, "a hexadecimal value")
 
 
 def is_sendable(value: Any) -> bool:
-    """Return whether it is a finite number of few enough digits before its decimal point. Text is not a number."""
+    """Return True for a finite number whose digits before the decimal point fit. Text is not a number."""
     try:
         return hasattr(value, "__float__") and abs(float(value)) < 10**LONGEST_DATA
     except (ValueError, OverflowError):
@@ -272,12 +272,12 @@ def is_sendable(value: Any) -> bool:
 
 @lru_cache(maxsize=4096)
 def read_request(address: int, name: str) -> tuple[bytes, bytes]:
-    """Return the read request, and what its reply begins with."""
+    """Return the read request, and the beginning of its reply."""
     return reset(address) + name.encode() + ENQ, header_of(name)
 
 
 def header_of(name: str) -> bytes:
-    """Return what the reply to a read begins with: STX, and the name as it is echoed."""
+    """Return the beginning of the reply to a read: STX and the echoed name."""
     return STX + name.encode()
 
 

@@ -4,7 +4,7 @@
     write   EOT g g u u STX [channel] c1 c2 data ETX BCC        ->  ACK or NAK
     then    ACK or NAK alone, after a read that was answered    ->  the next parameter of the list, or the same again
 
-Characters have 7 bits. Where a line carries 8, bit 7 may hold even parity: it is dropped, and sent if it was received.
+Characters have 7 bits. If a line carries 8, bit 7 may contain even parity: it is dropped, and sent if it was received.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from busmaster.wire.checks import bcc, xor
 STX, ETX, EOT, ENQ, NEXT, AGAIN = 0x02, 0x03, 0x04, 0x05, 0x06, 0x15
 ACK, NO_SUCH_PARAMETER = b"\x06", b"\x04"
 IDLE = (0x00, 0x7F)
-"""What is no character: a line that is let go, or hosts that pad their frames."""
+"""Bytes that are not characters: from a line that is released, or from hosts that pad their frames."""
 SPACE, DELETE = 0x20, 0x7F
 TEXT_AT = 5
-"""Where a read has its mnemonic and a write its STX."""
+"""Position of the mnemonic of a read, and of the STX of a write."""
 READ_SIZES = (8, 9)
 SHORTEST_WRITE = 11
 KEPT = 32
-"""Bytes of a frame that are kept: a longer one is refused."""
+"""Stored bytes of a frame: a longer one is refused."""
 CHANNEL = ord("1")
-"""Of an instrument with one loop. It may be left out."""
+"""Channel of an instrument with one loop. Optional in a request."""
 SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
 EVEN_PARITY = bytes(byte & 0x7F | (byte & 0x7F).bit_count() % 2 << 7 for byte in range(256))
 NUMBER = re.compile(rb" *[+-]?(\d+\.?\d*|\.\d+) *", re.ASCII)
@@ -51,7 +51,7 @@ WRITE_ONLY, READ_ONLY, BAD_DATA, OUT_OF_RANGE = 0x04C8, 0x05C8, 0x07C8, 0x08C8
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Its limits, what may be done with it, and whether it is a word that is sent as hexadecimal digits."""
+    """Its limits, its access, and whether it is a word that is sent as hexadecimal digits."""
 
     low: float = -99999
     high: float = 99999
@@ -80,15 +80,15 @@ PARAMETERS = {
     b"dm": Parameter(0, 7),
     b"fi": Parameter(0, 9),
 }
-"""In the order of the instrument's own list, which a lone ACK goes through."""
+"""In the order of the instrument's own list, through which a single ACK steps."""
 INITIAL = {b"II": 0x2480, b"V0": 0x0302, b"EE": NO_ERROR, b"PV": 20.0, b"SL": 20.0, b"XP": 20.0, b"TI": 360, b"TD": 60}
 
 
 class EmulatedBisynch(Device):
     """Addresses 0 to 99. The process value PV follows the setpoint SL within some `lag`s, in seconds.
 
-    `fixed_width`: zeros fill the numbers it sends. `printable_check`: 32 is added to a BCC below 32. With a `traceable`
-    every parameter is the traceable's.
+    `fixed_width`: sent numbers are filled with zeros. `printable_check`: 32 is added to a BCC below 32. With a
+    `traceable`, it provides every parameter.
     """
 
     def __init__(
@@ -120,15 +120,15 @@ class EmulatedBisynch(Device):
         self._as_of: float | None = None
         """The time of the process value in `values`; None before it is first needed."""
         self._last: bytes | None = None
-        """The name that was read last: what short commands start from."""
+        """The name that was read last, from which short commands start."""
         self._frame = bytearray()
         self._check_due = False
         self._parity = False
 
-    # What is in it
+    # Values
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values in a parameter ("SL", "tag247") and, of tags, in those after it; one that it lacks is added."""
+        """Set a parameter ("SL", "tag247") and, for tags, those after it. Missing parameters are added."""
         for name, value in zip(run_of(item, len(values)), values, strict=True):
             parameter = self.parameters.setdefault(name, Parameter())
             if parameter.hexadecimal:
@@ -148,7 +148,7 @@ class EmulatedBisynch(Device):
         return self.values.get(name, 0)
 
     def _advance(self, now: float) -> None:
-        """Bring process value and output to the present."""
+        """Update process value and output to the time `now`."""
         values = self.values
         setpoint = values[b"SL"]
         if self._as_of is None:
@@ -164,7 +164,7 @@ class EmulatedBisynch(Device):
         self._last = None
         self.values[b"EE"] = NO_ERROR
 
-    # Hearing
+    # Receiving
 
     def take(self, frame: bytes, now: float) -> bool:
         if self._frame:
@@ -217,10 +217,10 @@ class EmulatedBisynch(Device):
         self._frame.clear()
         self._check_due = False
 
-    # Answering
+    # Replying
 
     def _short(self, character: int, now: float) -> None:
-        """Answer a short command; any other character ends them."""
+        """Reply to a short command. Any other character ends them."""
         last, self._last = self._last, None
         assert last is not None
         if character == AGAIN:
@@ -231,7 +231,7 @@ class EmulatedBisynch(Device):
             self._answer_read(last[:-2] + names[place] if place < len(names) else b"", now)
 
     def _handle(self, frame: bytes, now: float) -> None:
-        """Obey a whole request to this instrument."""
+        """Execute a complete request to this instrument."""
         self._last = None
         if frame[TEXT_AT] != STX:
             self._answer_read(frame[TEXT_AT:-1], now)
@@ -253,13 +253,13 @@ class EmulatedBisynch(Device):
         self._say(self._telegram(name, self._text(parameter, self.value(name[-2:], now))), now)
 
     def _found(self, name: bytes) -> Parameter | None:
-        """Return the parameter of a name, which may begin with the channel of its only loop."""
+        """Return the parameter with this name, which may begin with the channel of its only loop."""
         if len(name) == 3 and name[0] != CHANNEL:
             return None
         return self.parameters.get(name[-2:]) if len(name) in (2, 3) else None
 
     def _write(self, text: bytes) -> int:
-        """Store what a write carries. Returns the code of the error, 0 if it was stored."""
+        """Store the value of a write. Returns the code of the error, 0 if it was stored."""
         size = 3 if text[0] == CHANNEL and text[1:3] in self.parameters else 2
         name, data = text[:size], text[size:]
         parameter = self._found(name)
@@ -287,7 +287,7 @@ class EmulatedBisynch(Device):
         return 0
 
     def _text(self, parameter: Parameter, value: float) -> bytes:
-        """Return a value as it is sent: in hexadecimal, or with a decimal point and no zeros that mean nothing."""
+        """Return a value as it is sent: in hexadecimal, or with a decimal point and without unnecessary zeros."""
         if parameter.hexadecimal and self.traceable is None:
             return b">%04X" % int(value)
         digits = b"%d." % value if value == int(value) else (b"%.4f" % value).rstrip(b"0")
@@ -313,7 +313,7 @@ class EmulatedBisynch(Device):
 
 
 def _is_read(plain: bytes) -> bool:
-    """Return whether it is a whole read request of 7-bit characters, to any instrument."""
+    """Return True for a complete read request of 7-bit characters, to any instrument."""
     size = len(plain)
     return size in READ_SIZES and plain[-1] == ENQ and plain[0] == EOT and all(map(_is_visible, plain[TEXT_AT:-1]))
 
@@ -323,7 +323,7 @@ def _is_visible(character: int) -> bool:
 
 
 def _is_write(plain: bytes) -> bool:
-    """Return whether it is a whole write request of 7-bit characters, to any instrument."""
+    """Return True for a complete write request of 7-bit characters, to any instrument."""
     return (
         SHORTEST_WRITE <= len(plain) <= KEPT
         and plain[0] == EOT
@@ -334,7 +334,7 @@ def _is_write(plain: bytes) -> bool:
 
 
 def run_of(item: str, count: int) -> list[bytes]:
-    """Return the mnemonics of so many parameters from an item on: several only from a tag on. Raises InvalidCommand."""
+    """Return the mnemonics of `count` parameters from an item on; several only from a tag on. Raises InvalidCommand."""
     match = ITEM.fullmatch(item)
     if match is None or (match["tag"] is None and count != 1):
         raise InvalidCommand(f"an emulated instrument has no {item!r}: use one value for a mnemonic, such as SL")
@@ -347,7 +347,7 @@ def run_of(item: str, count: int) -> list[bytes]:
 
 
 def mnemonic_of(tag: int) -> bytes:
-    """Return the mnemonic of a tag number, two digits of a number: by 36 up to "zz", then by 26 as in "aA"."""
+    """Return the mnemonic of a tag number: two digits to the base 36 up to "zz", then to the base 26 as in "aA"."""
     if tag < len(LETTERS) * len(DIGITS):
         return bytes((LETTERS[tag // len(DIGITS)], DIGITS[tag % len(DIGITS)]))
     rest = tag - len(LETTERS) * len(DIGITS)

@@ -1,4 +1,4 @@
-"""The handle of an instrument that speaks EI-Bisynch."""
+"""The handle of an instrument with EI-Bisynch."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class BisynchInstrument(Handle):
         await furnace.write("SL", 450.0)
         temperature = await furnace.read("PV")
 
-    The instrument sends decimal points itself. `decimals` says to how many digits a parameter's values are rounded
-    before they are written, half away from zero; without an entry a value is sent as it is. `fixed_width` is for
-    instruments that are set to the fixed format: numbers are filled with zeros to so many characters. `printable_check`
-    is for instruments that add 32 to a BCC below 32. The error of a write that was refused names the instrument's own
-    reason, which is read from the mnemonic EE.
+    The instrument sends decimal points itself. `decimals`: number of digits to which a parameter's values are rounded
+    before they are written, half away from zero; without an entry a value is sent unchanged. `fixed_width`: for
+    instruments with the fixed format, the number of characters to which numbers are filled with zeros.
+    `printable_check`: for instruments that add 32 to a BCC below 32. The error of a refused write contains the
+    instrument's own reason, which is read from the mnemonic EE.
     """
 
     profile: ClassVar[Profile] = PROFILE
@@ -103,18 +103,18 @@ class BisynchInstrument(Handle):
         return Point(self.node, item, self._read(name), unit=unit, encode=lambda value: self._write(text, value))
 
     async def _read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
-        """Read a run parameter by parameter, which is always safe, unless `chain` says otherwise."""
+        """Read a run parameter by parameter, which is always safe, unless `chain` is set."""
         if "," not in item_text(item) or chain:
             return await self.point(item).read()
         points = [self.point(name) for name in item.split(",")]
         return tuple([await point.read() for point in points])
 
     async def last_error(self, **options: Unpack[ReadOptions]) -> str:
-        """Return what the instrument says of its last error: its code, and what the documents say of that."""
+        """Return the last error of the instrument: its code, and the text from the documents."""
         return error_text(await self.node.request(self._read(LAST_ERROR), **options))
 
     async def clear_error(self, **options: Unpack[CommandOptions]) -> None:
-        """Clear the last error, so that the next one can be told from it."""
+        """Clear the last error, so that the next one can be recognised."""
         await self.node.request(self._clearing(), **options)
 
     def _clearing(self) -> Write:
@@ -122,7 +122,7 @@ class BisynchInstrument(Handle):
 
     _actions: ClassVar[Mapping[str, Action]] = {
         "clear-error": Action(
-            "Clear the last error, so that the next one can be told from it.",
+            "Clear the last error, so that the next one can be recognised.",
             clear_error,
             check=lambda instrument: instrument.node.check(instrument._clearing()),
         )
@@ -151,7 +151,7 @@ class BisynchInstrument(Handle):
                 )
 
     async def _explained(self, refusal: Refused, requests: SeveralRequests, command: Write) -> Refused:
-        """Return the refusal with the reason that EE holds; as it was if EE cannot be read."""
+        """Return the refusal with the reason from EE; unchanged if EE cannot be read."""
         try:
             code = await requests.read_back(self._read(LAST_ERROR))
         except BusError:
@@ -169,7 +169,7 @@ class BisynchInstrument(Handle):
         return lambda: self.write(item, value, **options)
 
     def _run_items(self, item: str, count: int) -> tuple[str, ...]:
-        """Return what each of `count` values from a tag on is called. Mnemonics have no order that is documented."""
+        """Return the items of `count` values from a tag on. The order of mnemonics is not documented."""
         first, colon, kind = item_text(item).partition(":")
         number = first.removeprefix(TAG)
         if number == first or not is_decimal(number):
@@ -177,7 +177,7 @@ class BisynchInstrument(Handle):
         return tuple(f"{TAG}{int(number) + i}{colon}{kind}" for i in range(count))
 
     def _listed(self) -> Iterable[Parameter]:
-        """Return what the documents name: an instrument has a part of it. The mode is written first."""
+        """Return the parameters of the documents, of which an instrument has some. The mode is written first."""
         for one in PARAMETERS:
             yield Parameter(
                 item=one.item,
@@ -210,7 +210,7 @@ class BisynchInstrument(Handle):
 
 
 def name_of(item: str) -> str:
-    """Return the name on the line of "process_value", "PV", "1PV" or "tag247". Raises InvalidCommand for others."""
+    """Return the name that is sent for "process_value", "PV", "1PV" or "tag247". Raises InvalidCommand for others."""
     text = item_text(item)
     if text in NAMED:
         text = NAMED[text].item

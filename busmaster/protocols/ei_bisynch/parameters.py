@@ -13,7 +13,7 @@ from busmaster.errors import InvalidCommand
 
 LAST_ERROR = "EE"
 NO_ERROR = 0x00C0
-"""Of Parker SSD. Writing any value to EE sets it."""
+"""Code of Parker SSD. Writing any value to EE sets it."""
 
 DRIVE_ERRORS = {
     NO_ERROR: "no error",
@@ -26,7 +26,7 @@ DRIVE_ERRORS = {
     0x07C8: "the data had an invalid format",
     0x08C8: "the value is out of range",
 }
-"""What EE says of a Parker SSD drive."""
+"""Codes in EE of a Parker SSD drive."""
 CONTROLLER_ERRORS = {
     0: "no error",
     1: "the mnemonic does not exist",
@@ -34,7 +34,7 @@ CONTROLLER_ERRORS = {
     7: "the request had an invalid format",
     8: "the value is out of range",
 }
-"""What EE says of a Eurotherm controller."""
+"""Codes in EE of a Eurotherm controller."""
 ERRORS = CONTROLLER_ERRORS | DRIVE_ERRORS
 
 TAG = "tag"
@@ -44,7 +44,7 @@ _SMALL = "0123456789abcdefghijklmnopqrstuvwxyz"
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Describe one parameter that goes by a name in busmaster. `hexadecimal`: it is written so."""
+    """One parameter that has a name in busmaster. `hexadecimal`: it is written in hexadecimal."""
 
     name: str
     item: str
@@ -57,7 +57,7 @@ class Parameter:
 
     @property
     def documented(self) -> Item:
-        """What the document says of it, as lists show it."""
+        """Its description in the document, for lists."""
         return Item(self.name, self.item, self.meaning, self.unit, self.access)
 
 
@@ -98,13 +98,13 @@ ITEMS = (
     Item("0PV:hex", ">0000", "the same, written in hexadecimal"),
     Item("tag0-1611", "0-1611", "a parameter of a Parker SSD drive, by its tag number"),
 )
-"""What most mnemonics and tags mean is in the list of each instrument, not in the documents of the protocol."""
+"""The meaning of most mnemonics and tags is in the list of each instrument, not in the documents of the protocol."""
 
 
 def error_text(code: float) -> str:
-    """Return what a value of EE says, with its code in hexadecimal."""
+    """Return the text of a value of EE, with its code in hexadecimal."""
     number = int(code)
-    return f">{number:04X}: {ERRORS.get(number, 'a code that the documents do not name')}"
+    return f">{number:04X}: {ERRORS.get(number, 'a code that the documents do not define')}"
 
 
 def mnemonic_of_tag(tag: int) -> str:

@@ -1,4 +1,4 @@
-"""HCP as a listener hears it."""
+"""Reads captures of HCP."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from busmaster.wire.checks import xor
 
 
 class HcpDialect(CommsDialect):
-    """AN00110: EOT n n STX d d ..., a read without a checksum, a write's from after STX on."""
+    """AN00110: EOT n n STX d d ... A read has no checksum; that of a write covers the bytes after STX."""
 
     reset = EOT
     checked_read = 0

@@ -46,7 +46,7 @@ class Write(WriteElements):
 
 
 def _reset(address: int) -> bytes:
-    return EOT + b"%X" % address * 2  # sent twice, which guards a read: it has no check
+    return EOT + b"%X" % address * 2  # sent twice, which protects a read: it has no checksum
 
 
 PROFILE = Profile(
@@ -59,5 +59,5 @@ PROFILE = Profile(
     sync_reads=tuple(Read(element) for element in CHECKED),
     other_lines=OTHER_LINES,
     checked_requests=False,
-    shares_line_with=frozenset({"hcp2"}),  # a telegram of the one means nothing to the other
+    shares_line_with=frozenset({"hcp2"}),  # nodes of one ignore the telegrams of the other
 )

@@ -1,4 +1,4 @@
-"""An emulated Mint controller that speaks HCP."""
+"""An emulated Mint controller with HCP."""
 
 from __future__ import annotations
 

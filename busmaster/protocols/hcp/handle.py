@@ -1,4 +1,4 @@
-"""The handle of a controller that speaks HCP."""
+"""The handle of a controller with HCP."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ PROTOCOL = Protocol(
                 Option(
                     "trips_after",
                     "positive",
-                    about="It trips so many seconds after it is first asked, and has not tripped before.",
+                    about="It trips this many seconds after the first request, and has not tripped before.",
                 ),
                 Option("firmware", "whole", about="Its firmware's build; 5221 by default."),
                 Option(

@@ -1,4 +1,4 @@
-"""HCP2 as a listener hears it."""
+"""Reads captures of HCP2."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from busmaster.wire.checks import xor
 
 
 class Hcp2Dialect(CommsDialect):
-    """AN00129: BEL h h STX e e ..., every request's checksum from after BEL on."""
+    """AN00129: BEL h h STX e e ... The checksum of each request covers the bytes after BEL."""
 
     reset = BEL
     checked_read = 1

@@ -30,14 +30,14 @@ class Read(ReadElement):
     @lru_cache(maxsize=4096)
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
         header = STX + b"%02X" % element
-        # begun after STX, the check would be right for node 2, the note's example: there node and STX cancel out
+        # A checksum of the bytes after STX would fit AN00129's example too: for node 2, node and STX cancel out.
         body = b"%02X%b" % (address, header) + ENQ
         return BEL + body + bytes((xor(body),)), header
 
 
 @dataclass(frozen=True, slots=True)
 class Write(WriteElements):
-    """Write elements 1-255. Which ones are writable is the node's to say: controllers differ."""
+    """Write elements 1-255. The node decides which ones are writable: controllers differ."""
 
     last: ClassVar[int] = LAST_ELEMENT
 
@@ -56,5 +56,5 @@ PROFILE = Profile(
     probe=Read(1),
     sync_reads=tuple(Read(element) for element in CHECKED),
     other_lines=OTHER_LINES,
-    shares_line_with=frozenset({"hcp"}),  # a telegram of the one means nothing to the other
+    shares_line_with=frozenset({"hcp"}),  # nodes of one ignore the telegrams of the other
 )

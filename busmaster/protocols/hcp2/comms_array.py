@@ -25,7 +25,7 @@ AXIS: tuple[tuple[str, Callable[[float], object], str, str], ...] = (
     ("idle", whole, "not 0 while the motor is in position", "IDLE"),
     ("following_error", float, "positional error", "FOLERROR"),
 )
-"""The parameters of an axis, from its first element on: name, what the number means, what it is, the Mint keyword."""
+"""The parameters of an axis, from its first element on: name, conversion of the number, meaning, Mint keyword."""
 
 
 def axis_elements(axis: int) -> list[Element[object]]:
@@ -56,7 +56,7 @@ STATE: list[Element[object]] = [ERROR, ERROR_LINE, ERROR_AXIS, RUNNING, LINE_NUM
 AXIS_ELEMENTS: list[Element[object]] = [element for axis in range(AXES) for element in axis_elements(axis)]
 IO_ELEMENTS: list[Element[object]] = [INPUTS, OUTPUTS, *ANALOG, *STATE]
 ELEMENTS = by_name([*AXIS_ELEMENTS, *IO_ELEMENTS])
-"""Every name that the document gives to an element, in the order of the numbers."""
+"""All element names of the document, in the order of the numbers."""
 ITEMS = (*COMMS, *(element.item for element in ELEMENTS.values()))
 FORM = (
     f"an element, 1 to 255, or its name: axis0.{AXIS[0][0]} (to axis{AXES - 1}; "

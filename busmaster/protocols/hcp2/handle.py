@@ -1,4 +1,4 @@
-"""The handle of a controller that speaks HCP2."""
+"""The handle of a controller with HCP2."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Hcp2Controller(MintHandle):
 
     @property
     def io(self) -> Io:
-        """The points that belong to no axis."""
+        """The points that do not belong to an axis."""
         return Io(self)
 
 
 class Io:
-    """The points that belong to no axis: inputs, outputs, and the state of the Mint program."""
+    """The points that do not belong to an axis: inputs, outputs, and the state of the Mint program."""
 
     inputs = Named(comms_array.INPUTS)
     outputs = Named(comms_array.OUTPUTS)

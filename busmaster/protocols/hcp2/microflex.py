@@ -14,18 +14,18 @@ FIRST_FIRMWARE = 5221
 
 _RATED_CURRENT = "% of rated current"
 _MAX_SPEED = "% of max speed"
-"""The application's."""
+"""The maximum speed of the application."""
 
 
 class CommandWord(IntFlag):
-    """What the drive is told. Bits 0-5 are not defined for MicroFlex. CANCEL must not stay set."""
+    """Command word of the drive. Bits 0-5 are not defined for MicroFlex. CANCEL must not stay set."""
 
     CANCEL = 1 << 6
     ENABLE = 1 << 7
 
 
 class StatusWord(IntFlag):
-    """What the drive says. Bits 0-2, 4 and 8-15 are not defined for MicroFlex."""
+    """Status word of the drive. Bits 0-2, 4 and 8-15 are not defined for MicroFlex."""
 
     ASYNCHRONOUS_ERROR = 1 << 3
     STOP_INPUT = 1 << 5
@@ -52,12 +52,12 @@ STATUS_BITS = bits_of(
 
 
 def command_word(value: float) -> CommandWord:
-    """Return the command word that an element's value is."""
+    """Return an element's value as a command word."""
     return CommandWord(bits(value))
 
 
 def status_word(value: float) -> StatusWord:
-    """Return the status word that an element's value is."""
+    """Return an element's value as a status word."""
     return StatusWord(bits(value))
 
 
@@ -68,12 +68,12 @@ COMMAND_WORD = Element(
     "command_word",
     108,
     command_word,
-    "what the drive is told",
+    "commands to the drive",
     writable=True,
     bits=COMMAND_BITS,
     kept="it enables the drive",
 )
-STATUS_WORD = Element("status_word", 109, status_word, "what the drive does", bits=STATUS_BITS)
+STATUS_WORD = Element("status_word", 109, status_word, "state of the drive", bits=STATUS_BITS)
 DRIVE_ERROR = Element("drive_error", 110, bits, "errors of the drive, a bitmap")
 DEMAND_POSITION = Element("demand_position", 111, float, "position demand", "counts")
 TORQUE_REFERENCE = Element(
@@ -133,4 +133,4 @@ PROFILE = replace(
         )
     ),
 )
-"""HCP2 with the probe and the sync reads of this map: it has no Mint program, and so none of the elements 1 to 99."""
+"""HCP2 with the probe and the sync reads of this map. It has no Mint program, and so no elements 1 to 99."""

@@ -37,14 +37,14 @@ THERMAL_TIME = 60.0
 FRICTION = 0.1
 """Torque per speed, % per %."""
 ACCELERATING = 50.0
-"""Torque in % while the speed ramps."""
+"""Torque in % while the speed changes."""
 LAG = 0.001
-"""Seconds by which the position stays behind its demand."""
+"""Following error divided by speed, in seconds."""
 
 
 @dataclass(slots=True)
 class Trip:
-    """Errors to come: `delay` seconds after `since`, which is when the drive is first asked."""
+    """Future errors: `delay` seconds after `since`, the time of the first request to the drive."""
 
     delay: float
     errors: int
@@ -56,9 +56,9 @@ class EmulatedMicroFlex(HostCommsDevice):
     """One axis, its command and status word, a speed that follows its reference, errors that latch.
 
     `current_control` False: speed control. `host_reference`: the references come from the host. Otherwise writes to
-    the reference that does not apply are refused. `ripple` is by how much of itself, 0 to 1, the measured speed swings
-    with every turn. Writes to unmapped elements are refused. Reads of them are refused too; without `refuse_unmapped`
-    they return 0, and with `ignore_unmapped` they have no reply: the document does not say which of these a drive does.
+    the reference that does not apply are refused. `ripple`: share, 0 to 1, by which the measured speed varies with
+    every turn. Writes to unmapped elements are refused. Reads of them are refused too; without `refuse_unmapped` they
+    return 0, and with `ignore_unmapped` they have no reply, because the document does not define it.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class EmulatedMicroFlex(HostCommsDevice):
         """Latched asynchronous errors, a bitmap."""
         self.drive_error = 0
         self.causes = 0
-        """The axis errors that cannot be cancelled, since what caused them is still there."""
+        """The axis errors that cannot be cancelled, because their cause still exists."""
         self.command_word = 0
         self.speed_reference = 0.0
         self.torque_reference = 0.0
@@ -101,10 +101,10 @@ class EmulatedMicroFlex(HostCommsDevice):
         self._temperature = AMBIENT
         self._updated = -math.inf
 
-    # What happens to it
+    # Presets and errors
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values in an element and those after it: position, errors, command word, references, I/O, firmware."""
+        """Set an element and those after it: position, errors, command word, references, I/O, firmware."""
         first = int(item) if is_decimal(item) else 0
         for element, value in enumerate(values, first):
             if not self._hold(element, value):
@@ -137,11 +137,11 @@ class EmulatedMicroFlex(HostCommsDevice):
         return True
 
     def trip_after(self, delay: float, errors: int, drive_errors: int = 0) -> None:
-        """Trip the drive `delay` seconds after it is first asked."""
+        """Trip the drive `delay` seconds after the first request."""
         self._trip = Trip(delay, errors, drive_errors)
 
     def trip(self, errors: int, now: float, drive_errors: int = 0) -> None:
-        """Let an error occur. It latches and disables the drive, unless the cancel bit was left high."""
+        """Cause errors, which disable the drive and latch. Axis errors are ignored while the cancel bit is set."""
         self._update(now)
         self.drive_error |= drive_errors
         if not self.command_word & CANCEL:
@@ -151,7 +151,7 @@ class EmulatedMicroFlex(HostCommsDevice):
     def set_hardware_enable(self, active: bool, now: float) -> None:
         """Set the hardware enable input.
 
-        Without it the drive is disabled; when it comes back the drive stays so until it is commanded again.
+        Without it the drive is disabled. When it returns, the drive stays disabled until the next command.
         """
         self._update(now)
         self.hardware_enable = active
@@ -167,7 +167,7 @@ class EmulatedMicroFlex(HostCommsDevice):
         self._apply(now)
 
     def command(self, word: int, now: float) -> None:
-        """Do what a write to the command word does."""
+        """Execute a write to the command word."""
         self._update(now)
         self.command_word = word
         if word & CANCEL:
@@ -216,7 +216,7 @@ class EmulatedMicroFlex(HostCommsDevice):
 
     @property
     def status_word(self) -> int:
-        """The status word as element 109 shows it."""
+        """The status word, as in element 109."""
         return (
             STATUS_ERROR * bool(self.axis_error or self.drive_error)
             | STATUS_STOP_INPUT * self.stop_input
@@ -313,7 +313,7 @@ class EmulatedMicroFlex(HostCommsDevice):
         return abs(self._torque) / 100 * RATED_CURRENT
 
     def _update(self, now: float) -> None:
-        """Let time pass: the motor has turned, and the drive has warmed up or cooled down."""
+        """Update position and temperature to the time `now`."""
         if now > self._updated:
             self._motor.advance(now)
             final = AMBIENT + HEATING * abs(self._torque) / 100
@@ -331,10 +331,7 @@ class EmulatedMicroFlex(HostCommsDevice):
             self.trip(trip.errors, now, trip.drive_errors)
 
     def _apply(self, now: float) -> None:
-        """Decide whether the drive runs, and at what speed it aims.
-
-        After the cancel bit, motion waits until it is cleared.
-        """
+        """Decide whether the drive runs, and its target speed. While the cancel bit is set, it does not move."""
         if self.axis_error or self.drive_error or not self.hardware_enable:
             self.enabled = False
         reference = self.torque_reference if self.current_control else self.speed_reference
@@ -356,7 +353,7 @@ def make_device(
 ) -> EmulatedMicroFlex:
     """Make a drive; if it is lively, it runs.
 
-    With errors given it has tripped, or trips `trips_after` seconds after it is first asked.
+    With errors given it has tripped, or trips `trips_after` seconds after the first request.
     """
     drive = EmulatedMicroFlex(address, ripple=(0.01 if lively else 0.0) if ripple is None else ripple, **options)
     drive.hardware_enable = hardware_enable

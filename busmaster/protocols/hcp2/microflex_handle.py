@@ -19,9 +19,9 @@ from busmaster.protocols.hcp2 import microflex
 from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
 
 CLEAR_WITHIN = 2.0
-"""Seconds for which cancel_errors goes on trying to clear the cancel bit, even if its caller was cancelled."""
+"""Seconds for which cancel_errors tries to clear the cancel bit, even if its caller was cancelled."""
 LOOK_AGAIN = 0.02
-"""Seconds between two looks at the status word."""
+"""Seconds between two reads of the status word."""
 
 _NOTHING = CommandWord(0)
 
@@ -34,7 +34,7 @@ class MicroFlexDrive(CommsHandle):
         await drive.set_speed_reference(25.0)       # % of the application's maximum speed
         speed = await drive.speed_measured.read()
 
-    No loss of communication stops the drive: assume that it keeps its last reference when the master dies.
+    A loss of communication does not stop the drive: assume that it keeps its last reference when the master fails.
     """
 
     profile: ClassVar[Profile] = microflex.PROFILE
@@ -78,56 +78,56 @@ class MicroFlexDrive(CommsHandle):
         return await self.status_word.read(**options)
 
     async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
-        """Return that the drive is enabled, as its status word says; "" if it is not."""
+        """Return that the drive is enabled, from its status word; "" if it is not."""
         status = await self.status(**options)
-        return "its status word says ENABLED" if StatusWord.ENABLED in status else ""
+        return "ENABLED is set in its status word" if StatusWord.ENABLED in status else ""
 
     async def check_firmware(self, **options: Unpack[ReadOptions]) -> int:
         """Return the drive's firmware build. Raises VerifyFailed if it is too old to have this map."""
         build = await self.firmware.read(**options)
         if build < microflex.FIRST_FIRMWARE:
             raise VerifyFailed(
-                f"firmware build {build} is older than {microflex.FIRST_FIRMWARE}, which brought the element map",
+                f"firmware build {build} is older than {microflex.FIRST_FIRMWARE}, the first with the element map",
                 node=self.node,
                 hint="update the drive's firmware",
             )
         return build
 
     async def enable(self, *, within: float = 0.5) -> StatusWord:
-        """Enable the drive, and return its status word once that says so.
+        """Enable the drive, and return its status word when it is enabled.
 
-        Raises VerifyFailed, naming the cause that the status word gives, if it is not enabled `within` so many
-        seconds: an axis error, or the hardware enable input. Raises Superseded if a `disable` overtook it.
+        Raises VerifyFailed if it is not enabled `within` this many seconds, with the cause from the status word: an
+        axis error, or the hardware enable input. Raises Superseded if a `disable` overtook it.
         """
         within = seconds(within, f"{self.node.label}: within")
         await self._command(CommandWord.ENABLE)
         return await self._await_enabled(True, within, Priority.COMMAND)
 
     async def disable(self, *, within: float = 0.5) -> StatusWord:
-        """Disable the drive before anything else on the line, and return its status word once that says so.
+        """Disable the drive before any other request on the line, and return its status word when it is disabled.
 
-        It is retried like a read. Writes to this drive that wait are dropped with Superseded, and a `cancel_errors`
-        under way will not enable it again. Raises VerifyFailed if it is still enabled after `within` seconds.
-        A cancelled caller's disable is not sent: shield it where it must go out.
+        It is retried like a read. Queued writes to this drive fail with Superseded, and a running `cancel_errors` does
+        not enable it again. Raises VerifyFailed if it is still enabled after `within` seconds. If the caller is
+        cancelled before it is sent, it is not sent: use a shield if it must be.
         """
         within = seconds(within, f"{self.node.label}: within")
-        self.node.note_stop()  # before the write, so that a cancel_errors under way keeps no enable bit from now on
+        self.node.note_stop()  # before the write, so that a running cancel_errors no longer sets the enable bit
         await self._command(_NOTHING, priority=Priority.URGENT, stop=True)
         return await self._await_enabled(False, within, Priority.URGENT)
 
     async def cancel_errors(self) -> StatusWord:
         """Cancel asynchronous axis errors: set the cancel bit, keep the enable bit, and clear the cancel bit again.
 
-        The cancel bit is cleared whatever happens, also when the caller is cancelled; this may take up to 2 s. Raises
-        WriteUnconfirmed, or what the last attempt raised, if that could not be done: the drive must not be left so.
-        Returns the status word after it.
+        The cancel bit is cleared in any case, also if the caller is cancelled; this can take up to 2 s. If that is not
+        possible, raises WriteUnconfirmed or the error of the last attempt: the drive must not stay in this state.
+        Returns the status word.
         """
         stops = self.node.stops
         word = await self.command_word.read()
 
         async def command(cancel: CommandWord) -> None:
-            """Decide anew for each write: the drive may have been disabled meanwhile, by whomever."""
-            # the cancel bit alone would disable a drive that runs; bits that the note does not define stay 0
+            """Decide again for each write: another program may have disabled the drive in the meantime."""
+            # The cancel bit alone would disable a running drive. Bits that AN00129 does not define stay 0.
             kept = word & CommandWord.ENABLE if self.node.stops == stops else _NOTHING
             await self._command(kept | cancel, stops_seen=stops if kept else None)
 
@@ -137,7 +137,7 @@ class MicroFlexDrive(CommsHandle):
             try:
                 await _to_the_end(self._clear_cancel(command))
             except BusError:
-                pass  # what went wrong first says more
+                pass  # the first error is more useful
             raise
         await _to_the_end(self._clear_cancel(command))
         return await self.status()
@@ -163,7 +163,7 @@ class MicroFlexDrive(CommsHandle):
         stops_seen: int | None = None,
         stop: bool = False,
     ) -> None:
-        """Write the command word. It changes more than its own point: all samples of the drive are stale after it."""
+        """Write the command word. It affects more than its own point, so all samples of the drive become stale."""
         command = _command(word)
         await self.node.request(command, priority=priority, stops_seen=stops_seen, stop=stop)
 
@@ -175,7 +175,7 @@ class MicroFlexDrive(CommsHandle):
                     await command(_NOTHING)
                 except BusClosed:  # nothing can be sent any more
                     raise
-                except BusError as error:  # dropped by a disable, too: it is decided anew
+                except BusError as error:  # possibly superseded by a disable: `command` decides again
                     last = error
                 else:
                     return
@@ -187,7 +187,7 @@ class MicroFlexDrive(CommsHandle):
         )
 
     async def _await_enabled(self, wanted: bool, within: float, priority: Priority) -> StatusWord:
-        """Look at the status word until its bit 7 is as wanted."""
+        """Read the status word until its bit 7 has the wanted state."""
         deadline = self.node.now() + within
         while True:
             status = await self.status(priority=priority)
@@ -203,13 +203,13 @@ class MicroFlexDrive(CommsHandle):
 
     _actions: ClassVar[Mapping[str, Action]] = {
         "enable": Action(
-            "Enable the drive, and wait until its status word says so.",
+            "Enable the drive, and wait until its status word shows it.",
             enable,
             check=lambda drive: drive.node.check(_command(CommandWord.ENABLE)),
             time="within",
         ),
         "disable": Action(
-            "Disable the drive ahead of all other traffic, and wait until its status word says so.",
+            "Disable the drive ahead of all other traffic, and wait until its status word shows it.",
             disable,
             check=lambda drive: drive.node.check(_command(_NOTHING), stop=True),
             time="within",
@@ -228,9 +228,9 @@ def _command(word: CommandWord) -> hcp2.Write:
 
 
 async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
-    """Run `work` whole, even if the caller is cancelled meanwhile: it gets its CancelledError after that.
+    """Run `work` to its end, even if the caller is cancelled: the caller gets its CancelledError afterwards.
 
-    It runs in a task of its own, since a scope's shield holds off anyio's cancellation, but not `Task.cancel()`.
+    It runs in a task of its own, because a scope's shield stops anyio's cancellation, but not `Task.cancel()`.
     """
     task = asyncio.ensure_future(work)
     cancelled: asyncio.CancelledError | None = None
@@ -247,7 +247,7 @@ async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
 
 
 def _why_not(status: StatusWord) -> str:
-    """Return why a drive that was told to enable has not, as far as its status word tells."""
+    """Return why a drive did not enable, as far as its status word shows it."""
     reasons = []
     if StatusWord.ASYNCHRONOUS_ERROR in status:
         reasons.append("it has an error (see axis_error and drive_error)")

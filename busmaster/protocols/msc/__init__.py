@@ -15,13 +15,13 @@ ADDRESS_STEP = Option(
     "address_step",
     "whole",
     "addresses from one value to the next",
-    about="By how much data addresses grow from one value to the next: 1, 2 or 4. Its emulated unit has 4 by default.",
+    about="Difference of the data addresses of two consecutive values: 1, 2 or 4. Its emulated unit has 4 by default.",
 )
 MODEL = Option(
     "model",
     "text",
     choices=("MSC-250", "MSC-850", "MSC-850/32"),
-    about="Which model it is, and so which commands it knows. For its emulated unit MSC-250 by default.",
+    about="The model, which determines the supported commands. For its emulated unit MSC-250 by default.",
 )
 
 __all__ = ["PROTOCOL", "ProgramStatus"]

@@ -1,4 +1,4 @@
-"""Transfers of many values: which exchanges they take, and how far they are."""
+"""Transfers of many values: their exchanges, and their progress."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.codec import BLOCK, HIGHEST_ADDRESS, BlockRead, BlockWrite, DataRead, DataWrite
 
 Progress = Callable[[int, int], None]
-"""Called with how many values are done, of how many."""
+"""Called with the number of transferred values, and their total."""
 
 
 def place(address: int, index: int, step: int | None) -> int:
-    """Return the address of the value `index` places behind the one at `address`.
+    """Return the address of the value `index` places after the one at `address`.
 
-    Raises InvalidCommand for one that does not exist, and while the address step is unknown.
+    Raises InvalidCommand if it does not exist, and if the address step is unknown.
     """
     if not index:
         return address
@@ -46,10 +46,9 @@ def reads(address: int, count: int, step: int | None) -> list[Part]:
 
 
 def reads_back(address: int, count: int, step: int | None) -> list[Part]:
-    """Return the exchanges that read values just written, in blocks that begin one value later than `writes` has them.
+    """Return the exchanges that read values back, in blocks that begin one value later than those of `writes`.
 
-    Where the address step is wrong, the blocks written lie apart or over each other, and only blocks that span two
-    of them show it.
+    If the address step is wrong, the written blocks have gaps or overlap. Only blocks that span two of them show it.
     """
     if step is None or count == 1:
         return reads(address, count, step)
@@ -57,7 +56,7 @@ def reads_back(address: int, count: int, step: int | None) -> list[Part]:
 
 
 def writes(address: int, values: Sequence[int], step: int | None) -> list[tuple[BlockWrite | DataWrite, int]]:
-    """Return the exchanges that write `values`, and how many each holds: whole blocks, and the rest one by one."""
+    """Return the exchanges that write `values`, each with its number of values: whole blocks, then single values."""
     if not values:
         raise InvalidCommand("there is no value to write")
     whole = len(values) - len(values) % BLOCK
@@ -67,7 +66,7 @@ def writes(address: int, values: Sequence[int], step: int | None) -> list[tuple[
 
 
 class Count:
-    """Tells `progress` how far a transfer of `total` values is."""
+    """Reports the progress of a transfer of `total` values."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress = progress
@@ -75,7 +74,7 @@ class Count:
         self._done = 0
 
     def add(self, values: int) -> None:
-        """Tell `progress` that so many more values are done."""
+        """Report that this many more values were transferred."""
         self._done += values
         if self._progress is not None:
             self._progress(self._done, self._total)

@@ -1,4 +1,4 @@
-"""MSC as a listener hears it."""
+"""Reads captures of MSC."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNITS = range(1, 16)
 
 
 class Op(NamedTuple):
-    """One MSC command: body lengths of request and reply (0: it has none) and what it names."""
+    """One MSC command: body lengths of request and reply (0: no reply), and the form of its item."""
 
     request: int
     reply: int
@@ -38,13 +38,13 @@ OPS = {
     "RQSTAT": Op(7, 15, "status"),
 }
 _OPEN_ENDED = {"RQSTAT"}
-"""What follows the status word is "not currently used": replies may have other lengths."""
+"""The bytes after the status word are "not currently used": replies may have other lengths."""
 
 
 class MscDialect:
-    """Request packet, ACK, reply packet, the host's ACK. Who sent a packet follows from where in that it comes.
+    """Request packet, ACK, reply packet, the host's ACK. The sender of a packet follows from its position in this.
 
-    Lengths tell a request from a reply for every command but RFLAG; there the conversation does.
+    The length distinguishes a request from a reply for every command except RFLAG; there the conversation does.
     """
 
     starts = bytes((STX,))
@@ -113,7 +113,7 @@ class MscDialect:
         elif not self._acked:
             frame.fault = frame.fault or UNACKED
         elif frame.node != asked.node or frame.command != asked.command:
-            frame.fault = frame.fault or f"wrong answer: {asked.command} of unit {asked.node} was asked"
+            frame.fault = frame.fault or f"wrong reply: {asked.command} of unit {asked.node} was requested"
         self._answer = frame.raw
 
     def _acknowledge(self, raw: bytes, sender: Direction) -> Frame:

@@ -1,9 +1,9 @@
 """MSC controllers (IB-11A002 rev E): data variables of 32 bits, 256 flags, the program's status word.
 
 Each command is one packet whose body is an ASCII name, a comma and binary values, most significant byte first.
-Writes are answered by an ACK alone; reads by an ACK and a packet of the same name. `msc_exchange` has the wire.
+The reply to a write is an ACK; the reply to a read is an ACK and a packet with the same name. `exchange` implements it.
 
-Which data addresses and flags exist, and which may be written, is the controller's business: it says NAK.
+The controller decides which data addresses and flags exist and may be written. It refuses all others with a NAK.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from busmaster.wire.readers import ACK
 T = TypeVar("T")
 
 BLOCK = 32
-"""Values of one BREAD or BWRITE: never more, never fewer."""
+"""Number of values of each BREAD or BWRITE."""
 FLAGS = 256
 HIGHEST_ADDRESS = 0xFFFF
 WIDEST_STEP = 4
-"""What an address grows by at most from one value to the next, as far as is known: a value has four bytes."""
+"""Largest known difference of the addresses of two consecutive values: a value has four bytes."""
 LOWEST_VALUE = -(2**31)
 HIGHEST_VALUE = 2**31 - 1
 
@@ -41,7 +41,7 @@ class _Reading:
 
 
 class _Writing:
-    """A program may consume what was written, so no write may be repeated unexpected."""
+    """A program may consume a written value, so no write is repeated unless the caller allows it."""
 
     __slots__ = ()
     writes = True
@@ -113,7 +113,7 @@ class BlockRead(_Reading, _AtAddress):
         return f"read {BLOCK} values from data {self.address}"
 
     def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
-        """Return its values by their addresses: the first alone where the address step is not known."""
+        """Return its values by their addresses; only the first if the address step is not known."""
         step = _step_of(profile)
         return {("data", self.address + i * (step or 0)): one for i, one in enumerate(value if step else value[:1])}
 
@@ -123,7 +123,7 @@ class BlockRead(_Reading, _AtAddress):
 
 @dataclass(frozen=True, slots=True)
 class BlockWrite(_Writing, _AtAddress):
-    """BWRITE: 32 values from a data address on. Fewer are refused: padding would overwrite what lies behind them."""
+    """BWRITE: 32 values from a data address on. Fewer are rejected: padding would overwrite the values after them."""
 
     values: tuple[int, ...]
 
@@ -194,7 +194,7 @@ class ReadFlag(_Reading, _OfFlag):
 
 @dataclass(frozen=True, slots=True)
 class ReadFlags(_Reading):
-    """RFLAGS: the numbers of all flags that are on. Only MSC-850/32 and MSC-250 know it; others say NAK."""
+    """RFLAGS: the numbers of all flags that are on. Only MSC-850/32 and MSC-250 have it; others reply with a NAK."""
 
     def __str__(self) -> str:
         return "read all flags"
@@ -208,7 +208,7 @@ class ReadFlags(_Reading):
 
 @dataclass(frozen=True, slots=True)
 class ReadStatus(_Reading):
-    """RQSTAT: the macroprogram status word. What follows it in the reply is "not currently used": any is accepted."""
+    """RQSTAT: the macroprogram status word. The bytes after it are "not currently used": any are accepted."""
 
     def __str__(self) -> str:
         return "read program status"
@@ -220,7 +220,7 @@ class ReadStatus(_Reading):
 
 @dataclass(frozen=True, slots=True)
 class PickedData(_Reading, _AtAddress):
-    """Some of the 32 values of one BREAD, by their places 0 to 31: what several DREADs would have read."""
+    """Some of the 32 values of one BREAD, by their places 0 to 31, instead of several DREADs."""
 
     places: tuple[int, ...]
 
@@ -241,7 +241,7 @@ class PickedData(_Reading, _AtAddress):
 
 @dataclass(frozen=True, slots=True)
 class PickedFlags(_Reading):
-    """Some of the flags of one RFLAGS: what several RFLAGs would have read."""
+    """Some of the flags of one RFLAGS, instead of several RFLAGs."""
 
     flags: tuple[int, ...]
 
@@ -263,9 +263,9 @@ class PickedFlags(_Reading):
 class Merging:
     """A Profile's `merge`: neighbouring DREADs as one BREAD, RFLAGs as one RFLAGS.
 
-    `address_step` is what the address grows by from one value to the next; without it no DREADs are merged.
-    `all_flags` says that the controller knows RFLAGS (MSC-850/32, MSC-250). Raises InvalidCommand for a step of 0,
-    or one so large that no block has room.
+    `address_step`: difference of the addresses of two consecutive values; without it no DREADs are merged. `all_flags`:
+    the controller has RFLAGS (MSC-850/32, MSC-250). Raises InvalidCommand for a step of 0, and for one with which no
+    block fits into the addresses.
     """
 
     address_step: int | None = None
@@ -284,15 +284,15 @@ class Merging:
 
 
 def _step_of(profile: Profile) -> int | None:
-    """Return what the address grows by from one value to the next; None where that is not known."""
+    """Return the difference of the addresses of two consecutive values; None if it is not known."""
     return profile.merge.address_step if isinstance(profile.merge, Merging) else None
 
 
 def _data_changes(profile: Profile, first: int, values: Sequence[int]) -> Mapping[Hashable, Any]:
-    """Return what data addresses hold after a write. Where the address step is not known, nor is what a block changes.
+    """Return the values of data addresses after a write; None for an address whose value is not known.
 
-    Between two values that are more than an address apart lie parts of the first, and before the first of the one
-    before it.
+    If the address step is not known, only the first value of a block has a known address. If it is more than 1, the
+    addresses between two values contain parts of a value, and so do those before the first.
     """
     step = _step_of(profile)
     widest = step or (1 if len(values) == 1 else WIDEST_STEP)
@@ -314,7 +314,7 @@ def _data_batches(commands: Sequence[Command[Any]], step: int) -> list[Batch]:
             if (address - first) % step == 0 and address - first < BLOCK * step
         }
         waiting = [(address, i) for address, i in waiting if i not in reached]
-        # a BREAD is always of 32 values: none may reach beyond the last address
+        # A BREAD always has 32 values: the last one must exist too.
         if len(reached) > 1 and first + (BLOCK - 1) * step <= HIGHEST_ADDRESS:
             batches.append(Batch(PickedData(first, tuple(reached.values())), tuple(reached)))
     return batches
@@ -345,7 +345,7 @@ def _block_of(payload: bytes) -> tuple[int, ...]:
 def _state_of(payload: bytes) -> bool:
     state = int.from_bytes(payload, "big")
     if state > 1:
-        # the packet was sound: without an ACK it would come again, into other exchanges
+        # The checksum was right: without an ACK the packet would be sent again, into other exchanges.
         raise FrameError(f"a flag's state must be 0 or 1, not {state}", send=ACK)
     return state == 1
 
@@ -375,9 +375,9 @@ PROFILE = Profile(
     sync_reads=(
         ReadStatus(),
         ReadFlag(0),
-    ),  # a reply repeats the name of its command, which tells these two apart (R15)
-    exchange_limit=2.0,  # a packet that is damaged again and again is then ACKed away and asked for anew
+    ),  # a reply repeats the name of its command, so these two differ (R15)
+    exchange_limit=2.0,  # a packet that is damaged repeatedly is then ACKed, dropped and requested again
     listen=StalePacketListener,  # a packet whose ACK was lost would be repeated five times, into other exchanges
-    fixed_rate=True,  # 9600 baud and no other
+    fixed_rate=True,  # only 9600 baud
 )
-"""The document gives no times."""
+"""The document contains no times."""

@@ -2,8 +2,8 @@
 
     packet    STX unit length16 sequence16 body checksum16    big-endian; the sum of all bytes from unit to body
 
-It answers ACK, or NAK if the packet is unsound, unknown or asks for what is not there. A packet that holds data follows
-its ACK, and is sent again until the host ACKs it, five times at most ("Data transfer sequence").
+It replies with an ACK, or with a NAK if the packet is damaged, unknown or refers to a missing address. A packet with
+data follows its ACK, and is sent again until the host ACKs it, five times at most ("Data transfer sequence").
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum16
 
-# none of this is the codec's: a misreading on one side is not to be hidden by the same on the other
+# Nothing here is shared with the codec: otherwise the same misinterpretation on both sides would not be noticed.
 STX, ACK_BYTE, NAK_BYTE = 0x02, 0x06, 0x15
 ACK = b"\x06"
 UNITS = range(1, 16)
@@ -33,7 +33,7 @@ BLOCK = 32
 VALUE = 4
 """Bytes of a data value."""
 MODELS = {"MSC-250": True, "MSC-850": False, "MSC-850/32": True}
-"""Whether each knows RFLAGS."""
+"""Whether each model has RFLAGS."""
 OPERANDS = {
     b"DREAD,": 2,
     b"DWRITE,": 2 + VALUE,
@@ -45,15 +45,15 @@ OPERANDS = {
     b"RFLAGS,": 0,
     b"RQSTAT,": 0,
 }
-"""Bytes that follow each command's name."""
+"""Number of bytes after each command's name."""
 REPLIES = {b"DREAD,": VALUE, b"BREAD,": VALUE * BLOCK, b"RFLAGS,": FLAGS // 8, b"RQSTAT,": 8}
-"""Likewise in its reply, where that differs: such a packet is a reply, and no request."""
+"""The same in its reply, if it differs. A packet with this length is a reply, not a request."""
 
 RUNNING, RAM_NOT_RELIABLE, SYSTEM_RESET, AUTO_START = 1, 4, 8, 64
 RUN_FLAG = 200
-"""The user flag that lets the program count. Ours, like the address: the document has no program."""
+"""The user flag with which the program counts. Chosen here, like the address: the document has no program."""
 SHORTEST_COUNT_PERIOD = 0.001
-FORM = "a data address that there is, flag:5, flags (the numbers of those that are on), or status"
+FORM = "an existing data address, flag:5, flags (the numbers of those that are on), or status"
 COUNT = 2000
 """The data address at which it counts."""
 
@@ -62,13 +62,13 @@ class EmulatedMsc(Device):
     """One unit, 1 to 15. Its macroprogram is running: while flag 200 is on it adds 1 to the value at 2000, once every
     `period` seconds.
 
-    `address_step` is what data addresses grow by from one 32-bit value to the next: 4, 2 or 1, since the document does
-    not say whether they count bytes. `addresses` of them exist. `read_only_flags` (inputs, timers) cannot be set or
-    cleared. `battery`: data outlives a power failure and the program starts again. `packet_delay` is from the end of
-    an ACK to the packet that follows it. With a `traceable` every data value is the traceable's.
+    `address_step`: difference of the data addresses of two consecutive 32-bit values, 4, 2 or 1. The document does not
+    define whether addresses count bytes. `addresses`: how many exist. `read_only_flags` (inputs, timers) cannot be set
+    or cleared. `battery`: data survives a power failure, and the program starts again. `packet_delay`: time from the
+    end of an ACK to the packet after it. With a `traceable`, it provides every data value.
 
-    `naks_ahead`, `missing_acks_ahead` and `bad_packets_ahead` are for tests: so many of the next requests are refused
-    unheeded, of the next ACKs left out, of the next packets sent with a wrong bit.
+    For tests: `naks_ahead` of the next requests are refused without effect. `missing_acks_ahead` of the next ACKs are
+    omitted. `bad_packets_ahead` of the next packets have a wrong bit.
 
     Raises InvalidCommand for a unit, model or step that does not exist.
     """
@@ -100,7 +100,7 @@ class EmulatedMsc(Device):
         self.model = model
         self.address_step = address_step
         self.read_only_flags = read_only_flags
-        self.battery = battery  # the manual does not say what survives without power
+        self.battery = battery  # the manual does not define which data survives without power
         self.period = period
         self.packet_delay = Delay() if packet_delay is None else packet_delay
         self.traceable = traceable
@@ -112,23 +112,23 @@ class EmulatedMsc(Device):
         """Packets that were sent again."""
         self.routes = (bytes((STX, address)),)
         self._width = VALUE // address_step
-        """Bytes that an address stands for."""
+        """Bytes per address."""
         self._memory = bytearray(addresses * self._width)
         self._counted_until = NEVER
         self._frame = bytearray()
         self._size = FRAMING
         self._complete_by = NEVER
         self._packet = b""
-        """What the host has yet to ACK."""
+        """The packet that the host has not ACKed yet."""
         self._retransmissions = 0
         self._retransmit_at = NEVER
 
-    # What is in it
+    # Values
 
     def preset(self, item: str, *values: float) -> None:
-        """Hold values from a data address on ("2008"), in "flag:5" and those after it 0 or 1, in "status" the word.
+        """Set values from a data address on ("2008"), 0 or 1 in "flag:5" and those after it, or the word in "status".
 
-        "flags" are given as the numbers of those that are on.
+        "flags" has the numbers of those that are on.
         """
         name, _, number = item.partition(":")
         if item == "flags":
@@ -141,7 +141,7 @@ class EmulatedMsc(Device):
         elif is_decimal(name) and int(name) * self._width + len(values) * VALUE <= len(self._memory):
             self.set_value(int(name), *(held(value, -(2**31), 2**31 - 1, "a data address") for value in values))
         else:
-            raise InvalidCommand(f"an emulated MSC cannot hold what is given at {item!r}: use {FORM}")
+            raise InvalidCommand(f"an emulated MSC cannot store the values at {item!r}: use {FORM}")
 
     @property
     def unacknowledged(self) -> bool:
@@ -153,7 +153,7 @@ class EmulatedMsc(Device):
         return int.from_bytes(self._memory[self._bytes_of(address, 1)], "big", signed=True)
 
     def set_value(self, address: int, *values: int) -> None:
-        """Hold consecutive values from a data address on. Raises KeyError, and OverflowError beyond 32 bits."""
+        """Set consecutive values from a data address on. Raises KeyError, and OverflowError beyond 32 bits."""
         data = b"".join(value.to_bytes(VALUE, "big", signed=True) for value in values)
         self._memory[self._bytes_of(address, len(values))] = data
 
@@ -174,7 +174,7 @@ class EmulatedMsc(Device):
             self._memory = bytearray(len(self._memory))
             self.status = SYSTEM_RESET | RAM_NOT_RELIABLE
 
-    # Hearing
+    # Receiving
 
     def take(self, frame: bytes, now: float) -> bool:
         if self._frame or len(frame) < FRAMING or len(frame) != int.from_bytes(frame[2:4], "big") + FRAMING:
@@ -201,9 +201,9 @@ class EmulatedMsc(Device):
         self._settle(now)
 
     def _go_on(self, now: float) -> None:
-        """Obey the packet that the last byte ended, if it is to this unit.
+        """Execute the packet that the last byte completed, if it is for this unit.
 
-        Any byte can stand anywhere in a packet: whoever it is for, its length alone says where it ends.
+        Any byte can occur anywhere in a packet, so only its length shows its end, also for packets to other units.
         """
         frame = self._frame
         length = len(frame)
@@ -214,7 +214,7 @@ class EmulatedMsc(Device):
         elif length == self._size:
             whole = bytes(frame)
             frame.clear()
-            if whole[1] == self.address:  # a packet to another unit was counted through, for its data may hold an STX
+            if whole[1] == self.address:  # packets to other units are counted too: their data may contain an STX
                 self._handle(whole, now)
 
     def wake(self, now: float) -> None:
@@ -228,7 +228,7 @@ class EmulatedMsc(Device):
         self._settle(now)
 
     def _settle(self, now: float) -> None:
-        """Decide whether it must hear everything from now on, and when it wants to be woken."""
+        """Decide whether it must receive every byte from now on, and when `wake` is due."""
         if self._frame:
             self.attentive = True
             self.wakeup = self._complete_by
@@ -239,16 +239,16 @@ class EmulatedMsc(Device):
             self.attentive = False
             self.wakeup = NEVER
 
-    # Answering
+    # Replying
 
     def _handle(self, frame: bytes, now: float) -> None:
-        """Answer a whole packet to this unit. The host has moved on from whatever it has not ACKed."""
+        """Reply to a complete packet to this unit. The host does not ACK an earlier packet any more."""
         body = frame[HEADER:-2]
         name = body[: body.find(b",") + 1]
         operand = body[len(name) :]
-        if len(operand) == REPLIES.get(name):  # on two wires it may hear its own packet come back
+        if len(operand) == REPLIES.get(name):  # on two wires it may receive its own packet
             return
-        self._packet = b""  # the manual does not say what becomes of it: here it is forgotten
+        self._packet = b""  # the manual does not define this case: here the packet is dropped
         if self.naks_ahead:
             self.naks_ahead -= 1
             self.reply(NAK, now)
@@ -265,7 +265,7 @@ class EmulatedMsc(Device):
             self.missing_acks_ahead -= 1
         else:
             heard_at = self.reply(ACK, now)
-            self.lag = 0.0  # of a late answer only the ACK is late
+            self.lag = 0.0  # if a reply is late, only its ACK is
         if answer:
             self._packet = packet(self.address, name + answer)
             self._retransmissions = 0
@@ -287,7 +287,7 @@ class EmulatedMsc(Device):
         self._transmit(now, self.delay)
 
     def _perform(self, name: bytes, operand: bytes, now: float) -> bytes | None:
-        """Return what its reply holds: nothing for a write, None to refuse."""
+        """Return the data of its reply: empty for a write, None to refuse."""
         if RUN_FLAG in self.flags:
             self._count(now)
         if name == b"RQSTAT,":
@@ -334,7 +334,7 @@ class EmulatedMsc(Device):
         return b""
 
     def _count(self, now: float) -> None:
-        """Count what the program has done since it was last asked. Its time begins when it is first asked."""
+        """Count the steps of the program since the last request. Its time begins with the first request."""
         if self._counted_until == NEVER or not self.status & RUNNING:
             self._counted_until = now
         steps = int((now - self._counted_until) / self.period)

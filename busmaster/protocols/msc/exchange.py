@@ -1,4 +1,4 @@
-"""MSC packets, and what the host and a controller say to each other about them (IB-11A002 rev E).
+"""MSC packets, and the conversation of host and controller about them (IB-11A002 rev E).
 
     packet    STX unit length16 sequence16 body checksum16     big-endian; the sum of all bytes from unit to body
 
@@ -10,15 +10,14 @@ The conversation ("Data transfer sequence"):
     host: ACK              ->  done
     host: NAK              ->  the packet again, at most five times
 
-Any byte can stand anywhere in a packet, so a reader counts from STX and never searches. Where the count itself is in
-doubt (a damaged header, bytes where none belong) the reader is lost: it swallows what comes until the line pauses for a
-inter-byte timeout, and speaks only then. So it never talks into a packet, and never takes a byte from the middle of one
-for an ACK.
+Any byte can occur anywhere in a packet, so a reader counts from STX and never searches. If the count is uncertain (a
+damaged header, unexpected bytes), the reader is lost. It drops all bytes until the line pauses for an inter-byte
+timeout, and sends only then. So it never sends into a packet, and never interprets a byte within a packet as an ACK.
 
-A reply names its command but no data address. So a packet that comes before the request's ACK is never a reply:
-it answers something older; it is ACKed and dropped, and the ACK still awaited. If that packet is said twice, the
-host's ACK runs into the second one's STX, and unit 6 follows: the byte of an ACK. So behind a dropped packet an ACK
-counts only with a pause (for a write) or a packet (for a read) right behind it.
+A reply contains its command but no data address. So a packet before the request's ACK is never its reply, but belongs
+to an older request. It is ACKed and dropped, and the reader still waits for the ACK. If that packet is sent twice, the
+host's ACK collides with the second one's STX, and the unit number 6 follows, which is also the byte of an ACK. So after
+a dropped packet an ACK counts only with a pause (for a write) or a packet (for a read) directly behind it.
 """
 
 from __future__ import annotations
@@ -51,10 +50,10 @@ FRAMING = 8
 LONGEST_BODY = 240
 LONGEST_PACKET = LONGEST_BODY + FRAMING
 LONGEST_HEARD = 2 * LONGEST_PACKET
-"""Bytes of a packet that no controller may say, and whose end is awaited all the same: it is told from noise then."""
+"""Longest invalid packet whose end is awaited, so that it can be distinguished from noise."""
 UNITS = range(1, 16)
 
-RESENDS = 3  # the manual leaves the number to the host
+RESENDS = 3  # the host chooses this number, according to the manual
 HOST_NAKS = 5  # a controller sends its packet again five times at most
 STALE_PACKETS = 6  # one packet, and the five times that it is sent again
 
@@ -66,9 +65,9 @@ def packet(unit: int, body: bytes) -> bytes:
 
 
 def packet_size(data: bytes | bytearray) -> int | None:
-    """Return the bytes of the packet that `data` begins with.
+    """Return the length of the packet at the beginning of `data`.
 
-    It is 0 while that cannot be told, and None if no packet begins so.
+    It is 0 if the length is not known yet, and None if `data` does not begin with a packet.
     """
     if data[0] != STX[0]:
         return None
@@ -79,20 +78,20 @@ def packet_size(data: bytes | bytearray) -> int | None:
 
 
 def claimed_size(data: bytes | bytearray) -> int:
-    """Return the bytes of a packet whose header `data` begins with, be it longer than any may be; 0 if none does."""
+    """Return the length in the packet header at the beginning of `data`, even if it is too long; 0 if there is none."""
     return int.from_bytes(data[2:4], "big") + FRAMING if data[0] == STX[0] and data[1] in UNITS else 0
 
 
 def is_sound(whole: bytes) -> bool:
-    """Return whether the checksum of a whole packet is right."""
+    """Return True if the checksum of a complete packet is right."""
     return sum16(whole[1:-2]) == int.from_bytes(whole[-2:], "big")
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The packet that answers a read: from `unit`, `name` with its comma, then `payload` bytes.
+    """The reply packet of a read: from `unit`, `name` with its comma, then `payload` bytes.
 
-    Other payloads of at least `shortest` bytes are accepted too, if that is given.
+    If `shortest` is given, other payloads of at least this length are accepted too.
     """
 
     unit: int
@@ -102,34 +101,34 @@ class Reply:
 
     @property
     def size(self) -> int:
-        """Bytes of the whole packet."""
+        """Length of the complete packet."""
         return FRAMING + len(self.name) + self.payload
 
     def echoed_by(self, whole: bytes) -> bool:
-        """Return whether this packet has the length, the unit and the command name of the reply."""
+        """Return True if this packet has the length, the unit and the command name of the reply."""
         payload = len(whole) - FRAMING - len(self.name)
         right_length = payload == self.payload if self.shortest is None else payload >= self.shortest
         return right_length and self.named_by(whole)
 
     def named_by(self, whole: bytes) -> bool:
-        """Return whether this packet has the unit and the command name of the reply, of whatever length it is."""
+        """Return True if this packet has the unit and the command name of the reply, with any length."""
         return whole[1] == self.unit and whole.startswith(self.name, HEADER)
 
     @property
     def header(self) -> bytes:
-        """What every such packet begins with: unit, length and command name tell it from all other replies."""
+        """Beginning of every such packet. Unit, length and command name distinguish it from all other replies."""
         length = len(self.name) + self.payload
         return STX + bytes((self.unit, *length.to_bytes(2, "big"), 0, 0)) + self.name
 
     def payload_of(self, whole: bytes) -> bytes:
-        """Return the payload of a whole packet."""
+        """Return the payload of a complete packet."""
         return whole[HEADER + len(self.name) : -2]
 
 
 class PacketExchange(Generic[T]):
-    """One request packet on the wire; then its ACK; then, if a `reply` is due, that packet and the host's ACK.
+    """One request packet on the wire, then its ACK, then for a read the `reply` packet and the host's ACK.
 
-    `decode` makes the value of the reply's payload, or of nothing for a write; it may raise FrameError.
+    `decode` converts the reply's payload to the value (for a write it is empty). It may raise FrameError.
     """
 
     __slots__ = (
@@ -173,7 +172,7 @@ class PacketExchange(Generic[T]):
 
     @property
     def overdue(self) -> tuple[bytes, ...]:
-        """An ACK, and the packet behind it."""
+        """An ACK, and the packet after it."""
         return self.answers if self._acked or self._reply is None else (ACK, *self.answers)
 
     def feed(self, data: bytes, /) -> Progress[T]:
@@ -184,7 +183,7 @@ class PacketExchange(Generic[T]):
         if self._lost:
             return self._swallow()
         if self._acked and self._reply is None:
-            raise FrameError("an ACK within other bytes, behind a packet that answers something else")
+            raise FrameError("an ACK within other bytes, after a packet for another request")
         if not self._acked:
             if buffer[0] == ACK[0]:  # ACK and packet may arrive in one piece
                 del buffer[0]
@@ -207,20 +206,21 @@ class PacketExchange(Generic[T]):
             return Done(self._decode(b""))
         what = f"the packet was cut short after {arrived} bytes"
         if self._lost:
-            what = f"{arrived} bytes that are no packet, the first of them {self._buffer[0]:02x}"
+            what = f"{arrived} bytes that are not a packet, the first of them {self._buffer[0]:02x}"
         if not self._acked or (self._lost and self._stale):
             raise FrameError(what, send=ACK)
         if not arrived:
             raise self._other or FrameError("no packet followed the ACK", send=ACK)
-        # Fewer bytes than any packet has are none: noise, another unit's NAK, the end of one that was asked for again
-        # already. A NAK would have the packet that is still to come said twice, into the next exchange.
+        # Fewer bytes than any packet has are not a packet, but noise, another unit's NAK, or the end of a packet that
+        # was already requested again. A NAK would make the unit send the expected packet twice, into the next exchange
+        # (docs/proof.md, 15).
         return self._ask_again(FrameError(what, send=ACK), NAK if arrived >= FRAMING else b"")
 
     def abandon(self) -> FrameError | Refused:
-        """Return what to fail the attempt with in place of the last Expect's `send`, which must not have been sent.
+        """Return the error that fails the attempt instead of the last Expect's `send`, which must not have been sent.
 
-        This is for an Expect that would say something again (its `send` is not empty) where the exchange has lasted too
-        long or something urgent waits. A FrameError's own `send` leaves the device with nothing unacknowledged.
+        Used for an Expect that would send again (its `send` is not empty), if the exchange has taken too long or an
+        urgent request waits. A FrameError's own `send` leaves the device with nothing unacknowledged.
         """
         return self._failure
 
@@ -229,12 +229,12 @@ class PacketExchange(Generic[T]):
             return Done(self._decode(b""), rest=bytes(self._buffer))
         self._acked = True
         if self._reply is None:
-            return self.feed(b"")  # anything behind it?
+            return self.feed(b"")  # further bytes in the same chunk
         return Expect(self._packet_timing, self.later[0].sizes)
 
     def _resend(self) -> Expect:
         if self._resends == RESENDS:
-            # a NAK for a damaged packet looks like one for a request that cannot be met, which this many confirm
+            # The NAK for a damaged packet looks like that for an impossible request, which this many NAKs confirm.
             raise Refused(f"refused {1 + RESENDS} times", confirm=False)
         self._resends += 1
         self._failure = Refused()
@@ -252,11 +252,11 @@ class PacketExchange(Generic[T]):
         return MORE
 
     def _take(self, whole: bytes) -> Progress[T]:
-        # a packet before the ACK is never the reply, however well it fits: a reply names no data address
+        # A packet before the ACK is never the reply, even if it fits: a reply does not contain a data address.
         reply = self._reply if self._acked else None
         mine = reply is not None and reply.echoed_by(whole)
         if not is_sound(whole):
-            # its length may be what was damaged: where it ends is then not known
+            # Its length field may be damaged: then its end is not known.
             if reply is None or len(whole) != reply.size or len(self._buffer) > len(whole):
                 return self._swallow()
             return self._ask_again(FrameError("bad checksum", whole=mine, send=ACK))
@@ -265,8 +265,8 @@ class PacketExchange(Generic[T]):
             return Done(self._decode(reply.payload_of(whole)), send=ACK, rest=bytes(self._buffer))
         if whole == self.request:
             raise FrameError("the request came back: if this line echoes, declare echo=True", send=ACK)
-        if reply is not None and reply.named_by(whole):  # it may be an earlier one's: then the right one follows
-            self._other = other_format(len(whole), f"the packet asked for has {reply.size}", send=ACK)
+        if reply is not None and reply.named_by(whole):  # possibly for an earlier request: then the right one follows
+            self._other = other_format(len(whole), f"the requested packet has {reply.size}", send=ACK)
         return self._drop()
 
     def _ask_again(self, failure: FrameError, send: bytes = NAK) -> Expect:
@@ -279,7 +279,7 @@ class PacketExchange(Generic[T]):
         return Expect(self._packet_timing, self.later[0].sizes, send)
 
     def _drop(self) -> Expect:
-        failure = FrameError("a packet that answers something else", send=ACK)
+        failure = FrameError("a packet for another request", send=ACK)
         if self._stale == STALE_PACKETS:
             raise failure
         self._stale += 1
@@ -290,11 +290,11 @@ class PacketExchange(Generic[T]):
 
 
 class StalePacketListener:
-    """Reads what arrives while nothing is asked: a packet whose ACK was lost. It is ACKed and dropped, a bad one too.
+    """Reads bytes between requests: a packet whose ACK was lost. It is ACKed and dropped, even if it is damaged.
 
-    Otherwise the controller would send it again, up to five times, into the exchanges of others. The ACK before it may
-    come with it, if both are late. One ACK is for all packets that came together. Ready for the next packet whenever
-    one has ended.
+    Otherwise the controller would send it again, up to five times, into other exchanges. The unit's ACK before it may
+    arrive with it, if both are late. One ACK is sent for all packets that arrived together. It is ready for the next
+    packet when one has ended.
     """
 
     __slots__ = ("_buffer",)

@@ -35,7 +35,7 @@ from busmaster.protocols.msc.status import ProgramStatus
 
 MODELS_WITH_RFLAGS = frozenset({"MSC-250", "MSC-850/32"})
 ADDRESS_STEPS = (1, 4)
-"""The document does not say: addresses may count values or bytes."""
+"""The document does not define it: addresses may count values or bytes."""
 FORM = "a data address or symbol, 2008:32 for a run of 32, flag:5, flags, or status"
 
 
@@ -47,10 +47,10 @@ class MscController(Handle):
         await press.load_cam("cam", table)
         if ProgramStatus.PROGRAM_RUNNING in await press.status(): ...
 
-    `symbols` is the data table of the program's listing. `address_step` is what the address grows by from one value to
-    the next; the document does not say, so give it or let `find_address_step` find it: until then no more than one
+    `symbols`: the data table of the program's listing. `address_step`: difference of the addresses of two consecutive
+    values. The document does not define it, so give it or call `find_address_step`. Until it is known, no more than one
     block of 32 values is transferred at once. Models "MSC-250" and "MSC-850/32" send all flags in one exchange. All
-    handles of a unit know its step and its model; `symbols` are each handle's own.
+    handles of a unit share its step and its model; each handle has its own `symbols`.
     """
 
     profile: ClassVar[Profile] = msc.PROFILE
@@ -70,17 +70,17 @@ class MscController(Handle):
         self.symbols = dict(symbols or {})
         for name, symbol in self.symbols.items():
             DataRead(symbol)
-            # it could not be told from an item
+            # It could not be distinguished from an item.
             if not name or name in self.items() or is_decimal(name) or set(name) & set(":=, "):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
         known = Merging(address_step, model in MODELS_WITH_RFLAGS)
-        # one that says nothing leaves what another handle of this unit said: a wrong step would give wrong values
+        # A handle without these options keeps those of another handle of this unit: a wrong step gives wrong values.
         profile = self.profile if known == Merging() else replace(self.profile, merge=known)
         super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
 
     @property
     def address_step(self) -> int | None:
-        """What the address grows by from one value to the next, for every handle of this unit; None: not known yet."""
+        """Difference of the addresses of two consecutive values, for all handles of this unit; None: not known yet."""
         return self._merging.address_step
 
     @address_step.setter
@@ -193,8 +193,8 @@ class MscController(Handle):
         """Write a value, or consecutive values, acknowledged: `write_block` without its progress.
 
         `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
-        outcome: not where the program consumes what is written. Raises InvalidCommand, before anything is sent, for
-        what is no signed 32-bit number.
+        outcome; do not use it if the program consumes written values. Raises InvalidCommand, before anything is sent,
+        for a value that is not a signed 32-bit number.
         """
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write to {item}")
@@ -208,12 +208,13 @@ class MscController(Handle):
         progress: Progress | None = None,
         **options: Unpack[WriteOptions],
     ) -> None:
-        """Write consecutive values: whole blocks of 32, and what is left one by one, so that nothing else is touched.
+        """Write consecutive values: whole blocks of 32, and the rest one by one, so that no other value changes.
 
-        If one exchange fails, what came before it is stored. `verify` reads all back when all are written, and raises
-        VerifyFailed at the first that differs. `progress` is told after each exchange how many values are done of how
-        many; those to be verified count twice. Raises InvalidCommand, before anything is sent, for a value that is no
-        signed 32-bit number, and for more than one exchange while the address step is unknown.
+        If one exchange fails, the values before it are stored. `verify` reads all values back after all are written,
+        and raises VerifyFailed at the first difference. `progress` is called after each exchange with the number of
+        transferred values and their total; values to be verified count twice. Raises InvalidCommand, before anything is
+        sent, for a value that is not a signed 32-bit number, and for more than one exchange while the address step is
+        unknown.
         """
         address = self._address_of(item)
         wanted = tuple(values)
@@ -235,30 +236,30 @@ class MscController(Handle):
         progress: Progress | None = None,
         **options: Unpack[ReadOptions],
     ) -> None:
-        """Write a CAM table and verify it: `write_block` in the background of other traffic, repeated where uncertain.
+        """Write a CAM table and verify it: `write_block` in the background of other traffic, repeated if uncertain.
 
         Load it while the program does not use it. If this raises, part of the table is stored: load it again.
         """
         if options.get("priority") is None:
             options["priority"] = Priority.BACKGROUND
-        # the program does not use the table meanwhile, so nothing consumes a value that is written twice
+        # The program does not use the table in the meantime, so it cannot consume a value that is written twice.
         await self.write_block(item, values, progress=progress, verify=True, idempotent=True, **options)
 
     async def find_address_step(self, item: int | str) -> int:
-        """Find what the address grows by from one value to the next, and keep it in `address_step`.
+        """Find the difference of the addresses of two consecutive values, and store it in `address_step`.
 
-        `item` is the first of a few values that differ and that nothing changes meanwhile: a block read from there
-        is compared with single reads. Raises InvalidCommand where they do not tell; then give the step.
+        `item`: the first of a few values that differ and do not change in the meantime. A block read from there is
+        compared with single reads. Raises InvalidCommand if they do not show it; then give the step.
         """
         address = self._address_of(item)
         block = await self.node.request(BlockRead(address))
         found = {step: await self._value_or_none(address + step) for step in ADDRESS_STEPS}
         bytewise = found[4] == block[1]
         valuewise = found[1] == block[1] and found[4] == block[4]
-        if bytewise == valuewise:  # values that are alike fit both steps, those that change neither
+        if bytewise == valuewise:  # equal values fit both steps, changing ones neither
             raise InvalidCommand(
-                f"{self.node.label}: the values from {address} on do not tell the address step: "
-                "point at some that differ, or give address_step"
+                f"{self.node.label}: the values from {address} on do not show the address step: "
+                "use values that differ, or give address_step"
             )
         step = 4 if bytewise else 1
         self.address_step = step
@@ -279,7 +280,7 @@ class MscController(Handle):
         await self.node.request(ClearFlag(number), **options)
 
     async def flags(self, **options: Unpack[ReadOptions]) -> frozenset[int]:
-        """Return the flags that are on: in one exchange where the model can, else in 256."""
+        """Return the flags that are on: in one exchange if the model supports it, else in 256."""
         if self._merging.all_flags:
             return await self.node.request(ReadFlags(), **options)
         requests = SeveralRequests(self.node, options)
@@ -290,9 +291,9 @@ class MscController(Handle):
         return ProgramStatus(await self.node.request(ReadStatus(), **options))
 
     async def in_operation(self, **options: Unpack[ReadOptions]) -> str | None:
-        """Return that the program runs, which uses the data, as its status word says; "" if it does not."""
+        """Return that the program runs, which uses the data, from its status word; "" if it does not."""
         running = ProgramStatus.PROGRAM_RUNNING in await self.status(**options)
-        return "its status word says PROGRAM_RUNNING" if running else ""
+        return "PROGRAM_RUNNING is set in its status word" if running else ""
 
     _actions: ClassVar[Mapping[str, Action]] = {
         "set-flag": Action(
@@ -318,7 +319,7 @@ class MscController(Handle):
 
     @property
     def _merging(self) -> Merging:
-        """What is known of the unit, whichever of its handles was told."""
+        """The step and the model of the unit, from any of its handles."""
         merge = self.node.profile.merge
         return merge if isinstance(merge, Merging) else Merging()
 

@@ -1,4 +1,4 @@
-"""What the document (IB-11A002) says of what can be asked of an MSC."""
+"""The items of an MSC, as the document (IB-11A002) describes them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ ITEMS = (
         access="read/write",
         keyword="RFLAG, SFLAG, CFLAG",
     ),
-    Item("flags", "", "the flags that are on, of MSC-850/32 and MSC-250 in one go", access="read", keyword="RFLAGS"),
+    Item("flags", "", "the flags that are on; one exchange for MSC-850/32, MSC-250", access="read", keyword="RFLAGS"),
     Item("status", "", "the program's status word", access="read", keyword="RQSTAT", bits=STATUS_BITS),
 )
 
 
 def width_of(item: str) -> int:
-    """Return how many bits an item has, flags as many as there are; 0 for a run."""
+    """Return the number of bits of an item; of `flags`, all of them; 0 for a run."""
     name, colon, _ = item.partition(":")
     if colon:
         return 1 if name == "flag" else 0

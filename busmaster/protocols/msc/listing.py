@@ -1,13 +1,16 @@
-"""The data table of a macroprogram's listing: what the program calls its data, and at which address each of it is.
+"""The data table of a macroprogram's listing: the names of the program's data, and their addresses.
 
-The document (IB-11A002) says that a listing has a "Data Table" with an entry for each symbol, an array's too, and its
-address in the data area. It shows none, and none is known elsewhere; so this much is assumed and no more:
+According to the document (IB-11A002), a listing has a "Data Table" with an entry for each symbol or array, and its
+address in the data area. The document shows no example, and none is known elsewhere. So only this is assumed:
 
-- the table begins below a line with the words "Data Table", perhaps after lines without a digit, such as its heads;
-- an entry is a line with a name, an address, and perhaps the number of its values ("32", or "dim 32");
-- an address is decimal, or hexadecimal with an H behind or a $ or 0x before it. One that might be either (007, 7D8) is
-  not read;
-- it ends with the file, or with a title: a line that ends in the word "table" or "listing".
+- The table begins below a line with the words "Data Table". Lines without a digit, such as headings, may come first.
+
+- An entry is a line with a name, an address, and optionally the number of its values ("32", or "dim 32").
+
+- An address is decimal, or hexadecimal with an H behind it, or with a $ or 0x in front. An ambiguous address (007, 7D8)
+  is rejected.
+
+- The table ends with the file, or with a title: a line that ends in the word "table" or "listing".
 """
 
 from __future__ import annotations
@@ -34,8 +37,8 @@ MOST_TOLD = 3
 def read_listing(text: str) -> dict[str, int]:
     """Return the address of each symbol of a listing's data table.
 
-    Raises InvalidCommand for a listing without one, and for one with lines that cannot be read: it counts them and
-    names the first.
+    Raises InvalidCommand for a listing without a data table, and for lines that cannot be read, with their number and
+    the first of them.
     """
     symbols: dict[str, int] = {}
     bad: list[str] = []
@@ -51,9 +54,7 @@ def read_listing(text: str) -> dict[str, int]:
             "table: { NAME = ADDRESS }"
         )
     if not symbols:
-        raise InvalidCommand(
-            "there is no data table in it, or an empty one: its entries stand below the words Data Table"
-        )
+        raise InvalidCommand("it has no data table, or an empty one: its entries must be below the words Data Table")
     return symbols
 
 
@@ -73,7 +74,7 @@ def _table(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _take(line: str, symbols: dict[str, int]) -> str:
-    """Take the symbol of one line, and return what is wrong with it; "" for nothing."""
+    """Store the symbol of one line. Returns its fault, or "" if there is none."""
     found = ENTRY.fullmatch(line)
     if found is None:
         return "no name with an address that is decimal, or marked as hexadecimal"

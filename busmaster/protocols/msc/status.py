@@ -8,9 +8,9 @@ from busmaster.contract.items import bits_of
 
 
 class ProgramStatus(enum.IntFlag):
-    """The macroprogram status word. `errors` and `warnings` are what is wrong in it, `texts` says what each bit means.
+    """The macroprogram status word. `errors` and `warnings` return bits that show a fault, `texts` their meanings.
 
-    The errors are those that the document calls so; the warnings are ours: what somebody should look after.
+    The errors are those of the document. The warnings are further bits that need attention.
     """
 
     PROGRAM_RUNNING = 1
@@ -32,17 +32,17 @@ class ProgramStatus(enum.IntFlag):
 
     @property
     def errors(self) -> ProgramStatus:
-        """Those of its bits that the document calls errors."""
+        """The bits that are errors according to the document."""
         return self & ERRORS
 
     @property
     def warnings(self) -> ProgramStatus:
-        """Those of its bits that are no errors, and that somebody should look after."""
+        """The bits that are not errors, but need attention."""
         return self & WARNINGS
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """What each bit that is set means, the lowest first."""
+        """The meaning of each bit that is set, the lowest first."""
         return tuple(bit.meaning for bit in STATUS_BITS if self >> bit.number & 1)
 
 
@@ -75,7 +75,7 @@ STATUS_BITS = bits_of(
         ProgramStatus.CHECKSUM_INCORRECT: "the checksum is incorrect",
         ProgramStatus.LOAD_IN_PROGRESS: "a program is being loaded",
         ProgramStatus.LOAD_OUT_OF_SEQUENCE: "a program was loaded out of sequence",
-        ProgramStatus.BAD_OPCODE: "a bad opcode was met",
+        ProgramStatus.BAD_OPCODE: "a bad opcode was found",
         ProgramStatus.STACK_OVERFLOW: "the stack has overflowed",
         ProgramStatus.STACK_UNDERFLOW: "the stack has underflowed",
         ProgramStatus.INTERRUPT_TABLE_FULL: "the table of software interrupts is full",

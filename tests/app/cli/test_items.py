@@ -30,7 +30,7 @@ def test_the_bits_of_a_word_stand_below_it(busmaster: Command) -> None:
         ["bit", "0", "PROGRAM_RUNNING"],
         ["bit", "1", "BATTERY_LOW"],
     ]
-    assert lines[status + 13].split(maxsplit=3)[3] == "error: a bad opcode was met"
+    assert lines[status + 13].split(maxsplit=3)[3] == "error: a bad opcode was found"
     assert len(lines) == status + 17
 
 

@@ -299,13 +299,13 @@ def test_values_of_every_kind_of_node_can_be_said() -> None:
         (node("hcp", 1, emulated="values = { 99 = [1, 2] }"), "element 100 cannot be given"),
         (
             node("dc104", None, "maximum = 9", "values = { 10 = 5 }"),
-            "values.10: an emulated DC104 cannot hold",
+            "values.10: an emulated DC104 cannot store",
         ),
         (node("dc104", None, emulated="values = { 10 = -1 }"), "parameter 10 holds a whole number, 0 to 65535, not -1"),
-        (node("msc", 1, emulated="addresses = 8\nvalues = { 8 = 5 }"), "values.8: an emulated MSC cannot hold"),
+        (node("msc", 1, emulated="addresses = 8\nvalues = { 8 = 5 }"), "values.8: an emulated MSC cannot store"),
         (
             node("msc", 1, emulated="values = { 'flag:256' = 1 }"),
-            "an emulated MSC cannot hold what is given at 'flag:",
+            "an emulated MSC cannot store the values at 'flag:",
         ),
         (node("msc", 1, emulated="values = { 8 = 2147483648 }"), "a data address holds a whole number, -2147483648 to"),
         (node("modbus", 1, emulated="values = { 'holding:1000' = 5 }"), "holding:1000 is beyond the 1000 addresses"),
