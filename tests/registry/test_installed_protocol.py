@@ -169,7 +169,7 @@ def test_its_emulated_device_is_as_the_file_says(tally: None) -> None:
 
 
 def test_a_wrong_key_in_a_line_file_says_whose_it_is(tally: None) -> None:
-    with pytest.raises(FileError, match="only nodes of tally have this, not those of hcp2"):
+    with pytest.raises(FileError, match="is only for nodes of tally, not of hcp2"):
         read(Source("line.toml", FILE.replace('protocol = "tally"', 'protocol = "hcp2"\ngate = 1')))
 
 

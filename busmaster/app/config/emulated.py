@@ -1,4 +1,4 @@
-"""The line of a file, emulated: every node that it names, as the node and the file's `[emulator]` say."""
+"""The emulated line of a file: every node in it, with the settings of the node and of `[emulator]`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def line_settings(file: LineFile) -> LineSettings:
 def _device(file: LineFile, name: str) -> Device:
     node, section = file.nodes[name], file.emulator.nodes[name]
     emulated = {option.name for option in node.kind.emulated}
-    # said of the node or of its device, an option is one and the same
+    # an option of the node and of its device are the same
     options = {key: value for key, value in node.options.items() if key in emulated} | dict(section.options)
     with (section.table or node.table).at():
         device = make_device(node.protocol, node.address, delay=section.reply_delay, lively=section.lively, **options)

@@ -31,10 +31,10 @@ class SharedEmulated:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EmulatedSection(SharedEmulated):
-    """What the file says of one node's emulated device.
+    """The settings of one node's emulated device.
 
-    `options` are arguments of what makes it. `values` are what it holds from the start, by item: one value, or those
-    from that item on. `table` is where it is said, if it is; so is the table that each value stands in.
+    `options` are arguments of the device. `values` are its initial values by item: one value, or several from that item
+    on. `table` is the table of the settings, if there is one, and likewise for each value.
     """
 
     values: Annotated[Mapping[str, tuple[Table, tuple[float, ...]]], VALUES] = field(default_factory=dict)
@@ -77,7 +77,7 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
 
 
 def _changed(section: EmulatedSection, table: Table, kind: NodeKind, shared: Table) -> EmulatedSection:
-    """Return the section with what a node's table says."""
+    """Return the section, changed by a node's table."""
     check_keys(table, kind, names_of(keys_of(EmulatedSection)), lambda other: other.emulated)
     held = table.table("values")
     return replace(

@@ -4,10 +4,10 @@
     \"""From one cycle to the next.\"""
 
 Name, type and default are the field's own, `Between` is the range and the unit, and the text below the field is the
-description. All else is derived: reading, its errors, the reference of LINE.toml and the JSON Schema for editors.
+description. Reading, its errors, the reference of LINE.toml and the JSON Schema for editors are derived from that.
 
-This module does what msgspec and cattrs do not: both were measured, and report neither the line of a key nor the
-nearest key that there is. msgspec stops at the first problem, and cattrs takes 5 for a text.
+msgspec and cattrs were tried: both report neither the line of a key nor the nearest known key. msgspec stops at the
+first problem, and cattrs accepts 5 as a text.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ class _Internal:
 
 INTERNAL: Final = _Internal()
 Internal: TypeAlias = Annotated[T, INTERNAL]
-"""The type of a field of a section that is not a key: its table, what is calculated from several keys."""
+"""The type of a section's field that is not a key: its table, or a result calculated from several keys."""
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """What a file can have for a key.
+    """The form of a key's value in a file.
 
-    `shown` is what the reference calls it, `schema` its JSON Schema. `read` reads it; None where the function that
-    reads the section does so, because it must know more than this table: only then `required` says that the key must
-    be there. `written` returns what a file would have for a default. `name`: the key's, if it is not the field's.
+    `shown` is its name in the reference, `schema` its JSON Schema. `read` reads it. `read` is None if the function of
+    the section does that, because it needs more than this table; only then `required` makes the key mandatory.
+    `written` returns the text of a default in a file. `name`: the key's name, if it is not the field's.
     """
 
     shown: str
@@ -278,7 +278,7 @@ def _read_labels(table: Table, key: str) -> Mapping[int, str]:
             raise named.error(f'labels are of whole numbers: {{ 0 = "off" }}, not of {number!r}', number)
     labels = {int(number): named.text(number) for number in named.data}
     if len(labels) < len(named.data):
-        raise table.error("say twice what a number is called", key)
+        raise table.error("define a number twice; leave out one of the labels", key)
     return labels
 
 

@@ -1,4 +1,4 @@
-"""A LINE.toml of an older version, written with the names of today: all else of it, comments too, stays as it is."""
+"""Conversion of an older LINE.toml to the present names. Comments and everything else are kept."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ TIMED = ("nodes", "protocols")
 
 
 def migration(path: str | os.PathLike[str]) -> tuple[str, str]:
-    """Return the text of a file, and the same with the new name of each key that has one.
+    """Return the text of a file, and the same text with the new name of each renamed key.
 
-    Raises OSError if it cannot be read, and FileError, with the line, for what is no TOML or cannot be migrated.
+    Raises OSError if it cannot be read, and FileError with the line if it is not TOML or cannot be migrated.
     """
     source = Source.read(path)
     return source.text, migrated(source)
@@ -31,7 +31,7 @@ def migrated(source: Source) -> str:
     text = source.text
     for key, pair in Walk(text).pairs.items():
         if _is_old(key) and _has(source.data, (*key[:-1], TIMES[str(key[-1])])):
-            raise source.error(key, f"stands there under its new name {TIMES[str(key[-1])]!r} too: delete one")
+            raise source.error(key, f"is also there under its new name {TIMES[str(key[-1])]!r}; delete one of them")
         names = [match for match in TOKEN.finditer(text[pair.start : pair.value]) if match.lastgroup != "mark"]
         names = [match for match in names if match.lastgroup in ("bare", "string")]
         for name, way in zip(reversed(names), (key[: len(key) - back] for back in range(len(names))), strict=True):

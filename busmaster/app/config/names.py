@@ -26,7 +26,7 @@ def expanded(name: str, known: Container[str] = ()) -> Iterator[str]:
     found = [] if name in known else list(RANGE.finditer(name))
     ranges = [_numbers(one[1], one[2]) for one in found]
     if prod(map(len, ranges)) > MOST_NAMES:
-        raise InvalidCommand(f"{name[:SHOWN]!r} stands for more than {MOST_NAMES} names: use shorter ranges")
+        raise InvalidCommand(f"{name[:SHOWN]!r} expands to more than {MOST_NAMES} names; use shorter ranges")
     ends = [0, *(one.end() for one in found)]
     before = [name[end : one.start()] for end, one in zip(ends, found, strict=False)]
     for numbers in product(*ranges):
@@ -36,12 +36,12 @@ def expanded(name: str, known: Container[str] = ()) -> Iterator[str]:
 def _numbers(first: str, last: str) -> list[str]:
     """Return the numbers of a range as texts. Raises InvalidCommand."""
     if max(len(first), len(last)) > LONGEST_NUMBER:
-        raise InvalidCommand(f"a number in a range has {LONGEST_NUMBER} digits at most")
+        raise InvalidCommand(f"a number in a range must have at most {LONGEST_NUMBER} digits")
     lowest, highest = int(first), int(last)
     if highest < lowest:
-        raise InvalidCommand(f"a range goes upwards: {highest}-{lowest}, not {first}-{last}")
+        raise InvalidCommand(f"the range {first}-{last} is descending; write {highest}-{lowest}")
     if highest - lowest >= MOST_NAMES:
-        raise InvalidCommand(f"{first}-{last} are too many: a name stands for {MOST_NAMES} at most")
+        raise InvalidCommand(f"the range {first}-{last} has more than {MOST_NAMES} names; use a shorter one")
     width = len(first) if first.startswith("0") else 0
     return [f"{number:0{width}d}" for number in range(lowest, highest + 1)]
 
@@ -50,5 +50,5 @@ def listed(text: str) -> list[str]:
     """Return what stands between commas. Raises InvalidCommand where nothing does."""
     parts = [part.strip() for part in text.split(",")]
     if not all(parts):
-        raise InvalidCommand(f"there is a name missing in {text!r}")
+        raise InvalidCommand(f"a name is missing in {text!r}; remove a comma, or add the name")
     return parts

@@ -30,12 +30,12 @@ def check_keys(
     for key in table.data:
         holders = [other.name for other in kinds().values() if any(key == option.name for option in options_of(other))]
         if holders and kind.name not in holders:
-            raise table.error(f"only nodes of {' and '.join(holders)} have this, not those of {kind.name}", key)
+            raise table.error(f"is only for nodes of {' and '.join(holders)}, not of {kind.name}; leave it out", key)
     table.only(*common, *(option.name for option in options_of(kind)))
 
 
 def read_options(table: Table, known: Sequence[Option]) -> dict[str, Any]:
-    """Return those of the options that the table says, each as the argument that it is."""
+    """Return the options in the table, each as an argument."""
     return read_keys(table, keys_of_options(known))
 
 
@@ -74,7 +74,7 @@ def _read_addresses(option: Option, table: Table, key: str) -> Mapping[str, int]
 
 
 def _read_tables(fields: Sequence[Option], table: Table, key: str) -> dict[str, dict[str, Any]]:
-    """Return what each table says, under each name that its own stands for."""
+    """Return the contents of each table, for each name in the range of its own name."""
     found: dict[str, dict[str, Any]] = {}
     keys = keys_of_options(fields)
     for one in table.tables(key):

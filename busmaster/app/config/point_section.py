@@ -1,4 +1,4 @@
-"""The points of a node, as a file says them: read, and checked against what the protocol has there."""
+"""Reads the points of a node, and checks them against the items of the protocol."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from busmaster.ext import OF_QUANTITIES, Between, MeansNothing, Placed
 from busmaster.registry import NodeKind
 
 WIDEST = 64
-"""Bits of a number: what has more is no number."""
+"""Maximum number of bits of a number."""
 NO_QUANTITIES = ("word", "bit", "set")
 LIMITS = ("minimum", "maximum", "max_step")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointSection:
-    """What a point is called, what its number on the line means, and what may be written to it, in its unit.
+    """The name, scaling, meaning and write limits of a point, in its unit.
 
-    `template`: the name of the template that says something of it, "" where the node's own section says all.
+    `template`: the name of the template that defines a part of it, "" if the node's own section defines all.
     """
 
     name: Internal[str]
@@ -40,7 +40,7 @@ class PointSection:
     decimals: Annotated[int, Between(0, 9)] = 0
     """How many of the number's last digits are decimals, where the line carries no point."""
     minimum: float | None = None
-    """The least that may be written, in its unit, by whatever name and whoever writes."""
+    """Lower limit for writes, in the point's unit. Applies to all clients and to all names of the point."""
     maximum: float | None = None
     """The most that may be written, likewise."""
     max_step: float | None = None
@@ -61,16 +61,16 @@ class PointSection:
 
 MEANINGS = names_of(keys_of(Meaning))
 POINT_KEYS = (*names_of(keys_of(PointSection)), *MEANINGS)
-"""All that a file can say of a point."""
+"""All keys of a point."""
 
 
 def read_point(table: Table, kind: NodeKind, template: str = "") -> PointSection:
-    """Read one point, of which that template says something.
+    """Read one point, of which that template defines a part.
 
-    Raises FileError, naming line and key, for what is wrong in it.
+    Raises FileError with line and key for an error in it.
     """
     if not POINT_NAME.fullmatch(table.name):
-        raise table.error(f"a point's name has no spaces, commas or slashes: {table.name!r} has")
+        raise table.error(f"the name {table.name!r} contains a space, comma or slash; use another name")
     table.only(*POINT_KEYS)
     values = {"item": table.name, **read_keys(table, keys_of(PointSection))}
     try:
@@ -79,18 +79,18 @@ def read_point(table: Table, kind: NodeKind, template: str = "") -> PointSection
         raise table.error(error.fault, error.field) from None
     section = PointSection(**values, name=table.name, meaning=meaning, template=template, table=table)
     if not section.factor:
-        raise table.error("a factor of 0 makes every value the same", "factor")
+        raise table.error("must not be 0, because every value would be the same", "factor")
     if section.decimals and not kind.takes_decimals:
         raise table.error(
-            f"{kind.name} has no implied decimals: write factor = {10**-section.decimals:.{section.decimals}f} "
-            "to scale what is sent",
+            f"{kind.name} has no implied decimals; use factor = {10**-section.decimals:.{section.decimals}f} "
+            "to scale the value on the line",
             "decimals",
         )
     return section
 
 
 def check_suits(section: PointSection, point: Point[Any], kind: NodeKind) -> None:
-    """Raise FileError for what a file says of a point and the protocol's number there cannot bear."""
+    """Raise FileError for a key that does not suit the protocol's number."""
     for key, fault in _misfits(section, point, kind):
         raise section.table.error(fault, key)
 
@@ -101,23 +101,23 @@ def _misfits(section: PointSection, point: Point[Any], kind: NodeKind) -> Iterat
     said = [key for key in (*LIMITS, *MEANINGS) if key in given]
     for key in said:
         if sort == "run" and key not in ("precision", "deadband", "heartbeat"):
-            yield key, f"cannot be said of {section.item}, a run of values: make each value a point of its own"
+            yield key, f"is not possible for {section.item}, a run of values; make each value a point of its own"
         if sort == "text" and key != "heartbeat" and (key != "deadband" or meaning.deadband):
-            yield key, f"cannot be said of {section.item}, which is a text"
+            yield key, f"is not possible for {section.item}, which is a text; leave it out"
         if sort in NO_QUANTITIES and key in OF_QUANTITIES:
-            yield key, f"cannot be said of {section.item}, which is a {sort} and no quantity{OF_QUANTITIES[key]}"
+            yield key, f"is not possible for {section.item}, which is a {sort} and not a quantity{OF_QUANTITIES[key]}"
     if sort in NO_QUANTITIES and meaning.deadband:
-        yield "deadband", f"of a {sort} is 0: every change is told"
+        yield "deadband", f"of a {sort} must be 0, because every change is reported"
     for key in ("bits", "labels"):
         if key not in said:
             continue
         if sort == "set" and key == "labels":
-            yield key, f"cannot be said of {section.item}, which is a set of many: name them by bits"
+            yield key, f"is not possible for {section.item}, which is a set of flags; name them by bits"
         if sort == "float":
-            yield key, f"are of whole numbers, and {section.item} has decimals"
+            yield key, f"need whole numbers, but {section.item} has decimals; leave them out"
         for scaled in ("factor", "offset", "decimals"):
             if scaled in given:
-                yield key, f"are of the number as it is on the line: leave out {scaled}"
+                yield key, f"apply to the unscaled number on the line; leave out {scaled}"
     yield from _beyond(section, 1 if sort == "bit" else kind.width(section.item))
 
 
@@ -125,16 +125,16 @@ def _beyond(section: PointSection, width: int) -> Iterator[tuple[str, str]]:
     """Yield bits and labels of a number that has no room for them."""
     for name, bit in section.meaning.bits.items():
         if bit >= width:
-            yield "bits", f"{name} is bit {bit}, and the highest of {section.item} is bit {width - 1}"
+            yield "bits", f"{name} is bit {bit}, but the highest bit of {section.item} is {width - 1}"
     for number in section.meaning.labels:
         if not -(2 ** (width - 1)) <= number < 2**width:
-            yield "labels", f"{section.item} is never {number}: it has {width} bit{'s' * (width > 1)}"
+            yield "labels", f"{section.item} cannot be {number}, because it has {width} bit{'s' * (width > 1)}"
 
 
 def sort_of(point: Point[Any], kind: NodeKind) -> str:
-    """Return what a protocol's point is: "float", "whole", "word", "bit", "set", "text", "run"; "" where nobody knows.
+    """Return the sort of a protocol's point: "float", "whole", "word", "bit", "set", "text", "run"; "" if unknown.
 
-    A read that says where it reads tells what it would return, and so what its value would be if all were 0 there.
+    A read with a known place is decoded with zeros there, and the type of the value shows the sort.
     """
     width = kind.width(point.item)
     if width in (0, 1) or width > WIDEST:

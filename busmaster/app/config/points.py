@@ -33,7 +33,7 @@ class Scale:
         Raises InvalidCommand for a factor of 0.
         """
         if not factor:
-            raise InvalidCommand("a factor of 0 makes every value the same")
+            raise InvalidCommand("a factor must not be 0, because every value would be the same")
         return cls(Fraction(repr(factor)) / 10**decimals, Fraction(repr(offset)), whole)  # repr: 0.1 is a tenth
 
     @property
@@ -50,7 +50,7 @@ class Scale:
         plus = self.offset.numerator * self.factor.denominator
 
         def read(number: Any) -> Any:
-            if type(number) is int:  # not isinstance: a word or a flag is an int, too, and stays what it is
+            if type(number) is int:  # not isinstance: a word or a flag is an int, too, and keeps its type
                 return (number * times + plus) / below
             if type(number) is float:
                 return float(f"{(number * times + plus) / below:.15g}")
@@ -72,7 +72,7 @@ class Scale:
             except OverflowError:
                 raise InvalidCommand(f"{value!r} is too large") from None
         if isinstance(value, bool) and not self.trivial:
-            raise InvalidCommand(f"{value!r} is no number: write {int(value)} if that is meant")
+            raise InvalidCommand(f"{value!r} is not a number; write {int(value)} for the number")
         return value
 
 
@@ -161,7 +161,7 @@ def _before(unscaled: Callable[[Any], Any], encode: Callable[[Any], Command[None
         number = unscaled(value)
         try:
             return encode(number)
-        except InvalidCommand as error:  # it tells of a number that nobody has written
-            raise InvalidCommand(f"{value!r} cannot be sent: on the line, {error}") from None
+        except InvalidCommand as error:  # it names the scaled number, which the user does not know
+            raise InvalidCommand(f"{value!r} cannot be sent; on the line, {error}") from None
 
     return scaled

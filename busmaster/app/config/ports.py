@@ -21,7 +21,7 @@ PORT = Form(
 
 @dataclass(frozen=True, slots=True)
 class ByRfc2217:
-    """The key that tells the two kinds of serial servers apart."""
+    """The key that distinguishes the two kinds of serial servers."""
 
     rfc2217: bool = False
     """Whether the server takes the line settings by RFC 2217."""
@@ -53,13 +53,15 @@ def _with_framing_of_the_protocol(port: type) -> tuple[Key, ...]:
 def read_port(top: Table, profiles: Sequence[Profile]) -> SerialPort | TcpPort:
     """Read `port = "/dev/ttyUSB0"` or `[port]`.
 
-    What it leaves open of a serial line is as the nodes' protocols want it.
+    Line settings that it does not contain are those of the nodes' protocols.
     """
     if isinstance(top.data.get("port"), str):
         with top.at("port"):
             return endpoint(top.text("port"), defaults=_agreed(profiles))
     if "port" not in top:
-        raise top.error("'port' is missing: a device path, socket://HOST:PORT, rfc2217://HOST:PORT, or a table: [port]")
+        raise top.error(
+            "'port' is missing; use a device path, socket://HOST:PORT, rfc2217://HOST:PORT, or a table: [port]"
+        )
     table = top.table("port")
     is_remote = "host" in table
     if is_remote and not ("rfc2217" in table and table.flag("rfc2217")):
@@ -69,7 +71,7 @@ def read_port(top: Table, profiles: Sequence[Profile]) -> SerialPort | TcpPort:
     agreed = _agreed(profiles)
     values = _read(table, rfc2217_keys() if is_remote else serial_keys())
     if "baudrate" not in values and agreed is None:
-        raise table.error("'baudrate' is missing: the nodes' protocols are meant for different lines")
+        raise table.error("'baudrate' is missing, and the nodes' protocols have different defaults; add it")
     with table.at():
         kind = Rfc2217Port if is_remote else SerialPort
         return kind(**({} if agreed is None else asdict(agreed)) | values)

@@ -18,7 +18,7 @@ Outputs: TypeAlias = dict[str, Settings]
 def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
     """Read `[outputs]`, and return those that are enabled.
 
-    Raises FileError, naming line and key, for what is wrong: also in one that is not enabled.
+    Raises FileError with line and key for an error, also in an output that is not enabled.
     """
     if not table.data.keys() <= OWN.keys():
         table.only(*names())
@@ -29,7 +29,7 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
             path = getattr(settings, key, None)
             if path is not None and taken.setdefault(path, f"{kind}.{key}") != f"{kind}.{key}":
                 with table.part():
-                    raise table.table(kind).error(f"{taken[path]} is that file already", key)
+                    raise table.table(kind).error(f"is already the file of {taken[path]}; use another path", key)
     return outputs
 
 

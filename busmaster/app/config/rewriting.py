@@ -1,4 +1,4 @@
-"""Changes to points, written into the text of a file: all else of it, comments and order too, stays as it is."""
+"""Changes of points in the text of a file. Comments, order and everything else are kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from busmaster.app.config.source import FileError, Key, Source, Walk
 
 Said: TypeAlias = Mapping[str, Any]
-"""What a file says of one point, by key."""
+"""The keys of one point and their values."""
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -21,7 +21,7 @@ def toml_text(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML's quotes, but for this one
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # as in TOML, except for this character
     if isinstance(value, Mapping):
         inside = ", ".join(f"{key_text(key)} = {toml_text(one)}" for key, one in value.items())
         return f"{{ {inside} }}" if inside else "{}"
@@ -36,9 +36,9 @@ def key_text(*names: str) -> str:
 
 
 def rewritten(source: Source, points: Mapping[tuple[str, str], Said]) -> str:
-    """Return the file's text with these points, by their node's section and their name, saying that and no more.
+    """Return the file's text in which these points, by node section and name, have exactly these keys.
 
-    Raises FileError for a point that is written in a way that this cannot change.
+    Raises FileError for a point that is written in a form that cannot be changed.
     """
     editing = _Editing(source)
     wanted = deepcopy(source.data)
@@ -58,7 +58,7 @@ def rewritten(source: Source, points: Mapping[tuple[str, str], Said]) -> str:
     except tomllib.TOMLDecodeError:
         as_wanted = False
     if not as_wanted:
-        raise source.error(("nodes",), "points are written in a way that this cannot change: change them in the file")
+        raise source.error(("nodes",), "points have a form that cannot be changed automatically; edit the file")
     return text
 
 
@@ -80,7 +80,7 @@ class _Editing:
         return "".join(pieces) + self._before[place:]
 
     def change(self, point: Key, held: Said, said: Said) -> None:
-        """Let a point that the file has say that and no more."""
+        """Give an existing point exactly these keys."""
         pair = self._walk.pairs.get(point)
         if pair is not None:  # position = { ... }
             self._edits.append((pair.value, pair.end, self._inline(point, held, said)))
@@ -105,7 +105,7 @@ class _Editing:
     # inside
 
     def _append(self, table: Key, pairs: Sequence[tuple[tuple[str, ...], Any]]) -> bool:
-        """Add pairs to a table behind those that it has, and tell whether it is written down anywhere."""
+        """Add pairs at the end of a table, and return whether the table exists in the text."""
         if table in self._walk.bodies:  # [nodes.winder.points]
             self._insert_lines(self._walk.bodies[table], [f"{key_text(*way)} = {toml_text(v)}" for way, v in pairs])
             return True
@@ -161,4 +161,4 @@ class _Editing:
         return self._before.find("\n", place) + 1 or len(self._before)
 
     def _unable(self, way: Key) -> FileError:
-        return self._source.error(way, "is not written as one pair, KEY = VALUE: change it in the file")
+        return self._source.error(way, "is not written as one pair, KEY = VALUE; edit the file")

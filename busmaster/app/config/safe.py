@@ -2,11 +2,11 @@
 
 [safe]
 within = 2.0                                 # seconds for all of it
-repeatable = ["press/setpoint"]              # those that the protocol does not call so, and that harm nobody twice
+repeatable = ["press/setpoint"]              # a second write does no harm, although the protocol does not define that
 writes = { "drive4/speed_reference" = 0, "press/setpoint" = 0 }
 
-Nothing is sent unless it stands there. What is sent may arrive more than once, and is repeated until it reads back as
-it was written or the time is over: so only a write that may be repeated can be of it, and one that can be read back.
+Only these writes are sent. Each is repeated until the value reads back or the time is over, and can arrive more than
+once. So each must be repeatable, and the point must be readable.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _read_writes(table: Table, key: str) -> Mapping[str, float]:
         with values.part():
             numbers = values.numbers(name)
             if len(numbers) != 1:
-                raise values.error("is one value: write the others as points of their own", name)
+                raise values.error("must be one value; write the others as points of their own", name)
             writes[name] = numbers[0]
     return writes
 
@@ -45,7 +45,7 @@ WRITES = Form("table", {"type": "object", "additionalProperties": {"$ref": "#/$d
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafeSection:
-    """What `[safe]` says: values by point, in their order. Without writes there is no safe state."""
+    """The section `[safe]`: values by point, in their order. Without writes there is no safe state."""
 
     writes: Annotated[Mapping[str, float], WRITES] = field(default_factory=dict)
     """The value to write to each point, in its unit and in this order: `writes = { "winder/setpoint" = 0 }`. One that
@@ -54,13 +54,13 @@ class SafeSection:
     """The time for all writes, more than 0. Writes that are not confirmed by then are reported, and the exit status is
     1."""
     repeatable: tuple[str, ...] = ()
-    """Points that can be written twice without harm although the protocol does not say so."""
+    """Points that can be written twice without harm although the protocol does not define that."""
     table: Internal[Table] = field(compare=False, repr=False)
 
 
 def read_safe(table: Table) -> SafeSection:
-    """Read `[safe]`. Raises FileError, naming line and key, for what is wrong in it."""
+    """Read `[safe]`. Raises FileError with line and key for an error in it."""
     section = SafeSection(**read_section(table, SafeSection), table=table)
     if table.data and not table.table("writes").data:
-        raise table.error('a safe state is of writes: writes = { "NODE/ITEM" = VALUE }')
+        raise table.error('a safe state needs writes; add writes = { "NODE/ITEM" = VALUE }')
     return section

@@ -28,7 +28,7 @@ from busmaster.registry import NodeKind, Option, kinds
 
 @dataclass(frozen=True, slots=True)
 class TableKeys:
-    """One table of the reference: its header as a file has it, what it is for, and its keys.
+    """One table of the reference: its header in a file, its purpose, and its keys.
 
     `definition` is its name in the JSON Schema, "" for a part of another table.
     """
@@ -41,7 +41,7 @@ class TableKeys:
 
 def tables() -> Iterator[TableKeys]:
     """Yield every table of a file, in the order of the reference."""
-    yield _table("The top", "What stands at the top of the file, before the first table.", LineFile, "")
+    yield _table("The top", "Keys at the top of the file, before the first table.", LineFile, "")
     serial = _described(serial_keys(), SerialPort)
     yield TableKeys("[port]", "A serial port as a table.", serial, "serial_port")
     switched = "How RTS switches the transmitter of a serial port, in [port]."
@@ -51,27 +51,29 @@ def tables() -> Iterator[TableKeys]:
     remote = _described(rfc2217_keys(), Rfc2217Port, ByRfc2217)
     about = "A serial server whose line settings are set by RFC 2217."
     yield TableKeys("[port] with rfc2217 = true", about, _required_first(remote), "rfc2217_port")
-    common = "What holds for all nodes of one protocol that do not say otherwise. Its options may stand here too."
+    common = "Defaults for all nodes of one protocol. Its options are permitted here too."
     yield _table("[protocols.NAME]", common, ProtocolSection, "")
     yield _table("[nodes.NAME]", "A node; several where NAME is a range, as drive4-7.", NodeSection, "")
     yield from _options("[nodes.NAME]", "nodes", lambda kind: kind.options)
     yield _table("timing = {}", "Reply times, from the last byte of a request on the wire.", TimingSection, "timing")
     points = described(PointSection) + described(Meaning)
     yield TableKeys("[nodes.NAME.points]", "Each key is a point, and its value a table of these.", points, "point")
-    yield _table("[groups.NAME]", "A poll group: what is read together, on a fixed grid.", GroupSection, "group")
+    yield _table(
+        "[groups.NAME]", "A poll group: points that are read together, on a fixed grid.", GroupSection, "group"
+    )
     for kind in output_kinds():
         keys = tuple(key for key in described(kind.settings) if key.name not in kind.without)
         yield TableKeys(f"[outputs.{kind.name}]", kind.about, _required_first(keys), f"output_{kind.name}")
-    yield _table("[safe]", "Writes that are sent at once when the line is left.", SafeSection, "safe")
+    yield _table("[safe]", "Writes that are sent when the program ends.", SafeSection, "safe")
     yield _table("[service]", "Which other programs can use the line, and how they connect.", ServiceSection, "service")
     roles = "A role; so too [service.groups.NAME], [service.tokens.NAME]."
     yield _table("[service.users.NAME]", roles, RoleSection, "role")
     yield _table("[emulator]", "How the line is emulated.", EmulatorSection, "emulator")
-    every = "What differs for one node, or a range of them. What its kind has beside it follows."
+    every = "Settings for one node, or a range. The options of its kind follow."
     yield _table("[emulator.nodes.NAME]", every, EmulatedSection, "")
     yield from _options("[emulator.nodes.NAME]", "emulated nodes", lambda kind: kind.emulated)
-    yield _table("faults = {}", "The probability of each that it strikes a frame; 0 by default.", Faults, "faults")
-    yield _table("A template", "A file of its own, which `template` names.", Template, "")
+    yield _table("faults = {}", "The probability per frame of each fault; 0 by default.", Faults, "faults")
+    yield _table("A template", "A separate file, which `template` names.", Template, "")
 
 
 def _table(header: str, about: str, section: type, definition: str) -> TableKeys:
@@ -94,7 +96,7 @@ def _described(keys: Iterable[Key], *sections: type) -> tuple[Key, ...]:
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Return what is written under each attribute of a class, by its name."""
+    """Return the docstring of each attribute of a class, by name."""
     [definition] = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(definition, ast.ClassDef)
     docs = {}
@@ -109,7 +111,7 @@ def _options(header: str, nodes: str, options_of: Callable[[NodeKind], Sequence[
     for kind in kinds().values():
         keys = tuple(_flat(options_of(kind)))
         if keys:
-            yield TableKeys(f"{header} of {kind.name}", f"What only {nodes} of {kind.name} have.", keys)
+            yield TableKeys(f"{header} of {kind.name}", f"Only for {nodes} of {kind.name}.", keys)
 
 
 def _flat(options: Sequence[Option], before: str = "") -> Iterator[Key]:

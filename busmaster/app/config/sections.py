@@ -1,4 +1,4 @@
-"""What a file says, typed and checked; nothing is opened. `config.line` makes a line of it."""
+"""The typed and checked contents of a file. Nothing is opened. `app.line` makes a line from it."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ ADDRESS = Form("whole number, or range as text", {"anyOf": [{"type": "integer", 
 
 def _check_title(title: str) -> str:
     if len(title) > LONGEST_TITLE:
-        raise InvalidCommand(f"a title has {LONGEST_TITLE} characters at most, not {len(title)}")
+        raise InvalidCommand(f"a title must have at most {LONGEST_TITLE} characters, not {len(title)}")
     return title
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProtocolSection:
-    """What holds for all nodes of one protocol that do not say otherwise."""
+    """Defaults for all nodes of one protocol."""
 
     timings: Annotated[Timings | Learned | None, TIMING]
     """Its reply times: a table, or `"learned"`. The protocol's by default."""
@@ -72,7 +72,7 @@ class ProtocolSection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeSection(ProtocolSection):
-    """What a file says of one node. `options` are those of the protocol's handle."""
+    """The section of one node. `options` are those of the protocol's handle."""
 
     name: Internal[str]
     protocol: Annotated[str, PROTOCOL]
@@ -119,13 +119,13 @@ PERIOD = replace(number(Between(SHORTEST_PERIOD, LONGEST_PERIOD, "s")), read=_re
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroupSection:
-    """What a file says of one poll group. `points` are as the file has them: `drive4-8/speed_measured,current`."""
+    """The section of one poll group. `points` are in the form of the file: `drive4-8/speed_measured,current`."""
 
     name: Internal[str]
     period: Annotated[float, PERIOD]
     """From one cycle to the next."""
     points: tuple[str, ...]
-    """What is read: `"drive4-7/speed_measured,current"` is eight points."""
+    """Points to read: `"drive4-7/speed_measured,current"` is eight points."""
     phase: Annotated[float | None, Between(0, LONGEST_PERIOD, "s")] = None
     """Start of each cycle within the period. By default the group avoids the cycles of the others."""
     priority: Annotated[Priority, PRIORITY] = Priority.POLL
@@ -135,7 +135,7 @@ class GroupSection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineFile:
-    """All that one file says. `table` is the whole of it, for messages."""
+    """The contents of one file. `table` is the whole file, for messages."""
 
     path: Internal[str]
     title: Annotated[str, Parsed(_check_title)] = ""
@@ -166,12 +166,12 @@ class LineFile:
 
 
 def load(path: str | os.PathLike[str]) -> LineFile:
-    """Read a file. Raises OSError if it cannot be read; FileError, naming line and key, for what is wrong in it."""
+    """Read a file. Raises OSError if it cannot be read; FileError with line and key for an error in it."""
     return read(Source.read(path))
 
 
 def read(source: Source) -> LineFile:
-    """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
+    """Read a line from a source. Raises FileError with line and key for an error in it."""
     top = Table(source)
     top.only(*names_of(keys_of(LineFile)))
     values: dict[str, Any] = {}
@@ -202,7 +202,7 @@ def read(source: Source) -> LineFile:
         table=top,
     )
     if not top.table("nodes").data:
-        source.keep(top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]"))
+        source.keep(top.error("the file has no nodes; define each in a table of its own, [nodes.NAME]"))
     return file
 
 
@@ -226,7 +226,7 @@ def _check_learned(top: Table, path: str | None, nodes: Iterable[NodeSection]) -
         return
     learns = any(isinstance(node.timings, Learned) for node in nodes)
     if not learns and not top.source.unread:  # a node that could not be read may be one that learns
-        raise top.error(f'no reply times are learned: say timing = "{LEARNED_WORD}" too', "learned")
+        raise top.error(f'has no effect, because reply times are not learned; add timing = "{LEARNED_WORD}"', "learned")
     with top.at("learned"):
         check_folder(path)
 
@@ -235,7 +235,7 @@ def _check_learned(top: Table, path: str | None, nodes: Iterable[NodeSection]) -
 
 
 def _protocols(top: Table) -> dict[str, Table]:
-    """Read `[protocols.hcp2]`: what holds for all nodes of one protocol that do not say otherwise."""
+    """Read `[protocols.hcp2]`: defaults for all nodes of one protocol."""
     top.table("protocols").only(*kinds())
     tables = {table.name: table for table in top.tables("protocols") if table.name in kinds()}
     for protocol, table in tables.items():
@@ -256,18 +256,18 @@ def _nodes(top: Table, defaults: Mapping[str, Table], learned: bool) -> dict[str
                     check_company(node.profile, profiles.values())
                 profiles.setdefault(node.profile.name, node.profile)
                 if node.name in nodes:
-                    raise table.error(f"there are two nodes {node.name!r}")
+                    raise table.error(f"two nodes have the name {node.name!r}; rename one")
                 other = taken.setdefault((node.profile.name, node.address), node.name)
                 if other != node.name:
-                    raise table.error(f"node {other!r} has address {node.address} already", "address")
+                    raise table.error(f"node {other!r} already has address {node.address}; use another one", "address")
                 nodes[node.name] = node
     return nodes
 
 
 def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iterator[NodeSection]:
-    """Yield the nodes of one table: several where its name is a range.
+    """Yield the nodes of one table: several if its name is a range.
 
-    `learned` says whether the reply times of the line are learned.
+    `learned`: whether the reply times of the line are learned.
     """
     kind = find(table.choice("protocol", kinds()))
     check_keys(table, kind, names_of(keys_of(NodeSection)), lambda kind: kind.options)
@@ -276,7 +276,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     profile = kind.profile
     addresses = _addresses(table, profile)
     if len(names) != len(addresses):
-        raise table.error(f"{len(names)} names need as many addresses, not {len(addresses)}", "address")
+        raise table.error(f"{len(names)} names need {len(names)} addresses, not {len(addresses)}", "address")
     default = defaults.get(kind.name, Table(table.source, ("protocols", kind.name), {}))
     base = read_timings(default, profile.timings)
     document = read_timings(table, base)
@@ -286,12 +286,12 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
             profile.check_learnable()
     values = {**read_keys(default, keys_of(ProtocolSection)), **read_keys(table, keys_of(NodeSection))}
     if len(values.get("sync_reads", ())) == 1:
-        raise table.error("one sync read cannot be told from itself: name at least two items", "sync_reads")
+        raise table.error("needs at least two items, because the replies to one sync read are all alike", "sync_reads")
     options = {**read_options(default, kind.options), **read_options(table, kind.options)}
     points = read_points(table, kind)
     for name, address in zip(names, addresses, strict=True):
         if not NODE_NAME.fullmatch(name):
-            raise table.error(f"a node's name is of letters, digits, _, . and -, not {name!r}")
+            raise table.error(f"a node's name can contain letters, digits, _, . and -, not {name!r}")
         yield NodeSection(
             **values,
             name=name,
@@ -307,7 +307,7 @@ def _addresses(table: Table, profile: Profile) -> Sequence[int]:
     """Read `address = 5`, or `address = "4-8"`."""
     if not profile.addressed:
         if "address" in table:
-            raise table.error(f"{profile.name} has no addresses: one drive a line", "address")
+            raise table.error(f"{profile.name} has no addresses (one drive per line); leave it out", "address")
         return profile.addresses
     if not isinstance(table.data.get("address"), str):
         addresses = [table.whole("address")]
@@ -319,7 +319,9 @@ def _addresses(table: Table, profile: Profile) -> Sequence[int]:
         for address in addresses:
             profile.check_address(address)
             if address == profile.broadcast:
-                raise InvalidCommand(f"{address} means all nodes of {profile.name}: it is no node's own")
+                raise InvalidCommand(
+                    f"{address} is the broadcast address of {profile.name}; use the node's own address"
+                )
     return addresses
 
 
@@ -344,18 +346,20 @@ def _group(table: Table) -> GroupSection:
     with table.at("phase"):
         Poll(table.name, group.period, phase=group.phase)
     if not group.points:
-        raise table.error("a group without points polls nothing: name some, or leave the group out", "points")
+        raise table.error("a group without points polls nothing; add points, or remove the group", "points")
     return group
 
 
 def decimals_of(node: NodeSection) -> dict[str, int]:
-    """Return the digits of each quantity whose points have decimals, for a handle that scales or rounds by them.
+    """Return the decimals of each quantity whose points have them, for a handle that scales or rounds by them.
 
-    What is behind a colon only says how it is sent.
+    The text after a colon only selects the form on the line, so it is ignored.
     """
     decimals: dict[str, int] = {}
     for point in node.points.values():
         parameter = point.item.partition(":")[0]
         if decimals.setdefault(parameter, point.decimals) != point.decimals:
-            raise point.table.error(f"{parameter} has {decimals[parameter]} decimals elsewhere")
+            raise point.table.error(
+                f"{parameter} has {decimals[parameter]} decimals at another point; use the same number"
+            )
     return {parameter: digits for parameter, digits in decimals.items() if digits}

@@ -44,14 +44,14 @@ def _group_number(group: str) -> int:
     try:
         return grp.getgrnam(group).gr_gid
     except KeyError:
-        raise InvalidCommand(f"there is no group {group!r} on this machine") from None
+        raise InvalidCommand(f"the group {group!r} does not exist on this machine") from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSection:
-    """What `[service]` says: whether a socket is served, to whom, and what each client may do.
+    """The section `[service]`: whether a socket is served, to which clients, and their permissions.
 
-    Roles are by the numbers of users and groups, and by the names of tokens; they may change while the line runs.
+    Roles are stored by user and group numbers, and by token names. They can change while the line runs.
     """
 
     enabled: bool = True
@@ -86,12 +86,12 @@ class ServiceSection:
             secrets = read_tokens(self.token_file)
         for name, role in self.tokens.items():
             if name not in secrets:
-                raise role.table.error(f"there is no token {name!r} in {self.token_file}")
+                raise role.table.error(f"there is no token {name!r} in {self.token_file}; add it there")
         return secrets
 
 
 def read_service(table: Table) -> ServiceSection:
-    """Read `[service]`. Raises FileError, naming line and key, for what is wrong in it."""
+    """Read `[service]`. Raises FileError with line and key for an error in it."""
     values = read_section(table, ServiceSection)
     if "group" in values:
         values.setdefault("mode", GROUP_MODE)
@@ -114,12 +114,12 @@ def _listen(table: Table, token_file: str | None) -> tuple[str, int] | None:
                 listen = host_and_port(table.text("listen"))
                 check_listening(listen, tokens=token_file is not None)
         elif token_file is not None:
-            raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
+            raise table.error('tokens need TCP; add an address, such as listen = "127.0.0.1:7420"', "token_file")
     return listen
 
 
 def _roles(table: Table, key: str, read: Callable[[Table], tuple[K, RoleSection]]) -> dict[K, RoleSection]:
-    """Read `[service.users]`, say, and return the role of each of them."""
+    """Read a table such as `[service.users]`, and return the role of each entry."""
     roles: dict[K, RoleSection] = {}
     for each in table.tables(key):
         with each.part():
@@ -130,15 +130,13 @@ def _roles(table: Table, key: str, read: Callable[[Table], tuple[K, RoleSection]
 def _role(table: Table, kind: str) -> RoleSection:
     section = RoleSection(**read_section(table, RoleSection), who=f"{kind} {table.name}", table=table)
     if section.allow_writes is not None and not (RIGHTS[section.role].writes and section.allow_writes):
-        raise table.error(
-            'names what a role = "write" or "admin" may write: leave it out for all of the line', "allow_writes"
-        )
+        raise table.error('needs role = "write" or "admin"; leave it out to permit the whole line', "allow_writes")
     return section
 
 
 def _of_group(table: Table, mode: int) -> RoleSection:
     if not mode & 0o066:
-        raise table.error(f"no group comes to a socket of mode {mode:04o}: say whose it is, as group = {table.name!r}")
+        raise table.error(f"groups cannot open a socket of mode {mode:04o}; set group = {table.name!r}")
     return _role(table, "group")
 
 
@@ -146,7 +144,7 @@ def _user(table: Table) -> int:
     try:
         return pwd.getpwnam(table.name).pw_uid
     except KeyError:
-        raise table.error(f"there is no user {table.name!r} on this machine") from None
+        raise table.error(f"the user {table.name!r} does not exist on this machine") from None
 
 
 def _group(table: Table) -> int:
@@ -156,7 +154,7 @@ def _group(table: Table) -> int:
 
 def _token(table: Table, token_file: str | None) -> str:
     if token_file is None:
-        raise table.error("a token is written in a file of its own: say which, as token_file")
+        raise table.error("tokens are stored in a separate file; name it with token_file")
     return table.name
 
 
@@ -164,7 +162,7 @@ def read_tokens(path: str) -> dict[str, bytes]:
     """Return the digest of each token of a file by its name. Raises InvalidCommand, naming no token."""
     secrets = dict(_tokens(path))
     if not secrets:
-        raise InvalidCommand(f"there are no tokens in {path}: a line is a name and its token")
+        raise InvalidCommand(f"{path} has no tokens; write a name and its token on each line")
     return secrets
 
 
@@ -177,34 +175,34 @@ def _tokens(path: str) -> Iterator[tuple[str, bytes]]:
             continue
         name = words[0]
         if len(words) != 2 or not NODE_NAME.fullmatch(name):
-            raise InvalidCommand(f"{path}:{number}: a line is a name and its token")
+            raise InvalidCommand(f"{path}:{number}: expected a name and its token")
         if len(words[1]) < SHORTEST_TOKEN:
             raise InvalidCommand(
-                f"{path}:{number}: the token of {name} has less than {SHORTEST_TOKEN} characters: "
+                f"{path}:{number}: the token of {name} has less than {SHORTEST_TOKEN} characters; "
                 "make one with openssl rand -hex 32"
             )
         if name in known:
-            raise InvalidCommand(f"{path}:{number}: there are two tokens {name!r}")
+            raise InvalidCommand(f"{path}:{number}: two tokens have the name {name!r}; rename or remove one")
         known.add(name)
         yield name, digest_of(words[1])
 
 
 def _private_text(path: str) -> str:
-    """Return what is in a file. Raises InvalidCommand where others may read it, or write it."""
+    """Return the text of a file. Raises InvalidCommand if other users can read or write it."""
     try:
         with open(path, "rb", opener=_without_waiting) as file:
             found = os.fstat(file.fileno())
             check_regular(found, path)
             # A group may read it: so may that of a credential that systemd hands over.
             if found.st_mode & 0o027 or found.st_uid not in (0, os.getuid()):
-                raise InvalidCommand(f"others may read {path}, or change it: chmod 600 {path}, as its only user")
+                raise InvalidCommand(f"other users can read or change {path}; run chmod 600 {path} as its owner")
             if found.st_size > LONGEST_FILE:
-                raise InvalidCommand(f"{path} has more than {LONGEST_FILE} bytes: this is not a list of tokens")
+                raise InvalidCommand(f"{path} has more than {LONGEST_FILE} bytes; it is not a list of tokens")
             return file.read(LONGEST_FILE).decode()
     except OSError as error:
         raise InvalidCommand(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise InvalidCommand(f"{path} is no text") from None
+        raise InvalidCommand(f"{path} is not a text file; write a name and its token on each line") from None
 
 
 def _without_waiting(path: str, flags: int) -> int:

@@ -1,7 +1,7 @@
-"""A TOML file whose values know where they stand, so that whatever is wrong with one is said with its line.
+"""A TOML file with the line of each value, for error messages.
 
-The standard library's reader keeps no places. `places` walks the text once more, which is simple where that reader has
-found it right: only strings, comments and brackets have to be told apart.
+The standard library's reader does not keep places. `places` scans the text a second time. This is simple for a text
+that the reader has accepted: only strings, comments and brackets must be distinguished.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Source:
     """The values of one file, and where each of them stands."""
 
     def __init__(self, name: str, text: str) -> None:
-        """Read a TOML text. Raises FileError, with the line, for what is no TOML."""
+        """Read a TOML text. Raises FileError with the line if it is not TOML."""
         self.name = name
         self.text = text
         check_bounds(name, text)
@@ -66,7 +66,7 @@ class Source:
             found = AT.search(str(error))
             line = (found and found[1]) or len(text.splitlines())  # "at end of document" has no number
             what = AT.sub("", str(error))
-            raise FileError(name, int(line), "", f"this is no TOML: {what[:1].lower()}{what[1:]}") from None
+            raise FileError(name, int(line), "", f"not valid TOML: {what[:1].lower()}{what[1:]}") from None
         self.problems: dict[tuple[str, str], FileError] | None = None
         """Where this is a dict, problems are collected in it, one for each key of a file; see `keep`."""
         self.unread: set[Key] = set()
@@ -75,26 +75,26 @@ class Source:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Source:
-        """Read a file. Raises OSError where it cannot be read, and FileError for what is no TOML."""
+        """Read a file. Raises OSError if it cannot be read, and FileError if it is not TOML."""
         name = os.fspath(path)
         try:
             return cls(name, read_file(path).decode())
         except UnicodeDecodeError as error:
             line = error.object[: error.start].count(b"\n") + 1
-            raise FileError(name, line, "", "this is no TOML: it is not written in UTF-8") from None
+            raise FileError(name, line, "", "not valid TOML: the file is not UTF-8") from None
 
     def beside(self, name: str) -> Path:
         """Return the path of a file that this one names: from its own folder, where it is not absolute."""
         return Path(self.name).parent / name
 
     def line(self, key: Key) -> int:
-        """Return the line on which `key` stands, or what it would be part of."""
+        """Return the line of `key`, or of the table that it would belong to."""
         while key and key not in self._places:
             key = key[:-1]
         return self._places.get(key, 1)
 
     def error(self, key: Key, text: str) -> FileError:
-        """Return an error of what is wrong at `key`, with its place: "line.toml:12: nodes.winder.address: ..."."""
+        """Return an error for `key` with its place: "line.toml:12: nodes.winder.address: ..."."""
         shown = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
         return FileError(self.name, self.line(key) if key else 0, shown, text, key)
 
@@ -112,23 +112,23 @@ def check_bounds(name: str, text: str) -> None:
     """Raise FileError, with the line, for texts and numbers that are too long, and for brackets or names that are
     nested too deeply.
 
-    This is done before the standard library's reader sees the text: that one calls itself for each bracket, copies a
-    dotted key once for each of its names, and refuses a long number with an error that names no line.
+    This check comes before the standard library's reader. That reader recurses for each bracket, copies a dotted key
+    once for each of its names, and rejects a long number with an error without a line.
     """
     line, brackets, names = 1, 0, 1
     for match in TOKEN.finditer(text):
         kind, token = match.lastgroup, match[0]
         if kind == "string" and len(token) > LONGEST_TEXT:
-            raise FileError(name, line, "", f"a text has {LONGEST_TEXT} characters at most, not {len(token)}")
+            raise FileError(name, line, "", f"a text must have at most {LONGEST_TEXT} characters, not {len(token)}")
         if kind == "bare" and len(token) > LONGEST_WORD:
-            what = f"a number or a key has {LONGEST_WORD} characters at most, not {len(token)}"
+            what = f"a number or a key must have at most {LONGEST_WORD} characters, not {len(token)}"
             raise FileError(name, line, "", what)
         if kind == "mark":
             brackets += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token, 0)
         if kind in ("mark", "newline"):
             names = names + 1 if token == "." else 1
         if max(brackets, names) > MOST_NESTED:
-            raise FileError(name, line, "", f"this is nested more than {MOST_NESTED} levels deep: no key needs that")
+            raise FileError(name, line, "", f"nested more than {MOST_NESTED} levels deep, which no key needs")
         line += token.count("\n")
 
 
@@ -252,7 +252,7 @@ class Walk:
         return tuple(names)
 
     def _skip(self) -> str:
-        """Go to the next token that is no new line, and return it."""
+        """Go to the next token that is not a new line, and return it."""
         while self._peek() == "\n":
             self._take()
         return self._peek()

@@ -1,4 +1,4 @@
-"""One table of the file, read key by key. Errors name file, line and key, and the nearest name that there is."""
+"""One table of the file, read key by key. Errors name file, line and key, and the nearest known name."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Table:
         new = now_called(key, known)
         if new is None:
             return meant(key, known)
-        return f"it is now {new!r}: `busmaster migrate {self.source.name} --write` changes all old names of the file"
+        return f"renamed to {new!r}; `busmaster migrate {self.source.name} --write` changes all old names of the file"
 
     def error(self, text: str, *way: str | int) -> FileError:
         """Return an error with the place of this table, or of what `way` leads to in it."""
@@ -60,7 +60,7 @@ class Table:
 
     @contextmanager
     def at(self, *way: str | int) -> Iterator[None]:
-        """Give this place to what is wrong inside: an InvalidCommand becomes a FileError."""
+        """Add this place to an error inside: an InvalidCommand becomes a FileError."""
         try:
             yield
         except FileError:

@@ -3,10 +3,10 @@
     [nodes.drive4-7]
     protocol = "microflex"
     address = "4-7"
-    template = "microflex"                       # shipped; or a file of one's own: "templates/ours.toml"
+    template = "microflex"                       # shipped; or the path of a file: "templates/ours.toml"
 
     [nodes.drive4-7.points]
-    speed_reference = { minimum = 0, maximum = 80 }   # what the template says of it holds beside that
+    speed_reference = { minimum = 0, maximum = 80 }   # its other keys are those of the template
 
 A template is a file with the protocols that it is for, and points as a node has them.
 """
@@ -32,13 +32,13 @@ SUFFIX = ".toml"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Template:
-    """What a template says of each of its points. Without a name it is none."""
+    """The points of a template. Without a name, no template is used."""
 
     name: Internal[str] = ""
     protocol: tuple[str, ...]
     """The protocol of the nodes that it is for, or several."""
     title: str = ""
-    """What it is a template of, for people."""
+    """Title of the template."""
     points: Annotated[Mapping[str, Table], tables_of("point")]
     """A table for each point, as `[nodes.NAME.points]` has them."""
 
@@ -62,7 +62,7 @@ def _shipped() -> Mapping[str, Path]:
 def read_template(node: Table, kind: NodeKind) -> Template:
     """Read the template that a node's section names, if it names one.
 
-    Raises FileError, naming the file and the line, for a template that there is not, is for others, or is wrong.
+    Raises FileError with file and line if the template is unknown, for other protocols, or has an error.
     """
     if "template" not in node:
         return Template(protocol=(), points={})
@@ -74,9 +74,12 @@ def read_template(node: Table, kind: NodeKind) -> Template:
             raise top.error(f"no such protocol {protocol!r}{guess(protocol, kinds())}", "protocol")
     template = Template(**values, name=name, points={point.name: point for point in top.tables("points")})
     if kind.name not in template.protocol:
-        raise node.error(f"{name} is for nodes of {' and '.join(template.protocol)}, not of {kind.name}", "template")
+        raise node.error(
+            f"{name} is for nodes of {' and '.join(template.protocol)}, not of {kind.name}; use another template",
+            "template",
+        )
     for point in template.points.values():
-        read_point(point, kind)  # what is wrong in the template is said with its own line
+        read_point(point, kind)  # reports errors with the line in the template
     return template
 
 
@@ -84,7 +87,7 @@ def _source(node: Table, name: str) -> Source:
     if name in _shipped():
         return Source.read(shipped_file(name))
     if not name.endswith(SUFFIX):
-        others = f": there are {', '.join(shipped())}; a file of one's own ends in {SUFFIX}"
+        others = f"; use one of {', '.join(shipped())}, or the path of your own file, which ends in {SUFFIX}"
         raise node.error(f"no such template {name!r}{guess(name, shipped()) or others}", "template")
     path = node.source.beside(name)
     try:
@@ -98,8 +101,8 @@ def _source(node: Table, name: str) -> Source:
 def read_points(node: Table, kind: NodeKind) -> dict[str, PointSection]:
     """Read the points of a node's section: those of its template, and its own.
 
-    Of a point that both name, each key is as the node has it, and else as the template has it. Raises FileError,
-    naming file, line and key, for what is wrong in either.
+    If both define a point, the keys of the node override those of the template. Raises FileError with file, line and
+    key for an error in either.
     """
     template = read_template(node, kind)
     points = {name: read_point(point, kind, template.name) for name, point in template.points.items()}

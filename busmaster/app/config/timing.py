@@ -26,9 +26,7 @@ TIMING = Form("table or text", {"anyOf": [{"enum": [LEARNED_WORD]}, {"$ref": "#/
 def _read_time(table: Table, key: str) -> float:
     time = table.seconds(key, most=math.inf)
     if time > LONGEST_TIMING:
-        raise table.error(
-            f"times are in seconds, {LONGEST_TIMING:g} at most: for {time:g} ms write {time / 1000:g}", key
-        )
+        raise table.error(f"must be at most {LONGEST_TIMING:g}, in seconds; for {time:g} ms write {time / 1000:g}", key)
     return time
 
 
@@ -70,9 +68,9 @@ class TimingSection(TimesSection):
 
 
 def read_timings(table: Table, base: Timings) -> Timings:
-    """Return `base` with what the table's `timing` changes.
+    """Return `base`, changed by the table's `timing`.
 
-    Nominal and maximum reply delay move with the window where they must.
+    `late_after` and the maximum reply delay change with the window if necessary.
     """
     if isinstance(table.data.get("timing"), str):
         table.choice("timing", (LEARNED_WORD,))
@@ -89,7 +87,7 @@ def read_timings(table: Table, base: Timings) -> Timings:
 
 
 def reads_learned(table: Table, base: bool) -> bool:
-    """Return whether the table's `timing` says that reply times are to be learned; `base` where it says nothing."""
+    """Return whether the table's `timing` requests learned reply times; `base` if it does not contain that."""
     timing = table.data.get("timing")
     if isinstance(timing, str):
         return timing == LEARNED_WORD

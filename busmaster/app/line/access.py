@@ -1,4 +1,4 @@
-"""What `[service]` says of users, groups and tokens, as authorisation of its line holds it."""
+"""The permissions of users, groups and tokens in `[service]`, in the form of a line's authorisation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Names(Protocol):
 
 
 def access_of(section: ServiceSection, names: Names, secrets: Mapping[str, bytes] | None = None) -> Access:
-    """Return who may do what. Raises FileError for a name that is no point, or of what cannot be allowed alone."""
+    """Return the permissions. Raises FileError for an unknown point, and for one that cannot be permitted alone."""
     return Access(
         users={uid: _permission(role, names) for uid, role in section.users.items()},
         groups={gid: _permission(role, names) for gid, role in section.groups.items()},
@@ -53,7 +53,7 @@ def _places(text: str, names: Names) -> Iterator[tuple[tuple[str, int], frozense
     pattern, slash, items = text.partition("/")
     nodes = [name for name in names.nodes if fnmatchcase(name, pattern)] if slash and ALL in pattern else [pattern]
     if not nodes:
-        raise InvalidCommand(f"no node is called like {pattern!r}; there are {', '.join(names.nodes)}")
+        raise InvalidCommand(f"no node matches {pattern!r}; the nodes are {', '.join(names.nodes)}")
     for name in nodes:
         if items == ALL and name in names.nodes:
             yield _key(names.nodes[name]), None
@@ -62,7 +62,7 @@ def _places(text: str, names: Names) -> Iterator[tuple[tuple[str, int], frozense
             if not point.writable:
                 raise InvalidCommand(f"{point.key} is read-only")
             if not isinstance(point.command, Placed):
-                raise InvalidCommand(f"{point.key} cannot be allowed alone: allow {name}/*")
+                raise InvalidCommand(f"{point.key} cannot be permitted alone; permit {name}/*")
             yield (point.node.profile.name, point.node.address), frozenset(point.command.places)
 
 

@@ -28,7 +28,7 @@ from busmaster.errors import InvalidCommand
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What is wrong with a file, in the order of its lines, and what `busmaster run` would do all the same."""
+    """The errors of a file, in the order of its lines, and warnings about settings that `busmaster run` accepts."""
 
     problems: tuple[FileError, ...]
     warnings: tuple[str, ...]
@@ -88,7 +88,7 @@ def _told(source: Source, line: ConfiguredLine | None) -> Iterator[FileError]:
 
 
 def _unread_nodes(source: Source, line: ConfiguredLine | None) -> set[str]:
-    """Return the names of the nodes of which something could not be read: what others say of them is not known."""
+    """Return the names of nodes with errors. References to these nodes cannot be checked."""
     nodes = source.data.get("nodes")
     unknown: set[str] = set()
     for section in nodes if isinstance(nodes, dict) else ():
@@ -126,15 +126,15 @@ def _names(text: str, nodes: set[str]) -> bool:
 
 
 def _doubts(file: LineFile, line: ConfiguredLine) -> Iterator[str]:
-    """Yield what `run` would not refuse, and what is probably not meant."""
+    """Yield warnings about settings that `run` accepts, but that are probably mistakes."""
     if not line.file.groups:
-        yield "nothing is polled: the file has no [groups.NAME]"
+        yield "nothing is polled, because the file has no poll group; add [groups.NAME]"
     elif not line.plan().fits:
-        yield "cycles will be missed: busmaster plan shows which, and what would fit"
+        yield "cycles will be missed; `busmaster plan` shows which, and suggests periods that fit"
     try:
         emulated_line(file)
     except InvalidCommand as error:
-        yield f"busmaster emulate refuses it: {error}"
+        yield f"`busmaster emulate` rejects the file: {error}"
     for kind, settings in file.outputs.items():
         for key in ("path", "spill"):
             path = getattr(settings, key, None)
@@ -145,10 +145,10 @@ def _doubts(file: LineFile, line: ConfiguredLine) -> Iterator[str]:
 
 
 def _not_writable(path: str) -> str:
-    """Return why this user cannot write a file, "" if it can. That is no problem: `run` may run as another user."""
+    """Return why this user cannot write a file, "" if it can. It is only a warning: `run` may run as another user."""
     where = Path(path)
     if where.is_dir():
-        return f"{where} is a folder"
+        return f"{where} is a folder; name a file"
     while not where.exists() and where != where.parent:
         where = where.parent
-    return "" if os.access(where, os.W_OK) else f"{where} cannot be written by this user"
+    return "" if os.access(where, os.W_OK) else f"{where} cannot be written by this user; check the permissions"

@@ -42,12 +42,12 @@ from busmaster.ext import (
 class ConfiguredLine:
     """A line made of a file. Use it in `async with`: entering opens the port and starts groups and outputs.
 
-    `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError, which
-    names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
-    sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
-    happens to the outputs. `read_only` lets nothing from outside be written: `authorisation` is what all of that
-    passes. With `wait_for_port` a port that cannot be opened yet is no error. One that never `asks` is not entered: its
-    outputs, fed with what another master hears, say nothing of the state of line and nodes.
+    `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError with
+    line and key for settings that the protocols or the outputs do not support. `port` is used instead of the file's.
+    `tap` receives every byte. Without `outputs`, nothing is recorded or published. `tell` is called, on the loop, with
+    the events of the outputs. `read_only` rejects all writes from outside; `authorisation` checks each of them. With
+    `wait_for_port`, a port that cannot be opened yet is not an error. A line that never `asks` only listens and is not
+    entered: its outputs do not report the state of line and nodes.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class ConfiguredLine:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Close the line first; the outputs then have a few seconds to write what they still hold."""
+        """Close the line first. The outputs then have a few seconds to write their queued data."""
         self.authorisation.leaving = True
         try:
             await self.bus.__aexit__(kind, error, traceback)
@@ -107,11 +107,11 @@ class ConfiguredLine:
             await self.outputs.close()
 
     async def take(self, file: LineFile) -> None:
-        """Go on as another reading of the file says: what did not change keeps its grid and streams.
+        """Apply a changed file. Unchanged groups keep their grid and streams.
 
-        Groups whose section or points changed are closed and made anew; so are outputs, and the others are reopened.
-        Raises InvalidCommand, having changed nothing, for what needs a new start: another port, other settings of a
-        node. The file is to be one of which a line can be made.
+        Groups whose section or points changed are closed and created again. So are outputs; the other outputs are
+        reopened. Raises InvalidCommand, before any change, for changes that need a restart, such as another port or
+        other settings of a node. The file must be valid for a line.
         """
         check_same_line(self.file, file)
         fresh = {name: self._handle(node) for name, node in file.nodes.items() if name not in self.nodes}
@@ -139,17 +139,17 @@ class ConfiguredLine:
         await self.outputs.replace(dict(self._wanted_outputs()), self.groups.values())
 
     def point(self, name: str) -> NamedPoint:
-        """Return the point that the file calls so: "winder/position", "press/2008:32".
+        """Return the point with this name in the file: "winder/position", "press/2008:32".
 
-        Raises InvalidCommand for what is no point of the line.
+        Raises InvalidCommand for a name that is not a point of the line.
         """
         node, slash, item = name.partition("/")
         if not slash or node not in self.nodes:
-            raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
+            raise InvalidCommand(f"no such point {name!r}; use NODE/ITEM, with a node of {', '.join(self.nodes)}")
         return self._point(node, item)
 
     def points_named(self, text: str) -> Iterator[NamedPoint]:
-        """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for what is none of the line."""
+        """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for an unknown point."""
         return (self._point(*name) for name in self._names(text))
 
     def handle(self, node: str, bus: NodeSource | None = None) -> Handle:
@@ -159,10 +159,10 @@ class ConfiguredLine:
     def prepare_write(
         self, name: str, values: Sequence[float], *, bus: NodeSource | None = None, **options: Unpack[WriteOptions]
     ) -> Send:
-        """Return what writes a value to the point that the file calls so, or the values of a run, in the point's unit.
+        """Return a function that writes a value to the named point, or the values of a run, in the point's unit.
 
-        It goes over `bus`, where that is another than the line's own: that of the program that owns the line.
-        `RequestOptions` says what the options are. Raises InvalidCommand for what cannot be sent, or is beyond a limit.
+        It uses `bus` if that is not the line's own, but that of the program that owns the line. `RequestOptions`
+        describes the options. Raises InvalidCommand for values that cannot be sent, or are beyond a limit.
         """
         point = self.point(name)
         if not point.writable:
@@ -171,17 +171,17 @@ class ConfiguredLine:
             try:
                 point.encode(tuple(values))
             except (ArithmeticError, TypeError, ValueError) as error:
-                raise InvalidCommand(f"{name} does not take {len(values)} values: {error}") from None
+                raise InvalidCommand(f"{name} does not accept {len(values)} values: {error}") from None
         handle = self.handle(point.where, bus)
-        # one call, whatever it takes on the line: half of it must not be taken for nothing, or for the whole
+        # one call for several exchanges: a partial write must not look like none or all
         [send] = ext.prepare_write(handle, point.source.item, list(map(point.unscaled, values)), **options)
         return send
 
     def audit(self, tell: Callable[[str], None] = lambda _: None) -> Distributor:
-        """Return those outputs of the file that keep an audit log, for a process that polls nothing.
+        """Return the outputs of the file that keep an audit log, for a process that does not poll.
 
-        They are not started, say nothing of the line's state, and take in no commands. Raises InvalidCommand if an
-        extra is missing.
+        They are not started, do not report the line's state, and accept no commands. Raises InvalidCommand if an extra
+        is missing.
         """
         audit = Distributor(self.bus, tell, in_charge=False)
         for kind, settings in self.file.outputs.items():
@@ -248,7 +248,7 @@ class ConfiguredLine:
         return handle
 
     def _held_limits(self) -> Iterator[tuple[Node, Limit]]:
-        """Hold what the file says of its points, by whatever name they are written, and say what is held."""
+        """Apply the limits of the file's points to all of their names, and return the limits."""
         for node in self.file.nodes.values():
             for name, section in node.points.items():
                 if section.limited:
@@ -271,7 +271,7 @@ class ConfiguredLine:
             with group.table.part():
                 members = tuple(islice(self._members(group), left + 1))
                 if len(members) > left:
-                    raise group.table.error(f"the groups of a line have {MOST_MEMBERS} points at most", "points")
+                    raise group.table.error(f"the groups have more than {MOST_MEMBERS} points; remove some", "points")
                 left -= len(members)
                 wanted[group.name] = members
         return wanted
@@ -292,19 +292,19 @@ class ConfiguredLine:
         """
         nodes, slash, items = text.partition("/")
         if not slash:
-            raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
+            raise InvalidCommand(f"{text!r} is not a point; write NODE/ITEM")
         count = 0
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
                 raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             bits = (f"{point.name}.{bit}" for point in section.points.values() for bit in point.meaning.bits)
-            # a1-3 may be a name, and then is no range
+            # a1-3 can be a name, and then it is not a range
             known = {*section.points, *section.options.get("symbols", ()), *bits}
             for item in (name for part in listed(items) for name in expanded(part, known)):
                 count += 1
                 if count > MOST_MEMBERS:
-                    raise InvalidCommand(f"{text[:SHOWN]!r} stands for more than {MOST_MEMBERS} points")
+                    raise InvalidCommand(f"{text[:SHOWN]!r} expands to more than {MOST_MEMBERS} points")
                 yield node, item
 
     def _point(self, where: str, name: str) -> NamedPoint:
@@ -346,13 +346,13 @@ class ConfiguredLine:
         with section.table.part():
             for name in section.repeatable:
                 if name not in table.data:
-                    raise section.table.error(f"{name} is not among the writes", "repeatable")
+                    raise section.table.error(f"{name} is not in writes; add it there, or remove it", "repeatable")
         for name, value in section.writes.items():
             with table.part(), table.at(name):
                 point = self.point(name)
                 other = known.setdefault(point.quantity, name)
                 if other != name:
-                    raise InvalidCommand(f"{other} is the same quantity: write it once")
+                    raise InvalidCommand(f"is the same quantity as {other}; remove one of them")
                 handle = self.nodes[name.partition("/")[0]]
                 yield SafeWrite.of(point, handle, value, repeatable=name in section.repeatable)
 
@@ -388,16 +388,16 @@ class ConfiguredLine:
 
 
 def check_same_line(before: LineFile, after: LineFile) -> None:
-    """Raise InvalidCommand where a file says of the port, or of a node, what a line that runs cannot change."""
+    """Raise InvalidCommand for changes of the port or of a node that a running line cannot apply."""
     if (before.port, before.strict) != (after.port, after.strict):
-        raise InvalidCommand("other settings of the port need a restart")
+        raise InvalidCommand("changes of the port need a restart")
     if before.service != after.service:
-        raise InvalidCommand("another [service] needs a restart")
+        raise InvalidCommand("changes of [service] need a restart")
     own = {_address(node): node for node in before.nodes.values()}
     for node in after.nodes.values():
         known = before.nodes.get(node.name) or own.get(_address(node))  # renamed, it has other settings
         if known is not None and _settings(known) != _settings(node):
-            raise InvalidCommand(f"other settings of node {node.name!r} need a restart")
+            raise InvalidCommand(f"changes of node {node.name!r} need a restart")
 
 
 def _address(node: NodeSection) -> tuple[str, int]:
@@ -420,9 +420,9 @@ def _settings(node: NodeSection) -> tuple[object, ...]:
 
 
 def _section(file: LineFile, name: str) -> PointSection | None:
-    """Return what a file says of the point that it calls so, or of the word of which that is a bit.
+    """Return the section of a point with this name, or of the word to which the named bit belongs.
 
-    None stands for a point that goes by its item, and for one of a node that the file has not.
+    None for a point that is named by its item, and for a point of an unknown node.
     """
     node, _, point = name.partition("/")
     section = file.nodes.get(node)
@@ -441,7 +441,7 @@ def _check_bits(node: NodeSection, word: PointSection, handle: Handle) -> None:
     for bit in word.meaning.bits:
         name = f"{word.name}.{bit}"
         if name in node.points or _has(handle, name):
-            raise word.table.error(f"{node.name} has something else that is called {name}", "bits", bit)
+            raise word.table.error(f"{node.name} has another point or item {name}; rename one", "bits", bit)
 
 
 def _has(handle: Handle, item: str) -> bool:
@@ -488,7 +488,7 @@ def open_line(path: str | os.PathLike[str], *, outputs: bool = True, tap: Tap | 
             await line.nodes["winder"].write(1, 123.456)
             async for snapshot in line.groups["axes"]: ...
 
-    Its outputs run too, unless `outputs` is False. Raises OSError if the file cannot be read, and InvalidCommand,
-    naming file, line and key, for what is wrong in it, or for an output whose extra is not installed.
+    Its outputs run too, unless `outputs` is False. Raises OSError if the file cannot be read, and InvalidCommand with
+    file, line and key for an error in it, or for an output whose extra is not installed.
     """
     return ConfiguredLine(load(path), outputs=outputs, tap=tap)

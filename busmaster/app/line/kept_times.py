@@ -1,7 +1,7 @@
-"""The reply times that a line has learned, in a file that the next run of the line starts with.
+"""Stores the learned reply times of a line in a file, with which the next run starts.
 
-What is read from there is a hint alone: it is trusted after fewer replies, and leads to no window that is longer than
-the document's. A file that is damaged is left out as a whole; one that is wrong costs time, and no more.
+Stored times are only a hint. They are trusted after fewer replies, and never make a window longer than the document's.
+A damaged file is ignored as a whole. Wrong times cost time and nothing else.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ KEEP_EVERY = 600.0
 """Seconds from one keeping to the next, while the line runs."""
 PATIENCE = 5.0
 """Seconds for which a disk may hold up the start or the end of a line."""
-ANEW, NOT_KEPT = "reply times are learned anew", "the reply times that were learned are not kept"
+ANEW, NOT_KEPT = "reply times are learned again", "the learned reply times are not stored"
 SLICE = 16
 """Nodes whose times are taken at once, before the loop may go on with the line."""
 
 
 class KeptTimes:
-    """The file of one line. `tell` is called, on the loop, with what is wrong with it, once until that changes."""
+    """The file of one line. `tell` is called, on the loop, with an error of the file, once until it changes."""
 
     def __init__(self, bus: Bus, tell: Callable[[str], None]) -> None:
         self._bus = bus
@@ -42,7 +42,7 @@ class KeptTimes:
         self._path: str | None = None
         self._nodes: Mapping[str, Node] = {}
         self._known: Mapping[str, Any] = {}
-        """What the file said when the line was opened."""
+        """Contents of the file when the line was opened."""
         self._kept = ""
         self._trouble = self._told = ""
         self._keeping: asyncio.Task[None] | None = None
@@ -50,13 +50,13 @@ class KeptTimes:
         self._one_at_a_time = threading.Lock()
 
     async def start(self, path: str | None, nodes: Mapping[str, Node]) -> None:
-        """Begin with what the file says of these nodes, and keep from now on what they learn; None keeps nothing."""
+        """Load the times of these nodes from the file, and update the file from now on. None stores nothing."""
         if path is not None:
             await asyncio.to_thread(self._do, ANEW, self._read, path)
         self.take(path, nodes)
 
     def take(self, path: str | None, nodes: Mapping[str, Node]) -> None:
-        """Go on with these nodes, and keep their times there: those that are new begin with what the file said."""
+        """Continue with these nodes and this file. New nodes start with the times loaded at the start."""
         fresh = {name: node for name, node in nodes.items() if node not in self._nodes.values()}
         self._path, self._nodes = path, dict(nodes)
         for name, node in fresh.items():
@@ -67,7 +67,7 @@ class KeptTimes:
         self._say()
 
     async def close(self) -> None:
-        """Keep what is known, and end."""
+        """Store the present times, and stop."""
         if self._keeping is None:
             return
         self._keeping.cancel()
@@ -116,7 +116,7 @@ class KeptTimes:
                 self._thread.start()
             self._thread.join(PATIENCE)
             if self._thread.is_alive():
-                self._trouble = f"{path}: no answer for {PATIENCE:g} s: {without}"
+                self._trouble = f"{path}: the file system did not respond for {PATIENCE:g} s; {without}"
 
     def _read(self, path: str) -> None:
         try:
@@ -130,7 +130,7 @@ class KeptTimes:
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            self._trouble = f"{path}: {_why(error)}: {ANEW}"
+            self._trouble = f"{path}: {_why(error)}; {ANEW}"
 
     def _write(self, path: str, nodes: Mapping[str, Any]) -> None:
         """Put the file in the place of the one before, whole."""
@@ -145,7 +145,7 @@ class KeptTimes:
                 os.fsync(file.fileno())
             os.replace(fresh, path)
         except OSError as error:
-            self._trouble = f"{path}: {_why(error)}: {NOT_KEPT}"
+            self._trouble = f"{path}: {_why(error)}; {NOT_KEPT}"
         else:
             self._kept, self._trouble = text, ""
 
@@ -153,16 +153,16 @@ class KeptTimes:
 def _why(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return "it is damaged, or of another version"
+    return "the file is damaged, or from another version"
 
 
 def _times(node: Any) -> list[LearnedTimes]:
-    """Return what a file says of one node. Raises ValueError, TypeError or KeyError for what cannot be."""
+    """Return the times of one node in a file. Raises ValueError, TypeError or KeyError for invalid contents."""
     found = [LearnedTimes(**said) for said in node["times"]]
     for times in found:
         seconds = (times.slowest, times.received, times.pause, times.window)
         if not (type(times.kind) is str and type(times.packet) is type(times.trusted) is bool):
-            raise ValueError("a kind is a text, packet and trusted are true or false")
+            raise ValueError("kind must be a text, packet and trusted true or false")
         if not all(type(time) in (int, float) and 0 <= time < math.inf for time in seconds):
-            raise ValueError("a time is a number of seconds")
+            raise ValueError("a time must be a number of seconds")
     return found

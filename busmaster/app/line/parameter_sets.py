@@ -1,7 +1,7 @@
-"""Files of parameter sets: read with bounds and with the line of each fault, written whole, and resumed.
+"""Reads and writes files of parameter sets. An error names its line; a file is written whole; a save can be resumed.
 
 A set is TOML with a line for each parameter, whose value is in its unit. While a set is being saved, `FILE.part` beside
-it has what was read so far: an interrupted save goes on from there.
+it contains the values that were read so far. An interrupted save continues from there.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ class SetFile:
         kind = handle.profile.kind_name
         if kind != self.set.protocol:
             raise self._source.error(
-                ("drive", "protocol"), f"{handle.node.label} is a {kind}: a set of a {self.set.protocol} is not for it"
+                ("drive", "protocol"),
+                f"{handle.node.label} is a {kind}, but the set belongs to a {self.set.protocol}; use a set of a {kind}",
             )
         for item in self.set.entries:
             with Table(self._source).at("parameters", item):
                 handle.point(item)
 
     def check_range(self, item: str) -> None:
-        """Raise FileError for a value that is beyond the range that the file says of it: it is not to be written. One
-        that a node was found to hold may be."""
+        """Raise FileError for a value beyond the range in the file, which must not be written. Values read from a node
+        are not checked."""
         parameter, number = self.set.entries[item]
         value = in_unit(parameter, number, self.kind)
         for limit, beyond in (
@@ -86,8 +87,8 @@ def in_unit(parameter: Parameter, value: Value, kind: NodeKind) -> Value:
 
 
 def read_set(path: str) -> SetFile:
-    """Read a parameter set. Raises OSError where the file cannot be read, and FileError, with file, line and key, for
-    what is wrong in it."""
+    """Read a parameter set. Raises OSError if the file cannot be read, and FileError with file, line and key for an
+    error in it."""
     source = Source.read(path)
     table = Table(source)
     table.only("format", "drive", "saved", "parameters")
@@ -98,7 +99,7 @@ def _read(table: Table) -> tuple[NodeKind, ParameterSet]:
     number = table.whole("format")
     if number != FORMAT:
         raise table.error(
-            f"this version of busmaster reads parameter sets of the format {FORMAT}, not {number}", "format"
+            f"the set has format {number}, and this version of busmaster reads {FORMAT}; use another version", "format"
         )
     drive, saved = table.table("drive"), table.table("saved")
     drive.only("protocol", "address", "label", "line", "identity")
@@ -109,7 +110,7 @@ def _read(table: Table) -> tuple[NodeKind, ParameterSet]:
     identity = drive.table("identity")
     parameters = table.table("parameters")
     if len(parameters.data) > MOST_MEMBERS:
-        raise table.error(f"a parameter set has {MOST_MEMBERS} parameters at most", "parameters")
+        raise table.error(f"a parameter set must have at most {MOST_MEMBERS} parameters", "parameters")
     wanted = ParameterSet(
         protocol=kind.name,
         address=address,
@@ -158,7 +159,7 @@ def _entries(table: Table, kind: NodeKind) -> Iterator[tuple[Parameter, Value]]:
 
 def _value(table: Table, key: str) -> Value:
     if key not in table:
-        raise table.error(f"{key!r} is missing: a number, true or false")
+        raise table.error(f"{key!r} is missing; use a number, true or false")
     if isinstance(table.data[key], list):
         raise table.error(f"must be a number, true or false, not {shown(table.data[key])}", key)
     [value] = table.numbers(key)
@@ -215,14 +216,14 @@ def write_set(path: str, one: ParameterSet, kind: NodeKind) -> None:
 def check_new(path: str) -> None:
     """Raise InvalidCommand for a file that exists: a set is not overwritten."""
     if os.path.exists(path):
-        raise InvalidCommand(f"{path} is there already, and not overwritten: choose another name")
+        raise InvalidCommand(f"{path} exists and is not overwritten; choose another name")
 
 
 class PartFile:
-    """What was read so far of a set, for `with`: a file that is appended to, parameter by parameter.
+    """The part of a set that was read so far, for `with`: a file to which each parameter is appended.
 
-    If it is there already, the save goes on where it stopped. Raises InvalidCommand where it is of another node or
-    another list, FileError where it cannot be read.
+    If it exists, the save continues where it stopped. Raises InvalidCommand if it belongs to another node or another
+    list, FileError if it cannot be read.
     """
 
     def __init__(self, path: str, empty: ParameterSet, wanted: Sequence[Parameter], kind: NodeKind) -> None:
@@ -283,12 +284,12 @@ class PartFile:
             return None
         whole = data[: data.rfind(b"\n") + 1]  # a line that was being written is read again
         text = whole.decode(errors="replace")
-        other = f"remove {self._part} to begin anew, or choose another name"
+        other = f"remove {self._part} to start again, or choose another name"
         if "[parameters]\n" not in text:
             os.unlink(self._part)  # it ended before the first parameter
             return None
         if not text.startswith(self._list):
-            raise InvalidCommand(f"{self._part} was begun with other parameters: {other}")
+            raise InvalidCommand(f"{self._part} was started with other parameters; {other}")
         source = Source(self._part, text)
         parameters = source.data["parameters"]
         gaps = {item: said for item, said in parameters.items() if isinstance(said, dict) and "why" in said}
@@ -296,7 +297,7 @@ class PartFile:
             del parameters[item]
         _, begun = _read(Table(source))
         if (begun.protocol, begun.address, begun.identity) != (empty.protocol, empty.address, empty.identity):
-            raise InvalidCommand(f"{self._part} was begun with another node ({begun.label}): {other}")
+            raise InvalidCommand(f"{self._part} was started with another node ({begun.label}); {other}")
         own = {one.item: one for one in self._wanted}
         self._found = {item: Entry(own[item], entry.value) for item, entry in begun.entries.items()}
         for item, said in gaps.items():
@@ -311,8 +312,8 @@ class PartFile:
 def line_parameters(
     line: ConfiguredLine, node: str, handle: Handle, items: Sequence[str] = ()
 ) -> tuple[Parameter, ...]:
-    """Return the parameters of a node of a LINE.toml: those that its protocol documents, with what the file says of
-    them, and those that only the file names; with `items`, these.
+    """Return the parameters of a node of a LINE.toml: those in its protocol's document, changed by the file, and those
+    that only the file names; with `items`, only these.
 
     An item may be a point's name in the file. Raises InvalidCommand as `Handle.parameters` does.
     """
@@ -336,7 +337,7 @@ def line_parameters(
                 offset=point.offset,
                 minimum=point.minimum,
                 maximum=point.maximum,
-                kept="" if point.writable else "LINE.toml says writable = false",
+                kept="" if point.writable else "LINE.toml has writable = false",
             ),
         )
     if items:
@@ -351,12 +352,12 @@ def line_parameters(
     if not found:
         handle.parameters()  # for its complaint
     if len(found) > MOST_MEMBERS:
-        raise InvalidCommand(f"a parameter set has {MOST_MEMBERS} parameters at most")
+        raise InvalidCommand(f"a parameter set must have at most {MOST_MEMBERS} parameters")
     return tuple(found)
 
 
 def _described(document: Parameter, file: Parameter | None) -> Parameter:
-    """Return what document and file say of a parameter: the file's words, the document's item and order."""
+    """Return a parameter with the file's texts, and the document's item and order."""
     if file is None:
         return document
     return replace(

@@ -1,7 +1,7 @@
-"""The points of a file as a table, a row each: for people, and as CSV.
+"""The points of a file as a table with one row each, as text and as CSV.
 
-A column is what a file can say of a point; a cell is empty where it is not said. Texts are as they are; numbers, `true`
-and `false`, and tables of bits and labels are as in LINE.toml.
+A column is a key of a point. A cell is empty if the key is not set. Texts have no quotes; numbers, `true` and `false`,
+and tables of bits and labels are as in LINE.toml.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from busmaster.ext import Placed
 
 NODE, POINT, ITEM, LIMITED_BY, ORIGIN = "node", "point", "item", "limited_by", "origin"
 COLUMNS = (NODE, POINT, *POINT_KEYS, LIMITED_BY, ORIGIN)
-"""The last two are told, not taken."""
+"""The last two are export-only."""
 SYMBOLS = "symbols"
 TEXTS = frozenset(part.name for part in fields(PointSection) if get_type_hints(PointSection)[part.name] is str)
 """Keys whose cells are texts, and not written as in LINE.toml."""
@@ -54,10 +54,10 @@ def rows(file: LineFile) -> Iterator[Row]:
 
 
 def _limiting(file: LineFile) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Return, for each point of a section, the others of it whose limits hold for what it names."""
+    """Return, for each point of a section, the other points whose limits apply to it."""
     found: dict[tuple[str, str], tuple[str, ...]] = {}
     limited = {where: node for where, node in sections(file).items() if any(p.limited for p in node.points.values())}
-    line = ConfiguredLine(replace(file, groups={}), outputs=False) if limited else None  # what is polled is not asked
+    line = ConfiguredLine(replace(file, groups={}), outputs=False) if limited else None  # without groups
     for where, node in limited.items():
         assert line is not None
         names = {name: name for name in node.options.get(SYMBOLS, ())}
@@ -82,7 +82,7 @@ def sections(file: LineFile) -> dict[str, NodeSection]:
 
 
 def said_text(said: Said, key: str) -> str:
-    """Return what is said under a key as people read it; "" where nothing is."""
+    """Return the value of a key as text; "" if it is not set."""
     return "" if key not in said else str(said[key]) if key in TEXTS else toml_text(said[key])
 
 

@@ -28,7 +28,7 @@ from busmaster.ext import meant
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")
 MOST_FAULTS = 20
-"""Faults of a CSV that are told; the rest is counted."""
+"""Maximum number of errors of a CSV that are reported in full; the others are counted."""
 
 
 class BadRows(InvalidCommand):
@@ -41,7 +41,7 @@ class BadRows(InvalidCommand):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a CSV changes of one point: what was said of it, None where there was none, and what is said now."""
+    """The change of one point by a CSV: its keys before, None for a new point, and after."""
 
     node: str
     point: str
@@ -62,7 +62,7 @@ def _told(said: Said, key: str) -> str:
 
 
 def _same(one: Said, other: Said, key: str) -> bool:
-    """Tell whether two say the same under a key. True is no 1."""
+    """Return whether two points have the same value of a key. True differs from 1."""
     if key not in one or key not in other:
         return key not in one and key not in other
     return bool(one[key] == other[key]) and isinstance(one[key], bool) == isinstance(other[key], bool)
@@ -78,11 +78,10 @@ class Taking:
 
 
 def taken(file: LineFile, name: str, data: bytes) -> Taking:
-    """Return what a file becomes by a CSV, called `name`, with rows for some or all of its points.
+    """Return a file changed by a CSV, called `name`, with rows for some or all of its points.
 
-    Points are added and changed, never taken away: of a column that the CSV has not nothing changes, and an empty cell
-    says that nothing is said. Raises BadRows with all that is wrong in the rows, FileError for what is wrong in the
-    file that they would make.
+    Points are added and changed, never deleted. Keys without a column in the CSV are not changed. An empty cell removes
+    the key. Raises BadRows with all errors of the rows, FileError for an error in the resulting file.
     """
     incoming = _Incoming(file, name)
     incoming.read(data)
@@ -110,7 +109,7 @@ def write_beside(path: str, text: str) -> None:
             file.write(text.encode())
             file.flush()
             os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
-            with suppress(PermissionError):  # it was somebody else's, and is now the user's, who may write here
+            with suppress(PermissionError):  # another user owned it; it now belongs to this user, who may write here
                 os.fchown(descriptor, before.st_uid, before.st_gid)
             os.fsync(descriptor)
         os.replace(beside, target)
@@ -120,7 +119,7 @@ def write_beside(path: str, text: str) -> None:
 
 
 class _RowPlace(Source):
-    """Gives what is wrong in a row its number, and its column. The first part of a key is the point's name."""
+    """Adds the row's number and the column to an error. The first part of a key is the point's name."""
 
     def __init__(self, name: str, number: int) -> None:
         super().__init__(name, "")
@@ -132,7 +131,7 @@ class _RowPlace(Source):
 
 
 class _Incoming:
-    """The rows of a CSV, and what they make of a file."""
+    """The rows of a CSV, and the changes of a file by them."""
 
     def __init__(self, file: LineFile, name: str) -> None:
         self.faults: list[str] = []
@@ -140,7 +139,7 @@ class _Incoming:
         self.numbers: dict[tuple[str, str], int] = {}
         """The row of each point that the CSV has."""
         self.own: dict[tuple[str, str], Said] = {}
-        """What the node's own section is to say of each point that changes."""
+        """The new keys of each changed point in the node's own section."""
         self._file = file
         self._name = name
         self._sections = sections(file)
@@ -158,17 +157,17 @@ class _Incoming:
         return replace(self._file, nodes=nodes)
 
     def read(self, data: bytes) -> None:
-        """Read all rows, and note what is wrong in them. Raises BadRows for what is no CSV of points."""
+        """Read all rows, and collect their errors. Raises BadRows if the text is not a CSV of points."""
         records = self._records(data)
         head = [cell.strip().lower() for cell in next(records, [])]
         for column in head:
             if column not in COLUMNS:
                 raise BadRows(f"{self._name}: row 1: no such column {column!r}; {meant(column, COLUMNS)}")
             if head.count(column) > 1:
-                raise BadRows(f"{self._name}: row 1: the column {column} is there twice")
+                raise BadRows(f"{self._name}: row 1: there are two columns {column}; remove one")
         for column in (NODE, POINT):
             if column not in head:
-                raise BadRows(f"{self._name}: row 1: there is no column {column}")
+                raise BadRows(f"{self._name}: row 1: the column {column} is missing; add it")
         for number, cells in enumerate(records, 2):
             if any(cells):
                 try:
@@ -181,25 +180,25 @@ class _Incoming:
             text = data.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             line = data[: error.start].count(b"\n") + 1
-            raise BadRows(f"{self._name}: line {line}: it is not written in UTF-8: save it as such") from None
+            raise BadRows(f"{self._name}: line {line}: the file is not UTF-8; save it as UTF-8") from None
         delimiter = ";" if ";" in text.partition("\n")[0] else ","
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
         try:
             yield from reader
         except csv.Error as error:
-            raise BadRows(f"{self._name}: line {reader.line_num}: this is no CSV: {error}") from None
+            raise BadRows(f"{self._name}: line {reader.line_num}: not valid CSV: {error}") from None
 
     def _row(self, place: _RowPlace, number: int, head: Sequence[str], cells: Sequence[str]) -> None:
-        """Read one row. Raises FileError for what is wrong in it."""
+        """Read one row. Raises FileError for an error in it."""
         if len(cells) != len(head):
-            more = ": is there a comma in one that is not in quotes?" if len(cells) > len(head) else ""
-            raise place.error((), f"it has {len(cells)} cells and not {len(head)}{more}")
+            more = "; put cells with a comma into quotes" if len(cells) > len(head) else ""
+            raise place.error((), f"the row has {len(cells)} cells instead of {len(head)}{more}")
         given = dict(zip(head, cells, strict=True))
         where, name = text_of(given[NODE]), text_of(given[POINT])
         node = self._node(place, where)
         first = self.numbers.setdefault((where, name), number)
         if first != number:
-            raise place.error((name,), f"{where}/{name} is in row {first} already")
+            raise place.error((name,), f"{where}/{name} is also in row {first}; remove one of the rows")
         held = self._held.get((where, name))
         before = held.said if held else {}
         after = {key: value for key in POINT_KEYS for value in _values(place, name, key, given, before)}
@@ -213,21 +212,22 @@ class _Incoming:
         if where in self._sections:
             return self._sections[where]
         node = self._file.nodes.get(where)
-        what = f"it is one of {node.table.name}, which is" if node else meant(where, self._sections)
-        raise place.error(("", NODE), f"no section of nodes is called {where!r}; {what}")
+        what = f"the node belongs to {node.table.name}; use that name" if node else meant(where, self._sections)
+        raise place.error(("", NODE), f"no section of nodes has the name {where!r}; {what}")
 
     def _own(self, place: _RowPlace, where: str, name: str, after: Said) -> Said:
-        """Return what the node's own section is to say, so that it is this with what its template says."""
+        """Return the keys for the node's own section that, together with the template, give this point."""
         template = self._templates[where].points.get(name)
         given = {} if template is None else template.data
         for key in given:
             if key not in after:
-                raise place.error((name, key), f"is {toml_text(given[key])} by the template: write another value")
+                value = toml_text(given[key])
+                raise place.error((name, key), f"is {value} in the template and cannot be removed; write another value")
         written = self._file.table.source.data["nodes"][where].get("points", {}).get(name, {})
         return {key: after[key] for key in after if key in written or not _same(given, after, key)}
 
     def _section(self, node: NodeSection, table: Table) -> PointSection:
-        """Read and check what is said of a point of that section."""
+        """Read and check a point of that section."""
         section = read_point(table, node.kind)
         with table.at(*(["item"] if "item" in table else [])):
             point = self._line.nodes[node.name].point(section.item)
@@ -236,7 +236,7 @@ class _Incoming:
 
 
 def _values(place: _RowPlace, name: str, key: str, given: dict[str, str], before: Said) -> Iterator[Any]:
-    """Yield what is said under a key: what the cell says, or what was said where there is no such column."""
+    """Yield the value of a key: that of the cell, or the present one if there is no such column."""
     cell = given.get(key)
     if cell is None:
         if key in before:
@@ -246,11 +246,11 @@ def _values(place: _RowPlace, name: str, key: str, given: dict[str, str], before
 
 
 def _value(place: _RowPlace, key: Key, cell: str) -> Any:
-    """Return what a cell says that is as in LINE.toml. What it cannot be is refused where its key is read."""
+    """Return the value of a cell in the form of LINE.toml. An unsuitable value is rejected when its key is read."""
     if cell.lower() in ("true", "false"):
         return cell.lower() == "true"  # a spreadsheet writes TRUE
     if DECIMAL_COMMA.fullmatch(cell):
-        raise place.error(key, f"it has a decimal comma: write {cell.replace(',', '.')}, not {cell}")
+        raise place.error(key, f"{cell} has a decimal comma; write {cell.replace(',', '.')}")
     try:
         said = tomllib.loads(f"cell = {cell}")
     except tomllib.TOMLDecodeError:

@@ -44,16 +44,16 @@ class SafeWrite:
         if not point.writable:
             raise InvalidCommand(f"{point.key} is read-only")
         if point.encode is None:
-            raise InvalidCommand(f"{point.key} is a run of values: write them one by one, each is verified")
+            raise InvalidCommand(f"{point.key} is a run of values; write them one by one, because each is verified")
         command = point.encode(value)
         if not (repeatable or command.idempotent):
             raise InvalidCommand(
-                f"{point.key} may not be repeated as far as its protocol knows: if writing it twice harms nobody, "
-                f'say so: repeatable = ["{point.key}"]'
+                f"{point.key} is not repeatable by its protocol; if a second write does no harm, "
+                f'add repeatable = ["{point.key}"]'
             )
         node = Node.of(point)
         if node.address == node.profile.broadcast:
-            raise InvalidCommand(f"{point.key} is for all nodes: nobody confirms it; write each node's own")
+            raise InvalidCommand(f"{point.key} is a broadcast, which no node confirms; write the point of each node")
         item, number = point.source.item, point.unscaled(value)
 
         def prepare(within: float) -> Send:
@@ -62,7 +62,7 @@ class SafeWrite:
                 item,
                 [number],
                 priority=Priority.URGENT,
-                idempotent=True,  # its protocol has said so, or `repeatable`
+                idempotent=True,  # defined by the protocol or by `repeatable`
                 verify=True,
                 safe=True,
                 finish_within=within,
@@ -89,7 +89,7 @@ class SafeState:
         return {write.point.key: write.value for write in self.writes}
 
     def refusal(self, permission: Permission) -> str:
-        """Return why somebody may not have it sent, "" if he may."""
+        """Return why a client may not send the safe state, "" if it may."""
         return next(
             (why for write in self.writes if (why := permission.refusal(write.node, write.command))),
             "",
@@ -98,9 +98,10 @@ class SafeState:
     async def enter(self, authorisation: Authorisation, by: str, *, leaving: bool = True) -> dict[str, BusError | None]:
         """Send all, urgently, read them back, and return by point why it was not confirmed, None if it was.
 
-        From now on the bus takes no other write; unless the line is not left (`leaving`): then it does so afterwards,
-        and what waited, or was decided before, is not sent. Nodes are served at the same time, each in the file's
-        order; what fails is tried again until the time is over. `by` says for the record who wants it.
+        From now on the bus rejects all other writes. If the line continues (`leaving` is False), the bus accepts
+        writes again afterwards, but discards those that were queued or decided before. Nodes are served at the same
+        time, each in the file's order. A failed write is retried until the time is over. `by` is the source in the
+        audit log.
         """
         if not self.writes:
             return {}
@@ -124,7 +125,7 @@ class SafeState:
             with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
                 async with anyio.create_task_group() as tasks:
                     for node, ones in by_node.items():
-                        node.suspend(0.0)  # also one that somebody has suspended
+                        node.suspend(0.0)  # also a node that a client has suspended
                         tasks.start_soon(_leave, bus, ones, deadline)
         finally:
             for one in leaving:
@@ -168,7 +169,7 @@ class Leaving:
 
 
 async def _leave(bus: Bus, leaving: Sequence[Leaving], deadline: float) -> None:
-    """Write what is left of one node's, round by round: one that fails does not keep the others from being sent."""
+    """Send the remaining writes of one node in rounds, so that a failed write does not block the others."""
     waiting = list(leaving)
     while waiting and bus.now() < deadline:
         left = []

@@ -216,7 +216,7 @@ class MintHandle(CommsHandle):
         """Return the write that starts a command. Raises InvalidCommand for one that cannot be sent, or its data."""
         start = self._write_command(element, (command,))
         if float(start.text) == 0:
-            raise InvalidCommand(f"{self.node.label}: 0 is not a command: with it the program reports that a command is done")
+            raise InvalidCommand(f"{self.node.label}: 0 is not a command, but the report that one is done")
         whole_number(start.element + len(data), 1, LAST_OF_PROGRAM, f"{self.node.label}: the last element of a command")
         if data:
             self._writes(start.element + 1, data)

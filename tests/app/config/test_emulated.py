@@ -266,7 +266,7 @@ def test_values_of_every_kind_of_node_can_be_said() -> None:
         ),
         (
             node("hcp2", 1, emulated="model = 'MSC-250'"),
-            "line.toml:7: emulator.nodes.n.model: only nodes of msc have this, not those of hcp2",
+            "line.toml:7: emulator.nodes.n.model: is only for nodes of msc, not of hcp2",
         ),
         (
             node("msc", 1, "model = 'MSC-25'"),
@@ -286,7 +286,7 @@ def test_values_of_every_kind_of_node_can_be_said() -> None:
         ),
         (
             node("mentor", 14, emulated="[emulator.nodes.n.parameters]\n'7.06-05' = { high = 5 }"),
-            "line.toml:8: emulator.nodes.n.parameters.7.06-05: a range goes upwards: 5-6, not 06-05",
+            "line.toml:8: emulator.nodes.n.parameters.7.06-05: the range 06-05 is descending; write 5-6",
         ),
         (
             node("hcp2", 1, emulated="[emulator.nodes.n.values]\n1 = 5\n'axis0.postion' = 1"),

@@ -161,8 +161,8 @@ async def test_a_file_that_is_read_again_keeps_its_groups_but_those_whose_points
     [
         ("[nodes.winder.points]\na = { item = '1', minimum = 2, maximum = 1 }", "minimum of 2 is above its maximum"),
         ("[nodes.winder.points]\na = { item = '1', max_step = 0 }", "max_step is more than 0"),
-        ("[nodes.winder.points]\na = { item = '1', decimals = 2 }", "write factor = 0.01"),
-        ("timing = { late_after = 50 }", "times are in seconds, 10 at most: for 50 ms write 0.05"),
+        ("[nodes.winder.points]\na = { item = '1', decimals = 2 }", "use factor = 0.01"),
+        ("timing = { late_after = 50 }", "must be at most 10, in seconds; for 50 ms write 0.05"),
         ("[groups.axes]\nperiod = 1\npoints = []", "a group without points"),
     ],
 )

@@ -283,7 +283,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
     ("text", "complaint"),
     [
         (NODE, "line.toml: 'port' is missing"),
-        (HEAD, "line.toml: there are no nodes: describe each in a table of its own, [nodes.NAME]"),
+        (HEAD, "line.toml: the file has no nodes; define each in a table of its own, [nodes.NAME]"),
         (f"{HEAD}prot = 1", "line.toml:2: prot: no such key; did you mean 'port'?"),
         ("port = 5", "line.toml:1: port: must be a table: [port], not 5"),
         (f"{HEAD}{NODE}points.a = {{ factor = inf }}", "nodes.winder.points.a.factor: must be finite, not inf"),
@@ -301,15 +301,24 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (f"{HEAD}{NODE}adress = 1", "line.toml:5: nodes.winder.adress: no such key; did you mean 'address'?"),
         (f'{HEAD}[nodes.a]\nprotocol = "hcp"\naddress = 16', "line.toml:4: nodes.a.address: hcp: address 16 does not"),
         (f'{HEAD}[nodes.a]\nprotocol = "hcp"\naddress = "x"', "line.toml:4: nodes.a.address: an address is a number"),
-        (f'{HEAD}[nodes.a]\nprotocol = "mentor"\naddress = 0', "line.toml:4: nodes.a.address: 0 means all nodes"),
+        (
+            f'{HEAD}[nodes.a]\nprotocol = "mentor"\naddress = 0',
+            "line.toml:4: nodes.a.address: 0 is the broadcast address",
+        ),
         (f'{HEAD}[nodes.a]\nprotocol = "dc104"\naddress = 0', "line.toml:4: nodes.a.address: dc104 has no addresses"),
-        (f'{HEAD}[nodes.a1-3]\nprotocol = "hcp"\naddress = 1', "line.toml:4: nodes.a1-3.address: 3 names need as many"),
-        (f'{HEAD}[nodes."a b"]\nprotocol = "hcp"\naddress = 1', "line.toml:2: nodes.a b: a node's name is of letters"),
+        (
+            f'{HEAD}[nodes.a1-3]\nprotocol = "hcp"\naddress = 1',
+            "line.toml:4: nodes.a1-3.address: 3 names need 3 addresses",
+        ),
+        (
+            f'{HEAD}[nodes."a b"]\nprotocol = "hcp"\naddress = 1',
+            "line.toml:2: nodes.a b: a node's name can contain letters",
+        ),
         (
             f'{HEAD}{NODE}[nodes.other]\nprotocol = "microflex"\naddress = 5',
-            "line.toml:7: nodes.other.address: node 'winder' has address 5 already",
+            "line.toml:7: nodes.other.address: node 'winder' already has address 5",
         ),
-        (f"{HEAD}{NODE}symbols = {{}}", "line.toml:5: nodes.winder.symbols: only nodes of msc have this"),
+        (f"{HEAD}{NODE}symbols = {{}}", "line.toml:5: nodes.winder.symbols: is only for nodes of msc"),
         (f"{HEAD}{NODE}retries = -1", "line.toml:5: nodes.winder.retries: must be 0 to 100, not -1"),
         (
             f"{HEAD}{NODE}timing = {{ window = '1' }}",
@@ -326,12 +335,15 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         ),
         (
             f"{HEAD}{NODE}[nodes.winder.points]\n1 = {{ factor = 0 }}",
-            "line.toml:6: nodes.winder.points.1.factor: a factor",
+            "line.toml:6: nodes.winder.points.1.factor: must not be 0",
         ),
-        (f'{HEAD}{NODE}[nodes.winder.points]\n"a b" = {{}}', "line.toml:6: nodes.winder.points.a b: a point's name"),
+        (
+            f'{HEAD}{NODE}[nodes.winder.points]\n"a b" = {{}}',
+            "line.toml:6: nodes.winder.points.a b: the name 'a b' contains a space",
+        ),
         (
             f'{HEAD}{SCREW}[nodes.screw.points]\na = {{ item = "1.17", decimals = 1 }}\nb = {{ item = "1.17:hires" }}',
-            "line.toml:7: nodes.screw.points.b: 1.17 has 1 decimals elsewhere",
+            "line.toml:7: nodes.screw.points.b: 1.17 has 1 decimals at another point",
         ),
         (f"{HEAD}[groups.g]\npoints = []", "line.toml:2: groups.g: 'period' is missing: a number of seconds"),
         (f"{HEAD}[groups.g]\nperiod = true\npoints = []", "groups.g.period: must be a number of seconds, not true"),
@@ -349,8 +361,8 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = [\n'winder/1',\n'wider/1']",
             "line.toml:9: groups.g.points[2]: no such node 'wider'; did you mean 'winder'?",
         ),
-        (f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = ['winder']", "a point is written NODE/ITEM, not 'winder'"),
-        (f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = ['winder/1,']", "there is a name missing in '1,'"),
+        (f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = ['winder']", "'winder' is not a point; write NODE/ITEM"),
+        (f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = ['winder/1,']", "a name is missing in '1,'"),
         (
             f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = ['winder/axis0.postion']",
             "line.toml:7: groups.g.points[1]: no such item 'axis0.postion'",

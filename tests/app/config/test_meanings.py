@@ -155,47 +155,63 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("hcp2", 'item = "10", bits = [0]', "bits: must be a table of names: { READY = 0 }, not a list"),
         ("hcp2", 'item = "10", bits = { READY = "0" }', "bits.READY: must be a whole number, not '0'"),
         ("hcp2", 'item = "10", bits = { READY = -1 }', "bits.READY: must be 0 to "),
-        ("hcp2", 'item = "10", bits = { READY = 32 }', "bits: READY is bit 32, and the highest of 10 is bit 31"),
+        ("hcp2", 'item = "10", bits = { READY = 32 }', "bits: READY is bit 32, but the highest bit of 10 is 31"),
         ("hcp2", 'item = "10", bits = { A = 0, B = 0 }', "bits: B and A are the same bit, 0"),
         ("hcp2", 'item = "10", bits = { "a b" = 0 }', "bits: the name of a bit begins with a letter"),
-        ("hcp2", 'item = "axis0.position", bits = { A = 0 }', "bits: are of whole numbers, and axis0.position has dec"),
-        ("hcp2", 'item = "10", factor = 0.1, bits = { A = 0 }', "bits: are of the number as it is on the line: leave"),
+        ("hcp2", 'item = "axis0.position", bits = { A = 0 }', "bits: need whole numbers, but axis0.position has dec"),
+        (
+            "hcp2",
+            'item = "10", factor = 0.1, bits = { A = 0 }',
+            "bits: apply to the unscaled number on the line; leave",
+        ),
         ("hcp2", 'item = "10", bits = { A = 0 }, labels = { 0 = "x" }', "labels: a number has bits or labels, not bo"),
-        ("mentor", 'item = "1.17", bits = { A = 16 }', "bits: A is bit 16, and the highest of 1.17 is bit 15"),
-        ("mentor", 'item = "1.17:20", bits = { A = 1 }', "bits: cannot be said of 1.17:20, a run of values: make each"),
-        ("ct-ansi", 'item = "1.21:8", low = 1', "low: cannot be said of 1.21:8, a run of values: make each"),
-        ("dc104", 'item = "12", bits = { A = 16 }', "bits: A is bit 16, and the highest of 12 is bit 15"),
+        ("mentor", 'item = "1.17", bits = { A = 16 }', "bits: A is bit 16, but the highest bit of 1.17 is 15"),
+        (
+            "mentor",
+            'item = "1.17:20", bits = { A = 1 }',
+            "bits: is not possible for 1.17:20, a run of values; make each",
+        ),
+        ("ct-ansi", 'item = "1.21:8", low = 1', "low: is not possible for 1.21:8, a run of values; make each"),
+        ("dc104", 'item = "12", bits = { A = 16 }', "bits: A is bit 16, but the highest bit of 12 is 15"),
         (
             "modbus",
             'item = "holding:1", bits = { A = 16 }',
-            "bits: A is bit 16, and the highest of holding:1 is bit",
+            "bits: A is bit 16, but the highest bit of holding:1 is",
         ),
-        ("modbus", 'item = "holding:1:float32", bits = { A = 1 }', "bits: are of whole numbers, and holding:1:float32"),
-        ("modbus", 'item = "holding:1:4", minimum = 1', "minimum: cannot be said of holding:1:4, a run of values"),
-        ("modbus", 'item = "coil:1", bits = { A = 1 }', "bits: A is bit 1, and the highest of coil:1 is bit 0"),
+        ("modbus", 'item = "holding:1:float32", bits = { A = 1 }', "bits: need whole numbers, but holding:1:float32"),
+        ("modbus", 'item = "holding:1:4", minimum = 1', "minimum: is not possible for holding:1:4, a run of values"),
+        ("modbus", 'item = "coil:1", bits = { A = 1 }', "bits: A is bit 1, but the highest bit of coil:1 is 0"),
         (
             "modbus",
             'item = "coil:1", high = 0.5',
-            "high: cannot be said of coil:1, which is a bit and no quantity; for each of its changes, and these",
+            "high: is not possible for coil:1, which is a bit and not a quantity; for each of its changes, and these",
         ),
-        ("modbus", 'item = "coil:1", deadband = 0.5', "deadband: of a bit is 0: every change is told"),
-        ("modbus", 'item = "coil:1", labels = { 2 = "x" }', "labels: coil:1 is never 2: it has 1 bit"),
-        ("msc", 'item = "flags", bits = { A = 256 }', "bits: A is bit 256, and the highest of flags is bit 255"),
-        ("msc", 'item = "flags", high = 1', "high: cannot be said of flags, which is a set and no quantity"),
-        ("msc", 'item = "status", bits = { A = 16 }', "bits: A is bit 16, and the highest of status is bit 15"),
-        ("msc", 'item = "2008:32", labels = { 0 = "x" }', "labels: cannot be said of 2008:32, a run of values"),
-        ("microflex", 'item = "status_word", high = 1', "high: cannot be said of status_word, which is a word and no"),
+        ("modbus", 'item = "coil:1", deadband = 0.5', "deadband: of a bit must be 0, because every change is reported"),
+        ("modbus", 'item = "coil:1", labels = { 2 = "x" }', "labels: coil:1 cannot be 2, because it has 1 bit"),
+        ("msc", 'item = "flags", bits = { A = 256 }', "bits: A is bit 256, but the highest bit of flags is 255"),
+        ("msc", 'item = "flags", high = 1', "high: is not possible for flags, which is a set and not a quantity"),
+        ("msc", 'item = "status", bits = { A = 16 }', "bits: A is bit 16, but the highest bit of status is 15"),
+        ("msc", 'item = "2008:32", labels = { 0 = "x" }', "labels: is not possible for 2008:32, a run of values"),
+        (
+            "microflex",
+            'item = "status_word", high = 1',
+            "high: is not possible for status_word, which is a word and not",
+        ),
         ("hcp2", 'item = "10", labels = { on = "1" }', 'labels.on: labels are of whole numbers: { 0 = "off" }, not of'),
         ("hcp2", 'item = "10", labels = { 0 = 1 }', "labels.0: must be a text in quotes, not 1"),
-        ("hcp2", 'item = "10", labels = { 0 = "a", 00 = "b" }', "labels: say twice what a number is called"),
+        (
+            "hcp2",
+            'item = "10", labels = { 0 = "a", 00 = "b" }',
+            "labels: define a number twice; leave out one of the labels",
+        ),
         (
             "msc",
             'item = "flags", labels = { 0 = "x" }',
-            "labels: cannot be said of flags, which is a set of many: name",
+            "labels: is not possible for flags, which is a set of flags; name",
         ),
         ("hcp2", 'item = "10", labels = { 0 = "" }', "labels: the label of 0 is a text on one line, not ''"),
-        ("hcp2", 'item = "axis0.position", labels = { 0 = "x" }', "labels: are of whole numbers, and axis0.position"),
-        ("mentor", 'item = "1.17", decimals = 1, labels = { 0 = "x" }', "labels: are of whole numbers, and 1.17 has"),
+        ("hcp2", 'item = "axis0.position", labels = { 0 = "x" }', "labels: need whole numbers, but axis0.position"),
+        ("mentor", 'item = "1.17", decimals = 1, labels = { 0 = "x" }', "labels: need whole numbers, but 1.17 has"),
         (
             "hcp2",
             'item = "10", labels = { 0 = "x" }, low = 1',
@@ -209,7 +225,7 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("hcp2", 'item = "10", hysteresis = 1', "hysteresis: is of low and high: write one of them, or leave it out"),
         ("hcp2", 'item = "10", high = 1, hysteresis = -1', "hysteresis: is 0 or more, not -1"),
         ("hcp2", 'item = "10", low = 0, high = 1, hysteresis = 2', "hysteresis: must be less than the 1 between low"),
-        ("dc104", 'item = "12", decimals = 2', "decimals: dc104 has no implied decimals: write factor = 0.01"),
+        ("dc104", 'item = "12", decimals = 2', "decimals: dc104 has no implied decimals; use factor = 0.01"),
         ("ct-ansi", 'item = "1.21", decimals = 10', "decimals: must be 0 to 9, not 10"),
     ],
 )
@@ -223,7 +239,7 @@ def test_what_means_nothing_is_one_sentence_with_line_and_key(kind: str, said: s
 def test_a_text_has_nothing_of_a_number(said: str) -> None:
     section = file("hcp2", f'a = {{ item = "10", {said} }}').nodes["w"].points["a"]
     text: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=str)
-    with pytest.raises(FileError, match="cannot be said of 10, which is a text"):
+    with pytest.raises(FileError, match="is not possible for 10, which is a text"):
         check_suits(section, text, find("hcp2"))
 
 
@@ -246,7 +262,7 @@ def test_the_line_is_that_of_the_key_in_a_table_of_its_own() -> None:
 
 @pytest.mark.parametrize("points", ['"a.READY" = { item = "11" }\na = {', "axis0 = {"])
 def test_a_bit_takes_no_name_that_something_else_has(points: str) -> None:
-    with pytest.raises(FileError, match=r"bits\.\w+: w has something else that is called \w+\.\w+"):
+    with pytest.raises(FileError, match=r"bits\.\w+: w has another point or item \w+\.\w+"):
         parse("hcp2", f'{points} item = "10", bits = {{ READY = 0, position = 1 }} }}')
 
 
@@ -293,7 +309,7 @@ def test_metrics_take_one_flag_of_a_set_and_counts_take_all() -> None:
 def test_an_empty_group_and_milliseconds_for_seconds_are_errors() -> None:
     with pytest.raises(FileError, match="a group without points polls nothing"):
         parse("hcp2", "[groups.axes]\nperiod = 1\npoints = []")
-    with pytest.raises(FileError, match=r"times are in seconds, 10 at most: for 50 ms write 0\.05"):
+    with pytest.raises(FileError, match=r"must be at most 10, in seconds; for 50 ms write 0\.05"):
         parse("hcp2", "[nodes.w.timing]\nlate_after = 50")
 
 

@@ -52,5 +52,5 @@ def test_nothing_else_of_that_name_is_touched() -> None:
 
 
 def test_a_key_under_both_names_is_an_error_with_its_line() -> None:
-    with pytest.raises(FileError, match=r"line.toml:6: nodes.winder.timing.lateness: stands there under its new name"):
+    with pytest.raises(FileError, match=r"line.toml:6: nodes.winder.timing.lateness: is also there under its new name"):
         renamed(f"{HEAD}timing.max_reply_delay = 0.2\ntiming.lateness = 0.3\n")

@@ -97,9 +97,9 @@ def test_points_are_named_as_in_a_group_or_by_a_pattern_of_nodes() -> None:
     [
         ('allow_writes = "winder/nothing"', r"users\.\w+\.allow_writes\[1\]: no such item 'nothing'"),
         ('allow_writes = ["winder/force", "drive*/weight"]', r"allow_writes\[2\]: drive1/weight is read-only"),
-        ('allow_writes = "reel*/speed"', "no node is called like 'reel*'; there are winder, drive1"),
-        ('allow_writes = "*"', r"a point is written NODE/ITEM, not '\*'"),
-        ("allow_writes = []", "leave it out for all of the line"),
+        ('allow_writes = "reel*/speed"', "no node matches 'reel*'; the nodes are winder, drive1"),
+        ('allow_writes = "*"', r"'\*' is not a point; write NODE/ITEM"),
+        ("allow_writes = []", "leave it out to permit the whole line"),
         ('allow_reads = "winder/force"', "no such key; did you mean 'allow_writes'"),
     ],
 )
@@ -114,16 +114,16 @@ def test_what_is_no_point_that_could_be_written_is_refused_with_its_place(said: 
     [
         ('listen = "0.0.0.0:7420"', "service.listen: 0.0.0.0 is open to the network: give each program a token"),
         ('listen = "plc"', "service.listen: a TCP address is written HOST:PORT"),
-        ('token_file = "tokens"', "service.token_file: tokens are for TCP: say where"),
-        ('tokens.hmi.role = "read"', "service.tokens.hmi: a token is written in a file of its own"),
-        ('users.nobody-at-all.role = "read"', "there is no user 'nobody-at-all' on this machine"),
-        ('groups.nobody-at-all.role = "read"', "there is no group 'nobody-at-all' on this machine"),
-        (f'groups.{GROUP}.role = "read"', "no group comes to a socket of mode 0600: say whose it is, as group = "),
+        ('token_file = "tokens"', "service.token_file: tokens need TCP; add an address"),
+        ('tokens.hmi.role = "read"', "service.tokens.hmi: tokens are stored in a separate file"),
+        ('users.nobody-at-all.role = "read"', "the user 'nobody-at-all' does not exist on this machine"),
+        ('groups.nobody-at-all.role = "read"', "the group 'nobody-at-all' does not exist on this machine"),
+        (f'groups.{GROUP}.role = "read"', "groups cannot open a socket of mode 0600; set group = "),
         (f'users.{USER}.role = "owner"', "no such role 'owner'; there are read, write, admin"),
         (f"users.{USER} = {{}}", "'role' is missing"),
         (
             f'users.{USER} = {{ role = "read", allow_writes = "winder/force" }}',
-            'names what a role = "write" or',
+            'needs role = "write" or',
         ),
     ],
 )
@@ -148,11 +148,11 @@ def test_a_file_of_tokens_has_a_name_and_a_token_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("hmi secret\n", "tokens:1: the token of hmi has less than 16 characters: make one with openssl rand -hex 32"),
-        (f"{HMI}hmi another-token-0002\n", "tokens:2: there are two tokens 'hmi'"),
-        ("a-token-of-the-hmi-0001\n", "tokens:1: a line is a name and its token"),
-        ("hmi = a-token-of-the-hmi-0001\n", "tokens:1: a line is a name and its token"),
-        ("# none yet\n", "there are no tokens in"),
+        ("hmi secret\n", "tokens:1: the token of hmi has less than 16 characters; make one with openssl rand -hex 32"),
+        (f"{HMI}hmi another-token-0002\n", "tokens:2: two tokens have the name 'hmi'"),
+        ("a-token-of-the-hmi-0001\n", "tokens:1: expected a name and its token"),
+        ("hmi = a-token-of-the-hmi-0001\n", "tokens:1: expected a name and its token"),
+        ("# none yet\n", "has no tokens"),
     ],
 )
 def test_a_file_that_is_no_list_of_tokens_is_refused_and_no_token_told(
@@ -167,7 +167,7 @@ def test_a_file_that_is_no_list_of_tokens_is_refused_and_no_token_told(
 
 @pytest.mark.parametrize("mode", [0o604, 0o644, 0o660, 0o602])
 def test_tokens_that_others_may_read_or_change_are_refused(tmp_path: Path, mode: int) -> None:
-    with pytest.raises(FileError, match=r"service\.token_file: others may read .*, or change it: chmod 600"):
+    with pytest.raises(FileError, match=r"service\.token_file: other users can read or change .*; run chmod 600"):
         tokens(tmp_path, HMI, mode)
     assert tokens(tmp_path, HMI, 0o640)
 
@@ -187,7 +187,7 @@ def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> 
     line = ConfiguredLine(parse(f'{TEXT}[service.users.{USER}]\nrole = "read"\n'), outputs=False)
 
     async def run() -> None:
-        with pytest.raises(InvalidCommand, match=r"another \[service\] needs a restart"):
+        with pytest.raises(InvalidCommand, match=r"changes of \[service\] need a restart"):
             await line.take(parse(f'{TEXT}[service]\nlisten = "127.0.0.1:7420"\n'))
         line.authorisation.take_secrets({"hmi": b"kept"})
         line.authorisation.on_access.append(lambda: told.append(line.authorisation.access.users[0].writes))

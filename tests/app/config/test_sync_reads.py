@@ -62,7 +62,10 @@ def test_what_the_protocol_says_holds_for_the_nodes_that_do_not_say_otherwise() 
         ('probe = "holdin:7"', "line.toml:5: nodes.press.probe: no such item 'holdin:7'"),
         ("probe = 7", "line.toml:5: nodes.press.probe: must be a text"),
         ('sync_reads = ["holding:1", "x"]', "line.toml:5: nodes.press.sync_reads: no such item 'x'"),
-        ('sync_reads = "holding:1"', "line.toml:5: nodes.press.sync_reads: one sync read cannot be told from itself"),
+        (
+            'sync_reads = "holding:1"',
+            "line.toml:5: nodes.press.sync_reads: needs at least two items, because the replies to one sync read are",
+        ),
     ],
 )
 def test_a_wrong_item_is_an_error_at_its_key(key: str, complaint: str) -> None:
@@ -73,5 +76,5 @@ def test_a_wrong_item_is_an_error_at_its_key(key: str, complaint: str) -> None:
 
 @pytest.mark.parametrize("key", ['probe = "holding:1"', 'sync_reads = ["holding:1", "holding:2"]'])
 def test_another_probe_or_other_sync_reads_need_a_restart(key: str) -> None:
-    with pytest.raises(InvalidCommand, match="other settings of node 'press' need a restart"):
+    with pytest.raises(InvalidCommand, match="changes of node 'press' need a restart"):
         check_same_line(parse(NODE), parse(f"{NODE}{key}\n"))

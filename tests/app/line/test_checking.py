@@ -242,7 +242,7 @@ def test_doubts_are_warnings(tmp_path: Path) -> None:
     assert report.problems == ()
     assert [warning.partition(":")[0] for warning in report.warnings] == [
         "hcp2 is meant for 8N1, but /dev/nothing-is-there is 8O1",
-        "nothing is polled",
+        "nothing is polled, because the file has no poll group; add [groups.NAME]",
         "outputs.csv.path",
     ]
 
@@ -258,4 +258,4 @@ def test_what_only_the_emulator_refuses_is_a_warning(tmp_path: Path) -> None:
     report = check(written(tmp_path, f'{GOOD}[emulator.nodes.winder]\nvalues = {{ "no-such-item" = 1 }}\n'))
     assert report.problems == ()
     [warning] = report.warnings
-    assert warning.startswith("busmaster emulate refuses it: ")
+    assert warning.startswith("`busmaster emulate` rejects the file: ")

@@ -143,7 +143,7 @@ def test_a_file_that_is_damaged_is_told_once_and_begun_anew(text: str, kept: Pat
     assert run_for(text, SHORT, told.append) == set()
     assert len(told) == 1
     assert str(kept) in told[0]
-    assert "learned anew" in told[0]
+    assert "learned again" in told[0]
     told.clear()
     run_for(text, LONG, told.append)
     assert run_for(text, SHORT, told.append) == {"winder", "drive"}
@@ -169,8 +169,8 @@ def test_where_nothing_can_be_kept_it_is_told_once(text: str, kept: Path) -> Non
     told: list[str] = []
     run_for(text, 3 * OFTEN, told.append)
     assert told == [
-        f"{kept}: Is a directory: reply times are learned anew",
-        f"{kept}: Is a directory: the reply times that were learned are not kept",
+        f"{kept}: Is a directory; reply times are learned again",
+        f"{kept}: Is a directory; the learned reply times are not stored",
     ]
 
 
@@ -211,7 +211,9 @@ def test_a_file_that_is_read_again_may_bring_back_a_node_and_its_times(text: str
 def test_a_place_without_a_folder_or_without_learning_is_refused(text: str) -> None:
     with pytest.raises(InvalidCommand, match="there is no folder"):
         opened(text.replace("learned.json", "nowhere/learned.json"))
-    with pytest.raises(InvalidCommand, match='say timing = "learned" too'):
+    with pytest.raises(
+        InvalidCommand, match='has no effect, because reply times are not learned; add timing = "learned"'
+    ):
         opened(text.replace('timing = "learned"\n', ""))
 
 

@@ -34,7 +34,7 @@ def test_a_value_is_written_in_its_unit_and_read_as_the_lines_number(tmp_path: P
         ("value = -47.6", "valeu = -47.6", "parameters.1.17.valeu: no such key"),
         ("value = -47.6", 'value = "x"', "parameters.1.17.value: must be a number"),
         ('"mentor"', '"mentr"', "drive.protocol: no such protocol"),
-        ("format = 1", "format = 2", "format: this version"),
+        ("format = 1", "format = 2", "format: the set has format 2"),
     ],
 )
 def test_what_is_wrong_is_named_with_line_and_key(tmp_path: Path, old: str, new: str, what: str) -> None:

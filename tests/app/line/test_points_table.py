@@ -237,7 +237,7 @@ def test_points_of_a_range_of_nodes_are_those_of_its_section() -> None:
     again = read(Source("line.toml", back.text))
     assert again.nodes["d4"].points == again.nodes["d5"].points
     assert faults(held, "node,point,item", "d4,a,10") == [
-        "points.csv: row 2, column node: no section of nodes is called 'd4'; it is one of d4-5, which is"
+        "points.csv: row 2, column node: no section of nodes has the name 'd4'; the node belongs to d4-5; use that name"
     ]
 
 
@@ -254,7 +254,7 @@ def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
     back = take(held, "node,point,item,maximum,unit", "w,a,10,4,N")
     assert tomllib.loads(back.text)["nodes"]["w"]["points"] == {"b": {"item": "11"}, "a": {"maximum": 4, "unit": "N"}}
     assert faults(held, "node,point,maximum", "w,a,") == [
-        "points.csv: row 2, column maximum: is 5 by the template: write another value"
+        "points.csv: row 2, column maximum: is 5 in the template and cannot be removed; write another value"
     ]
 
 
@@ -265,20 +265,20 @@ def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
     ("row", "fault"),
     [
         ("w,c,12,,x", "row 2, column maximum: must be a number, not 'x'"),
-        ('w,c,12,,"0,5"', "row 2, column maximum: it has a decimal comma: write 0.5, not 0,5"),
-        ("w,c,12,,0,5", "row 2: it has 6 cells and not 5: is there a comma in one that is not in quotes?"),
+        ('w,c,12,,"0,5"', "row 2, column maximum: 0,5 has a decimal comma; write 0.5"),
+        ("w,c,12,,0,5", "row 2: the row has 6 cells instead of 5; put cells with a comma into quotes"),
         ("w,c,12,,inf", "row 2, column maximum: must be finite"),
         ("w,c,12,,true", "row 2, column maximum: must be a number, not true"),
         ("w,c,nothing,,", "row 2, column item: no such"),
         ("w,c,,,", "row 2, column point: no such"),
-        ("w,c d,12,,", "row 2, column point: a point's name has no spaces"),
-        ("v,c,12,,", "row 2, column node: no section of nodes is called 'v'; there are w"),
+        ("w,c d,12,,", "row 2, column point: the name 'c d' contains a space"),
+        ("v,c,12,,", "row 2, column node: no section of nodes has the name 'v'; there are w"),
         ("w,c,12,{ READY = 70 },", "row 2, column bits: READY is bit 70"),
         ("w,c,12,{ READY = x },", "row 2, column bits: must be a table of names"),
         ('w,c,12,"{ READY = 0, FAULT = 1.5 }",', "row 2, column bits: FAULT must be a whole number"),
         ("w,c,12,5,", "row 2, column bits: must be a table of names"),
         ('w,c,12,"1\nx = 2",', "row 2, column bits: must be a table of names"),
-        ('w,c,"12', "this is no CSV: unexpected end of data"),
+        ('w,c,"12', "not valid CSV: unexpected end of data"),
     ],
 )
 def test_a_bad_row_is_named_with_its_column(row: str, fault: str) -> None:
@@ -289,16 +289,16 @@ def test_a_bad_row_is_named_with_its_column(row: str, fault: str) -> None:
 
 def test_of_a_row_that_is_too_short_no_comma_is_suspected() -> None:
     [told] = faults(file(INLINE), "node,point,item,bits,maximum", "w,c,12")
-    assert told == "points.csv: row 2: it has 3 cells and not 5"
+    assert told == "points.csv: row 2: the row has 3 cells instead of 5"
 
 
 @pytest.mark.parametrize(
     ("head", "fault"),
     [
         ("node,point,mximum", "row 1: no such column 'mximum'; did you mean 'maximum'?"),
-        ("node,point,item,item", "row 1: the column item is there twice"),
-        ("node,item", "row 1: there is no column point"),
-        ("", "row 1: there is no column node"),
+        ("node,point,item,item", "row 1: there are two columns item"),
+        ("node,item", "row 1: the column point is missing"),
+        ("", "row 1: the column node is missing"),
     ],
 )
 def test_a_bad_head_is_named(head: str, fault: str) -> None:
@@ -306,7 +306,7 @@ def test_a_bad_head_is_named(head: str, fault: str) -> None:
 
 
 def test_what_is_no_utf_8_is_refused_with_its_line() -> None:
-    with pytest.raises(BadRows, match="line 2: it is not written in UTF-8"):
+    with pytest.raises(BadRows, match="line 2: the file is not UTF-8"):
         taken(file(INLINE), "points.csv", "node,point,unit\nw,a,°C\n".encode("latin-1"))
 
 
@@ -318,9 +318,7 @@ def test_all_bad_rows_are_told_and_many_are_counted() -> None:
 
 
 def test_a_point_that_is_there_twice_is_refused() -> None:
-    assert (
-        "row 3, column point: w/c is in row 2 already" in faults(file(INLINE), "node,point,item", "w,c,12", "w,c,13")[0]
-    )
+    assert "row 3, column point: w/c is also in row 2" in faults(file(INLINE), "node,point,item", "w,c,12", "w,c,13")[0]
 
 
 def test_what_the_rest_of_the_file_cannot_bear_is_refused() -> None:
@@ -330,9 +328,7 @@ def test_what_the_rest_of_the_file_cannot_bear_is_refused() -> None:
 
 
 def test_a_bit_that_is_called_like_a_point_is_refused_by_its_row() -> None:
-    with pytest.raises(
-        FileError, match=r"points.csv: row 2, column bits: READY w has something else that is called b.READY"
-    ):
+    with pytest.raises(FileError, match=r"points.csv: row 2, column bits: READY w has another point or item b.READY"):
         take(
             file(INLINE.replace("b =", '"b.READY" =').replace("b }", ""), ""),
             "node,point,item,bits",

@@ -200,7 +200,7 @@ def test_a_file_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_two_outputs_with_one_file_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"outputs.jsonl.spill: sqlite.path is that file already"):
+    with pytest.raises(FileError, match=r"outputs.jsonl.spill: is already the file of sqlite.path"):
         opened(tmp_path, f'{TEXT}spill = "FOLDER/x.db"\n')
 
 
