@@ -107,7 +107,8 @@ class Refused(BusError):
 
     A protocol's exchange raises it with `what` only, and with `confirm=False` if a repetition would give no new
     information (MSC has already sent it four times; a multi-value write may have stored a part). The arbiter adds the
-    rest, and repeats the request once if `confirm` is True.
+    rest, and repeats the request once if `confirm` is True. `temporary`: the node may accept the same request later
+    (a Modbus unit that is busy). Merged reads are then not divided.
     """
 
     hint = "check that it exists, is writable and within the node's limits"
@@ -117,6 +118,7 @@ class Refused(BusError):
         what: str = "refused",
         *,
         confirm: bool = True,
+        temporary: bool = False,
         node: Addressed | None = None,
         command: str | None = None,
         attempts: int = 0,
@@ -124,6 +126,7 @@ class Refused(BusError):
     ) -> None:
         super().__init__(what, node=node, command=command, attempts=attempts, hint=hint)
         self.confirm = confirm
+        self.temporary = temporary
 
 
 class NoSuchParameter(Refused):

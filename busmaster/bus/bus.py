@@ -284,7 +284,11 @@ class Bus:
         if not self._byte_time_known:
             self._arbiter.byte_time = profile.line.byte_time
             self._byte_time_known = True
-        node = Node(self._line, self._arbiter.add_node(profile, address, self.now(), timings, retries), timings)
+        node = Node(
+            self._line,
+            self._arbiter.add_node(profile.with_default_merge(), address, self.now(), timings, retries),
+            timings,
+        )
         self._nodes[profile.name, address] = node
         self._profiles.setdefault(profile.name, profile)
         return node

@@ -29,10 +29,9 @@ from busmaster.bus.snapshots import (
     Tally,
 )
 from busmaster.contract.exchange import Command
-from busmaster.contract.profile import Batch
 from busmaster.errors import GarbledReply, InvalidCommand, Refused
 from busmaster.planning import PlannedGroup, shape
-from busmaster.planning.merging import WEIGHING, Merge, Served, cheapest
+from busmaster.planning.merging import WEIGHING, Merge, Served, cheapest, without_refused
 
 __all__ = ["GroupStatistics", "PollGroup", "Quality", "Sample", "Snapshot", "Stream"]
 
@@ -245,8 +244,9 @@ class PollGroup(Cycles):
         self._line_time += read.line_time
         if transaction.error is None:
             _measure(transaction, read)
-        # The refusal of a batch does not show which item was refused: they are read one by one instead.
-        elif read.served.batch and isinstance(transaction.error, Refused):
+        # The refusal of a batch does not show which item was refused: they are read in smaller exchanges instead.
+        # A node that is busy would refuse those too.
+        elif read.served.batch and isinstance(transaction.error, Refused) and not transaction.error.temporary:
             self._refusals.append(read)
         for point, place in read.points:
             sample = self._sample(point, place, transaction)
@@ -483,15 +483,10 @@ class PollGroup(Cycles):
 
     def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
         """Return the merge without the commands that this node (None: any node) has refused."""
-        refused = {command for who, command in self._refused if node in (None, who)}
-
-        def sound(commands: Sequence[Command[Any]]) -> Sequence[Batch]:
-            return [batch for batch in merge(commands) if batch.command not in refused]
-
-        return sound if refused else merge
+        return without_refused(merge, {command for who, command in self._refused if node in (None, who)})
 
     def _fall_back(self) -> None:
-        """Send the commands of a refused batch now, one by one: each of them may still be accepted."""
+        """Send the commands of a refused batch now, in smaller exchanges: each of them may still be accepted."""
         # For good: a node that lacks one item of a run would refuse it in each cycle.
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
@@ -506,4 +501,5 @@ def _is_older(sample: Sample[Any], started: float) -> bool:
 def _measure(transaction: Transaction, read: _Read) -> None:
     """Update the mean reply time of the node."""
     if transaction.attempts == 1:  # the time of a retried request includes its failed attempts
-        read.node._note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.steps)
+        # Not below 0: behind a network, or on a pseudo-terminal, bytes are faster than the line's baud rate.
+        read.node._note_wait(max(0.0, transaction.last_byte - transaction.started - read.bytes_time) / read.steps)

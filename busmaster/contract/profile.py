@@ -51,11 +51,13 @@ class LineSettings:
 class Batch:
     """A cheaper exchange that serves several commands.
 
-    `command` returns a sequence with one value for each index in `serves`, in that order.
+    `command` returns a sequence with one value for each index in `serves`, in that order. `divisible`: if a node
+    refuses it, exchanges for each half of `serves` are proposed in its place.
     """
 
     command: Command[Sequence[Any]]
     serves: tuple[int, ...]
+    divisible: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,11 +104,17 @@ class Profile:
     """Name of this kind of device as a protocol, if it is not `name`: "microflex" uses hcp2."""
     # Compared separately: a second handle that leaves it out requests the same node (Node.check_shared).
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
+    default_merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
+    """`merge` of a node for which no handle specifies one."""
 
     @property
     def kind_name(self) -> str:
         """Return the name of this kind of device in LINE.toml and on the command line."""
         return self.kind or self.name
+
+    def with_default_merge(self) -> Profile:
+        """Return the profile of a node: its `merge`, or the default."""
+        return self if self.merge or not self.default_merge else replace(self, merge=self.default_merge)
 
     def label(self, address: int) -> str:
         """Return the name of a node in messages: "node 5", or "the drive" if the protocol has no address."""

@@ -6,7 +6,8 @@ that the caller can let the line continue in between.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from busmaster.contract.exchange import Command
@@ -63,6 +64,30 @@ def cheapest(
             chosen.append(served)
     chosen += (Served(commands[index], (index,)) for index in left)
     return sorted(chosen, key=lambda served: min(served.serves))
+
+
+def without_refused(merge: Merge, refused: Collection[Command[Any]]) -> Merge:
+    """Return the merge without refused commands, and with the halves of a divisible one in its place.
+
+    One refused item in a range of n is so separated from the others in about log2(n) further refusals.
+    """
+    if not refused:
+        return merge
+
+    def sound(commands: Sequence[Command[Any]]) -> list[Batch]:
+        batches: list[Batch] = []
+        for batch in merge(commands):
+            if batch.command not in refused:
+                batches.append(batch)
+            elif batch.divisible:
+                middle = len(batch.serves) // 2
+                for half in (batch.serves[:middle], batch.serves[middle:]):
+                    # One command alone is read as it is.
+                    parts = sound([commands[index] for index in half]) if len(half) > 1 else ()
+                    batches += (replace(part, serves=tuple(half[i] for i in part.serves)) for part in parts)
+        return batches
+
+    return sound
 
 
 def at_once(steps: Generator[int, None, T]) -> T:

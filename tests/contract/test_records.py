@@ -84,6 +84,8 @@ RECORDS: tuple[Any, ...] = (
     Bit(0, "on", "is on"),
     Item("1", "1", "a thing"),
     msc.Merging(1),
+    modbus.Merging(),
+    modbus.MergedRead("holding", ((0, 1),)),
     Reply(1, b"DREAD,", 4),
 )
 """One of each kind that never changes."""

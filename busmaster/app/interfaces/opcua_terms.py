@@ -85,9 +85,10 @@ def type_of(value: Any) -> ua.VariantType:
     match value:
         case bool():
             return ua.VariantType.Boolean
-        case int():
+        # A whole number beyond 64 bits with sign (a Modbus uint64) could not be encoded as Int64.
+        case int() if -(2**63) <= value < 2**63:
             return ua.VariantType.Int64
-        case float():
+        case int() | float():
             return ua.VariantType.Double
         case str():
             return ua.VariantType.String

@@ -239,11 +239,17 @@ def number_of(database: sqlite3.Connection, key: str, unit: str) -> int:
     return int(row[0])
 
 
+HIGHEST = 2**63 - 1
+"""The highest whole number of SQLite."""
+
+
 def column(value: Any) -> Any:
     """Return a value as SQLite can hold it: a number, a text or None; several values are JSON."""
     plain = json_value(value)
     if isinstance(plain, list):
         return json.dumps(plain)
+    if isinstance(plain, int) and not -HIGHEST <= plain <= HIGHEST:
+        return float(plain)  # sqlite3 raises OverflowError for it
     return plain if plain is None or isinstance(plain, int | float | str) else str(plain)
 
 

@@ -55,7 +55,7 @@ def error_data(error: BusError, depth: int = 0) -> dict[str, Any]:
     name = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN), "BusError")
     said: dict[str, Any] = {"error": name, **{field: getattr(error, field) for field in FIELDS}}
     if isinstance(error, Refused):
-        said["confirm"] = error.confirm
+        said |= {"confirm": error.confirm} | ({"temporary": True} if error.temporary else {})
     cause = error.__cause__
     if cause is not None and depth < DEEPEST:
         text = f"{type(cause).__name__}: {cause}"
@@ -81,7 +81,7 @@ def bus_error_of(data: dict[str, Any]) -> BusError:
         if getattr(error, field) != data.get(field):  # a hint that its class has is not kept twice
             setattr(error, field, data.get(field))
     if isinstance(error, Refused):
-        error.confirm = data.get("confirm", True)
+        error.confirm, error.temporary = data.get("confirm", True), data.get("temporary", False)
     cause = data.get("cause")
     if cause is not None:
         error.__cause__ = bus_error_of(cause) if isinstance(cause, dict) else Exception(cause)

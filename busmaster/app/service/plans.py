@@ -116,7 +116,7 @@ def _read(said: Mapping[str, Any], known: Mapping[tuple[str, int], PlannedNode])
     if isinstance(times, Learned):
         times = times.document
     reply_time = None if reply_time is None else seconds(reply_time, "a reply time")
-    return PlannedNode(protocol.profile, address, times, reply_time), command
+    return PlannedNode(protocol.profile.with_default_merge(), address, times, reply_time), command
 
 
 def _check_reads(command: Command[Any]) -> None:

@@ -65,7 +65,7 @@ class RemoteNode:
         """How often it was told to stop, by whatever program, since this one named it."""
         self.label = profile.label(address)
         self._bus = bus
-        self._profile = profile
+        self._profile = profile.with_default_merge()
         self._address = address
         self._protocol = protocol_of(profile.name)
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from busmaster.contract.items import Item
 from busmaster.protocols.modbus.capture import ModbusDialect
-from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
+from busmaster.protocols.modbus.codec import (
+    PROFILE,
+    MergedRead,
+    ReadBits,
+    ReadRegisters,
+    WriteCoils,
+    WriteRegisters,
+)
 from busmaster.protocols.modbus.handle import ModbusUnit, is_whole, width_of
 from busmaster.registry import NodeKind, Option, Protocol, device_of
 
@@ -16,8 +23,8 @@ PROTOCOL = Protocol(
             ModbusUnit,
             device_of("busmaster.protocols.modbus.device"),
             items="holding:100, input:100, coil:5, discrete:5 (addresses as sent, 0 to 65535); holding:100:10 (ten "
-            "addresses); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
-            "first, or last with :swapped)",
+            "from there on). holding:100:float32 (int16 uint16 int32 uint32 int64 uint64 float32 float64; most "
+            "significant word first; last with :swapped)",
             probe_item="holding:0",
             documented=(
                 Item("coil:0-65535", "0-65535", "a bit, read by function 1, written by 5 and 15", access="read/write"),
@@ -29,6 +36,20 @@ PROTOCOL = Protocol(
                     access="read/write",
                 ),
                 Item("input:0-65535", "0-65535", "an input register of 16 bits, read by function 4", access="read"),
+            ),
+            options=(
+                Option(
+                    "registers_per_read",
+                    "whole",
+                    about="How many registers the unit returns in one reply, 1 to 125; 125 by default. Neighbouring "
+                    "registers of a poll group are read in one exchange up to this number.",
+                ),
+                Option(
+                    "bits_per_read",
+                    "whole",
+                    about="How many coils or discrete inputs the unit returns in one reply, 1 to 2000; 2000 by "
+                    "default.",
+                ),
             ),
             whole_numbers=is_whole,
             width=width_of,
@@ -47,6 +68,7 @@ PROTOCOL = Protocol(
     ),
     commands={
         "read_bits": ReadBits,
+        "read_merged": MergedRead,
         "read_registers": ReadRegisters,
         "write_coils": WriteCoils,
         "write_registers": WriteRegisters,

@@ -13,14 +13,24 @@ not contain the address of the register.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import MORE, Done, FrameError, LaterStep, Progress, Sizes, no_reply, other_format
-from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.exchange import (
+    MORE,
+    Command,
+    Done,
+    FrameError,
+    LaterStep,
+    Progress,
+    Sizes,
+    no_reply,
+    other_format,
+)
+from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
 
@@ -54,6 +64,8 @@ EXCEPTIONS = {
 """Meaning of the exception codes."""
 HINTS = {5: "try again later", 6: "try again later", 10: "check the gateway", 11: "check the device behind the gateway"}
 """Remedies for some of them."""
+TEMPORARY = frozenset({5, 6, 10, 11})
+"""Exception codes that refer to the state of the unit or a gateway, not to the request."""
 
 
 def _crc_table() -> list[int]:
@@ -157,7 +169,7 @@ class Conversation(Generic[T]):
         code = buffer[2]
         name = EXCEPTIONS.get(code, f"exception {code}")
         # The CRC protects a refusal, so it needs no confirmation.
-        raise Refused(f"refused: {name}", confirm=False, hint=HINTS.get(code))
+        raise Refused(f"refused: {name}", confirm=False, temporary=code in TEMPORARY, hint=HINTS.get(code))
 
     def expired(self, started: bool, /) -> Done[T]:
         if not self.answered:
@@ -206,8 +218,15 @@ class ReadRegisters(_Read):
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address, which has no reply."""
-        frames = _read_frames(address, READS[self.table], self.first, self.count, 2 * self.count)
-        return Conversation(frames, timings.read, _registers(self.count))
+        return Conversation(self.frames(address), timings.read, self.decoder())
+
+    def frames(self, address: int) -> Frames:
+        """Return the frames of the exchange. Raises InvalidCommand for the broadcast address."""
+        return _read_frames(address, READS[self.table], self.first, self.count, 2 * self.count)
+
+    def decoder(self) -> Callable[[bytes], tuple[int, ...]]:
+        """Return the function that makes the values from the data of a reply."""
+        return _registers(self.count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,13 +240,121 @@ class ReadBits(_Read):
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[bool, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
+        return Conversation(self.frames(address), timings.read, self.decoder())
+
+    def frames(self, address: int) -> Frames:
+        """Return the frames of the exchange. Raises InvalidCommand for the broadcast address."""
+        return _read_frames(address, READS[self.table], self.first, self.count, (self.count + 7) // 8)
+
+    def decoder(self) -> Callable[[bytes], tuple[bool, ...]]:
+        """Return the function that makes the values from the data of a reply."""
 
         def decode(payload: bytes) -> tuple[bool, ...]:
             states = int.from_bytes(payload, "little")  # the first is bit 0 of the first byte
             return tuple(bool(states >> place & 1) for place in range(self.count))
 
-        frames = _read_frames(address, READS[self.table], self.first, self.count, (self.count + 7) // 8)
-        return Conversation(frames, timings.read, decode)
+        return decode
+
+
+@dataclass(frozen=True, slots=True)
+class MergedRead:
+    """Several reads of a table in one exchange: a tuple of the values of each.
+
+    `spans`: the first address and the count of each. Raises InvalidCommand if there is a gap between them, or if
+    they are more than one exchange can read.
+    """
+
+    table: str
+    spans: tuple[tuple[int, int], ...]
+    whole: ReadRegisters | ReadBits = field(init=False, repr=False, compare=False)
+    """The read that is sent."""
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        kind = ReadBits if self.table in ReadBits.tables else ReadRegisters
+        reads = [kind(first, count, self.table) for first, count in self.spans]
+        if not reads:
+            raise InvalidCommand("a merged read has one span or more")
+        first = reached = min(read.first for read in reads)
+        for read in sorted(reads, key=lambda read: read.first):
+            if read.first > reached:
+                raise InvalidCommand(f"merged reads have a gap at {self.table} {reached}")
+            reached = max(reached, read.first + read.count)
+        # here and not in `open`, which is called between the end of a silence and the write
+        object.__setattr__(self, "whole", kind(first, reached - first, self.table))
+
+    def __str__(self) -> str:
+        return str(self.whole)
+
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        """Return the value of each place."""
+        return {
+            place: one
+            for (first, count), values in zip(self.spans, value, strict=True)
+            for place, one in zip(_places(self.table, first, count), values, strict=True)
+        }
+
+    def open(self, address: int, timings: Timings, /) -> Conversation[tuple[tuple[Any, ...], ...]]:
+        """Begin the read. Raises InvalidCommand for the broadcast address."""
+        whole, decode, spans = self.whole, self.whole.decoder(), self.spans
+
+        def divide(payload: bytes) -> tuple[tuple[Any, ...], ...]:
+            values = decode(payload)
+            return tuple(values[first - whole.first : first - whole.first + count] for first, count in spans)
+
+        return Conversation(whole.frames(address), timings.read, divide)
+
+
+@dataclass(frozen=True, slots=True)
+class Merging:
+    """A Profile's `merge`: reads of neighbouring registers, or bits, of a table in one exchange.
+
+    No place is read that no command reads: a unit may lack it, or a read may have an effect there. `registers` and
+    `bits`: the most that the unit returns in one reply; 1 merges none. Raises InvalidCommand for more than the standard
+    permits.
+    """
+
+    registers: int = MOST_READ
+    bits: int = MOST_BITS_READ
+
+    def __post_init__(self) -> None:
+        whole_number(self.registers, 1, MOST_READ, "registers of a read")
+        whole_number(self.bits, 1, MOST_BITS_READ, "bits of a read")
+
+    def most(self, table: str) -> int:
+        """Return how many values of a table one read can have."""
+        return self.bits if table in ReadBits.tables else self.registers
+
+    def __call__(self, commands: Sequence[Command[Any]]) -> Sequence[Batch]:
+        tables: dict[str, list[tuple[int, int, int]]] = {}
+        for index, command in enumerate(commands):
+            if isinstance(command, ReadRegisters | ReadBits):
+                tables.setdefault(command.table, []).append((command.first, command.count, index))
+        return [
+            Batch(MergedRead(table, tuple(span[:2] for span in run)), tuple(span[2] for span in run), divisible=True)
+            for table, spans in tables.items()
+            for run in _runs(sorted(spans), self.most(table))
+            if len(run) > 1
+        ]
+
+
+def _runs(spans: Sequence[tuple[int, int, int]], most: int) -> Iterator[list[tuple[int, int, int]]]:
+    """Divide spans (first, count, ...) in the order of their addresses into runs of at most so many, without a gap."""
+    run: list[tuple[int, int, int]] = []
+    start = reached = 0
+    for span in spans:
+        first, end = span[0], span[0] + span[1]
+        if run and (first > reached or max(reached, end) - start > most):
+            yield run
+            run = []
+        if not run:
+            start = reached = first
+        run.append(span)
+        reached = max(reached, end)
+    if run:
+        yield run
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,4 +486,5 @@ PROFILE = Profile(
     # Only unit, function and length distinguish replies, so the lengths differ (R15).
     sync_reads=tuple(ReadRegisters(0, count) for count in range(1, 5)),
     broadcast=BROADCAST,
+    default_merge=Merging(),
 )

@@ -32,7 +32,16 @@ SHORTEST = 4
 PAUSE_CHARACTERS, SHORTEST_PAUSE = 3.5, 0.00175
 SIZE = 1000
 """Default size of each table."""
-FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
+FORMS = {
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
 TABLES = {"holding": "registers", "input": "inputs", "coil": "coils", "discrete": "discretes"}
 ITEM = re.compile(
     rf"(?P<table>{'|'.join(TABLES)}):(?P<first>\d+)(:\d+|:(?P<form>{'|'.join(FORMS)})(?P<swapped>:swapped)?)?",

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Unpack
 
 from busmaster.bus.handle import Handle, Send, checked_count, item_text, read_each, unknown_item
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.modbus.codec import (
+    MOST_BITS_READ,
     MOST_BITS_WRITTEN,
+    MOST_READ,
     MOST_WRITTEN,
     PROFILE,
     READS,
+    Merging,
     ReadBits,
     ReadRegisters,
     WriteCoils,
@@ -80,12 +85,15 @@ class Place:
             return tuple(raw)
         return raw[0] if self.is_bit else self.number.decode(raw)
 
-    def reads(self, count: int, item: str) -> list[ReadBits | ReadRegisters]:
-        """Return the commands that read `count` values from here on. Raises InvalidCommand for a run."""
+    def reads(self, count: int, most: int, item: str) -> list[ReadBits | ReadRegisters]:
+        """Return the commands that read `count` values from here on, each `most` registers or bits at most.
+
+        Raises InvalidCommand.
+        """
         if self.count is not None:
             raise InvalidCommand(f"{item} is a run already: read {count} values from {self.table}:{self.first} on")
         kind = ReadBits if self.is_bit else ReadRegisters
-        most = kind.most - kind.most % self.width  # a number is never split: its words would be of two moments
+        most = max(most - most % self.width, self.width)  # a number is never split: its words would be of two moments
         end = self.first + count * self.width
         return [kind(at, min(most, end - at), self.table) for at in range(self.first, end, most)]
 
@@ -141,11 +149,32 @@ class ModbusUnit(Handle):
         inputs = await press.read("discrete:0:16")
 
     An item is a table (`coil`, `discrete`, `holding`, `input`), an address, and an optional form. Without a form it is
-    a bit or an unsigned register. A count means a run of them. A kind of number (`int16 uint16 int32 uint32 float32
-    float64`) has its most significant word first, or last with `:swapped`.
+    a bit or an unsigned register. A count means a run of them. A kind of number (`int16 uint16 int32 uint32 int64
+    uint64 float32 float64`) has its most significant word first, or last with `:swapped`.
+
+    Poll groups read neighbouring registers, or bits, in one exchange. `registers_per_read` and `bits_per_read` limit
+    one reply, if the unit returns fewer than the 125 registers and 2000 bits of the standard; 1 merges nothing. They
+    also limit the exchanges of `read` with a count. All handles of a unit have the same limits.
     """
 
     profile: ClassVar[Profile] = PROFILE
+
+    def __init__(
+        self,
+        bus: NodeSource,
+        address: int,
+        *,
+        registers_per_read: int | None = None,
+        bits_per_read: int | None = None,
+        timings: Timings | Learned | None = None,
+        retries: int | None = None,
+    ) -> None:
+        profile = self.profile
+        if registers_per_read is not None or bits_per_read is not None:
+            registers = MOST_READ if registers_per_read is None else registers_per_read
+            merge = Merging(registers, MOST_BITS_READ if bits_per_read is None else bits_per_read)
+            profile = replace(profile, merge=merge)
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
 
     def point(self, item: str) -> Point[Any]:
         """Return the point of an item. The point of a run has a tuple of values. Inputs are read-only.
@@ -178,7 +207,7 @@ class ModbusUnit(Handle):
         if count is None:
             return await self.point(item).read(**options)
         place = Place.parse(item)
-        raw = await read_each(self.node, place.reads(checked_count(count), item), options)
+        raw = await read_each(self.node, place.reads(checked_count(count), self._most(place.table), item), options)
         return place.decode_each([one for part in raw for one in part])
 
     async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
@@ -199,6 +228,11 @@ class ModbusUnit(Handle):
         """Prepare to write consecutive addresses, in as few exchanges as possible."""
         self._writes(item, values, options)
         return [lambda: self.write(item, *values, **options)]
+
+    def _most(self, table: str) -> int:
+        """Return how many registers or bits of a table the unit returns in one reply."""
+        merge = self.node.profile.merge
+        return (merge if isinstance(merge, Merging) else Merging()).most(table)
 
     def _run_items(self, item: str, count: int) -> tuple[str, ...]:
         """Return the item of each value from an item on, each with its own address."""

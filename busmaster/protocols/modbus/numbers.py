@@ -10,7 +10,16 @@ from dataclasses import dataclass
 from busmaster.contract.arguments import whole_number
 from busmaster.errors import InvalidCommand
 
-FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
+FORMS = {
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
 """The kinds of numbers, with their formats for `struct`."""
 
 

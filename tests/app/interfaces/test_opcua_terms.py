@@ -96,6 +96,7 @@ def test_a_quantity_that_was_whole_by_chance_stays_a_double() -> None:
     assert widened(KINDS.Double, 7) is KINDS.Double
     assert widened(KINDS.Double, "x") is KINDS.String
     assert variant_of(7, KINDS.Double).Value == 7.0
+    assert [type_of(value) for value in (2**63 - 1, -(2**63), 2**63)] == [KINDS.Int64, KINDS.Int64, KINDS.Double]
     nothings: tuple[Any, ...] = (None, (), {}, (1, "x"))
     for nothing in nothings:
         with pytest.raises(TypeError):

@@ -31,6 +31,8 @@ REFUSED = WriteRecord(0.0, "mqtt", "line/set/x", "op", 17, "x", None, 2, Outcome
 def test_a_column_holds_whatever_a_value_is() -> None:
     values = (None, 1, 1.5, "text", True, float("nan"), ProgramStatus(65), frozenset({2, 1}), {"a": 1})
     assert [column(value) for value in values] == [None, 1, 1.5, "text", 1, None, 65, "[1, 2]", "{'a': 1}"]
+    assert [column(value) for value in (2**63 - 1, 2**63, -(2**63) - 1)] == [2**63 - 1, 2.0**63, -(2.0**63)]
+    assert type(column(2**63)) is float
 
 
 @contextmanager
