@@ -38,7 +38,7 @@ def test_an_old_key_is_an_error_that_names_the_new_one_and_the_command(old: str,
     with pytest.raises(InvalidCommand) as refused:
         load(path)
     assert str(refused.value).endswith(
-        f"{table}.{old}: no such key; it is now {TIMES[old]!r}: "
+        f"{table}.{old}: no such key; renamed to {TIMES[old]!r}; "
         f"`busmaster migrate {path} --write` changes all old names of the file"
     )
 

@@ -20,10 +20,10 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NoReply, NotStarted, WriteUnconfirmed
 
-BEFORE_ALL = -inf
-"""A time before all others. A constant, because `-inf` is calculated anew each time."""
 LONGEST_PATIENCE = 10.0
 """Longest time in seconds from a cycle's due time to its deadline, however long the poll's period is."""
+BEFORE_ALL = -inf
+"""A time before all others. A constant, because `-inf` is calculated anew each time."""
 
 
 class Priority(enum.IntEnum):
