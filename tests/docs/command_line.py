@@ -33,6 +33,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "write": (
         (f"write {LINE} --protocol hcp2 --node 5 --verify 1=123.456", RUN),
         ("write line.toml winder/setpoint=120", RUN),
+        (f"write {LINE} --protocol msc --node 3 --address-step 4 3000:500=@cam.csv --verify", DRIVES),
     ),
     "do": (
         (f"do 7@{LINE} enable --protocol microflex", DRIVES),

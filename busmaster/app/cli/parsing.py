@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+import re
+from collections.abc import Callable, Iterator
+from math import isfinite
+from typing import NamedTuple, TypeVar
 
 import click
 
 from busmaster import LEARNED
 from busmaster.errors import InvalidCommand
-from busmaster.ext import Learned, is_decimal
+from busmaster.ext import Learned, is_decimal, read_file
 from busmaster.registry import kinds
 
 S = TypeVar("S")
@@ -17,6 +19,10 @@ T = TypeVar("T")
 
 LONGEST_WINDOW = 60.0
 """Seconds. Maximum reply delay moves with it, and a line is first listened to for that long."""
+
+FROM_FILE = "@"
+"""Before the name of a file with the values of an item."""
+SEPARATORS = re.compile(r"\s*[,;\t]\s*|\s+")
 
 
 class Whole(click.IntRange):
@@ -85,12 +91,64 @@ def parse_items(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(items))
 
 
-def parse_assignment(text: str) -> tuple[str, tuple[float, ...]]:
-    """Return the item and the numbers of `ITEM=VALUE[,VALUE...]`. Raises InvalidCommand."""
+class Assignment(NamedTuple):
+    """What is written: an item, its values, and the file that they are from, or empty."""
+
+    item: str
+    values: tuple[float, ...]
+    path: str = ""
+
+    def check_count(self, counted: int) -> None:
+        """Raise InvalidCommand unless it has so many values."""
+        if len(self.values) != counted:
+            where = f"; {self.path} has {len(self.values)}" if self.path else f", not {len(self.values)}"
+            raise InvalidCommand(f"{self.item} takes {counted} values{where}")
+
+
+def parse_assignment(text: str) -> Assignment:
+    """Return the item and the numbers of `ITEM=VALUE[,VALUE...]` or `ITEM=@FILE`. Raises InvalidCommand."""
     item, equals, values = text.partition("=")
-    if not equals or not item.strip() or not values.strip():
+    item, values = item.strip(), values.strip()
+    if not equals or not item or not values:
         raise InvalidCommand(f"an assignment is written ITEM=VALUE, like 1=123.456, not {text!r}")
-    return item.strip(), tuple(parse_value(part) for part in values.split(","))
+    if values.startswith(FROM_FILE):
+        path = values.removeprefix(FROM_FILE)
+        return Assignment(item, numbers_of_file(path), path)
+    return Assignment(item, tuple(parse_value(part) for part in values.split(",")))
+
+
+def numbers_of_file(path: str) -> tuple[float, ...]:
+    """Return the numbers of a text file, line by line.
+
+    Numbers are separated by commas, semicolons, tabs or spaces. Empty lines and lines that begin with # are ignored.
+    Raises InvalidCommand, with file and line, for what cannot be read or is not a finite number.
+    """
+    try:
+        text = read_file(path).decode("utf-8-sig")
+    except OSError as error:
+        raise InvalidCommand(f"{path or 'the file'}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InvalidCommand(f"{path}: it is not a text file in UTF-8") from None
+    found = tuple(_numbers(path, text))
+    if not found:
+        raise InvalidCommand(f"{path}: there is no number in it")
+    return found
+
+
+def _numbers(path: str, text: str) -> Iterator[float]:
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if "," in line and ";" in line:  # decimal commas would be taken for two numbers each
+            raise InvalidCommand(f"{path}:{number}: it has commas and semicolons: write decimals with a point")
+        for part in SEPARATORS.split(line.strip()):
+            try:
+                value = parse_value(part)
+            except InvalidCommand:
+                raise InvalidCommand(f"{path}:{number}: {part!r} is not a number") from None
+            if not isfinite(value):
+                raise InvalidCommand(f"{path}:{number}: {part} is not a finite number")
+            yield value
 
 
 def parse_value(text: str) -> float:

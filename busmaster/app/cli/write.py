@@ -10,33 +10,33 @@ from typing import Any
 
 import click
 
-from busmaster import Point, ext
+from busmaster import Point, Priority, ext
 from busmaster.app.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.late import late_nodes
 from busmaster.app.cli.lines import is_line_file, keep, load
 from busmaster.app.cli.output import emit, json_line, note
-from busmaster.app.cli.parsing import Whole, parse_assignment, parsed
+from busmaster.app.cli.parsing import Assignment, Whole, parse_assignment, parsed
 from busmaster.app.cli.protocols import ItemCommand
 from busmaster.app.cli.reaching import owner_of, reach, tell_owner
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.authorisation import Wish
 from busmaster.app.service.record import WriteRecord
-from busmaster.app.service.remote import connect
+from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import utc
 from busmaster.errors import InvalidCommand
-from busmaster.ext import Send
+from busmaster.ext import Handle, Send, WriteOptions
 from busmaster.registry import find
 
-Pairs = Sequence[tuple[str, tuple[float, ...]]]
+Pairs = Sequence[Assignment]
 """What is written, in its order: items, or points of a file, and their values."""
 
 
 @click.command(short_help="Write values of one node, or of a file's points.", cls=ItemCommand)
 @partial(connected, or_file=True)
 @node_option
-@click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]...")
+@click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]|ITEM=@FILE...")
 @click.option("--verify", is_flag=True, help="Read back and compare.")
 @click.option(
     "--decimals",
@@ -55,8 +55,9 @@ def command(
 ) -> None:
     """Write to one node on PORT, in the order given, and print `ITEM ok` for each.
 
-    Several values go to ITEM and those after it. All values are checked before the first is sent; the first that
-    fails ends it, with those before it written.
+    Several values go to ITEM and those after it. With @FILE they are those of a text file, such as a cam table, and are
+    written in the background of other traffic: numbers with commas, spaces or line ends between them. All values are
+    checked before the first is sent; the first that fails ends it, with those before it written.
 
     With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit. The file's limits
     hold, and its outputs keep a record of each write, or of why it was refused. Where another busmaster owns the line,
@@ -86,10 +87,15 @@ async def write(
     bus = reach(connection)
     handle = connection.open_handle(bus, address)
     if decimals is not None:
-        items = (name for item, values in pairs for name in ext.run_items(handle, item.partition(":")[0], len(values)))
+        items = (
+            name for item, values, _ in pairs for name in ext.run_items(handle, item.partition(":")[0], len(values))
+        )
         with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
         handle = replace(connection, options=with_decimals).open_handle(bus, address)
-    prepared = [(item, ext.prepare_write(handle, item, values, verify=verify)) for item, values in pairs]
+    prepared = [
+        (one.item, ext.prepare_write(handle, checked(handle, one, one.item), one.values, **options_of(one, verify)))
+        for one in pairs
+    ]
     async with bus, late_nodes(bus):
         for item, sends in prepared:
             for send in sends:
@@ -103,7 +109,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     records: list[WriteRecord] = []
     line.authorisation.record = records.append
     try:
-        prepared = [prepare(line, name, values, verify) for name, values in pairs]
+        prepared = [prepare(line, one, verify) for one in pairs]
         async with line.bus, late_nodes(line.bus, in_file=True):
             for wish, send in prepared:
                 await pass_on(line, wish, send)
@@ -115,7 +121,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
 async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs, verify: bool, as_json: bool) -> None:
     """Write the pairs to points of a line that another program owns, which holds its limits and keeps the record."""
     remote = connect(address)
-    prepared = [(name, line.prepare_write(name, values, bus=remote, verify=verify)) for name, values in pairs]
+    prepared = [(one.item, prepare_point(line, one, verify, remote)) for one in pairs]
     async with remote, late_nodes(remote, in_file=True):
         for name, send in prepared:
             await send()
@@ -139,15 +145,34 @@ def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None)
     return Wish(interface="command line", by="busmaster write", name=name, point=point, value=value)
 
 
-def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> tuple[Wish, Send]:
+def prepare(line: ConfiguredLine, one: Assignment, verify: bool) -> tuple[Wish, Send]:
     """Return what a person wants, and what writes it.
 
     Raises InvalidCommand, of which a record is kept, for what may not be written, and for no point of the line.
     """
-    wish = wish_of(name, values)
+    wish = wish_of(one.item, one.values)
     try:
-        wish = wish_of(name, values, line.point(name))
-        return wish, line.prepare_write(name, values, verify=verify)
+        wish = wish_of(one.item, one.values, line.point(one.item))
+        return wish, prepare_point(line, one, verify)
     except InvalidCommand as error:
         line.authorisation.refuse(wish, str(error))
         raise
+
+
+def prepare_point(line: ConfiguredLine, one: Assignment, verify: bool, bus: RemoteBus | None = None) -> Send:
+    """Return what writes a point of a line, over `bus` if it is another than the line's own. Raises InvalidCommand."""
+    point = line.point(one.item)
+    checked(line.nodes[point.where], one, point.source.item)
+    return line.prepare_write(one.item, one.values, bus=bus, **options_of(one, verify))
+
+
+def checked(handle: Handle, one: Assignment, item: str) -> str:
+    """Return the item of a node. Raises InvalidCommand if it has a count and there are not so many values."""
+    if (names := ext.counted_items(handle, item)) != (item,):
+        one.check_count(len(names))
+    return item
+
+
+def options_of(one: Assignment, verify: bool) -> WriteOptions:
+    """Return the options of a write. A table from a file takes many exchanges, and is in the background."""
+    return {"verify": verify, "priority": Priority.BACKGROUND} if one.path else {"verify": verify}

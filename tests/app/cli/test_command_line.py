@@ -18,7 +18,8 @@ SIDE = "FILE.toml|NODE@PORT|NODE@LINE.toml"
 PROMISED = {
     "demo": "[--seconds S] [--plain]",
     "read": "PORT|LINE.toml [--protocol P] [--node N] ITEM... [--json]",
-    "write": "PORT|LINE.toml [--protocol P] [--node N] ITEM=VALUE[,VALUE...]... [--verify] [--json] [--decimals N]",
+    "write": "PORT|LINE.toml [--protocol P] [--node N] ITEM=VALUE[,VALUE...]|ITEM=@FILE... [--verify] [--json]"
+    " [--decimals N]",
     "do": "NODE@PORT|NODE@LINE.toml ACTION [NUMBER]... [--protocol P] [--within S] [--at-least S] [--json]",
     "poll": "PORT --protocol P [--nodes N-M,K] --items ITEM,ITEM... --period S [--seconds S] [--json] [--plain]",
     "scan": "PORT --protocol P [--nodes N-M,K] [--json]",
