@@ -10,15 +10,27 @@ from typing import Any
 import anyio
 import pytest
 
+from busmaster.bus.bus import Bus
 from busmaster.bus.node import Priority
 from busmaster.contract.exchange import Command
-from busmaster.errors import BusClosed, BusError, InvalidCommand, NoReply, Superseded, VerifyFailed, WriteUnconfirmed
+from busmaster.errors import (
+    BusClosed,
+    BusError,
+    InvalidCommand,
+    NoReply,
+    Refused,
+    Superseded,
+    VerifyFailed,
+    WriteUnconfirmed,
+)
 from busmaster.protocols.hcp2 import microflex_handle as module
 from busmaster.protocols.hcp2.codec import Read, Write
 from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
+from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.handles.fake_bus import FakeBus
+from tests.stories import on_a_bus
 
 READY = StatusWord.HARDWARE_ENABLE
 ENABLE, CANCEL = CommandWord.ENABLE, CommandWord.CANCEL
@@ -319,6 +331,19 @@ async def test_no_value_of_a_list_may_go_to_a_read_only_name(drive: MicroFlexDri
     with pytest.raises(InvalidCommand, match="speed_demand is read-only"):
         await drive.write("speed_reference", 10, 20)
     assert line.asked == []
+
+
+def test_a_refused_reference_names_mode_and_source() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MicroFlexDrive(bus, 7)
+        with pytest.raises(Refused, match="only in speed control mode with SPEEDRESOURCE set to host"):
+            await drive.set_speed_reference(10)
+        with pytest.raises(Refused, match="only in current control mode with TORQUERESOURCE set to host"):
+            await drive.write(116, 10)
+        with pytest.raises(Refused, match="within the node's limits"):
+            await drive.write(50, 10)
+
+    on_a_bus(story, EmulatedMicroFlex(7, host_reference=False))
 
 
 def test_the_errors_of_these_tests_are_bus_errors() -> None:

@@ -78,6 +78,8 @@ class WriteElements:
     text: str = field(init=False, repr=False, compare=False)
 
     last: ClassVar[int]
+    hints: ClassVar[Mapping[int, str]] = {}
+    """What to do about a refusal, for elements that nodes refuse for reasons of their own."""
     writes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -105,8 +107,10 @@ class WriteElements:
         raise NotImplementedError
 
     def open(self, address: int, timings: Timings) -> Writing | WritingMany:
-        exchange = Writing if len(self.values) == 1 else WritingMany
-        return exchange(self.encode(address, self.element, self.text.encode()), timings.write)
+        request = self.encode(address, self.element, self.text.encode())
+        if len(self.values) == 1:
+            return Writing(request, timings.write, self.hints.get(self.element))
+        return WritingMany(request, timings.write)
 
 
 class Reading(TelegramReader[float]):
@@ -121,9 +125,19 @@ class Reading(TelegramReader[float]):
 
 
 class Writing(AcknowledgeReader):
-    """One attempt to write one element."""
+    """One attempt to write one element. `hint`: what to do if the node refuses it; None for the usual hint."""
 
-    __slots__ = ()
+    __slots__ = ("_hint",)
+
+    def __init__(self, request: bytes, timing: ReplyTiming, hint: str | None = None) -> None:
+        super().__init__(request, timing)
+        self._hint = hint
+
+    def reject(self, heard: bytes) -> NoReturn:
+        """Raise the failure that the received byte means."""
+        if heard[0] == NAK[0] and self._hint is not None:
+            raise Refused(hint=self._hint)
+        super().reject(heard)
 
 
 class WritingMany(AcknowledgeReader):

@@ -8,6 +8,7 @@ The checksum of a request is the exclusive-or of everything after BEL, that of a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
@@ -18,6 +19,10 @@ from busmaster.wire.checks import xor
 from busmaster.wire.readers import BEL, ENQ, ETX, STX
 
 LAST_ELEMENT = 255
+REFUSED_REFERENCE = (
+    "a MicroFlex accepts this element only in {} control mode with {} set to host; on other controllers it is read-only"
+)
+"""AN00129, notes to the elements of a MicroFlex."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,10 @@ class Write(WriteElements):
     """Write elements 1-255. The node decides which ones are writable: controllers differ."""
 
     last: ClassVar[int] = LAST_ELEMENT
+    hints: ClassVar[Mapping[int, str]] = {
+        116: REFUSED_REFERENCE.format("current", "TORQUERESOURCE"),
+        118: REFUSED_REFERENCE.format("speed", "SPEEDRESOURCE"),
+    }
 
     @staticmethod
     def encode(address: int, element: int, text: bytes) -> bytes:
