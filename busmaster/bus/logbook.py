@@ -15,8 +15,9 @@ from busmaster.arbiter.events import (
     PortFailed,
     RepliesLate,
 )
-from busmaster.arbiter.health import Health
+from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.bus.alarms import AlarmChanged, BusEvent
+from busmaster.contract.places import Rounding
 
 logger = logging.getLogger("busmaster")
 
@@ -76,6 +77,11 @@ class Logbook:
     def failed_choice(self, group: str, error: Exception) -> None:
         """Log that a merge, or the line time of a protocol's exchange, raised an exception."""
         logger.error("%s: the exchanges of poll group %r could not be chosen", self._name, group, exc_info=error)
+
+    def rounded(self, node: NodeRecord, write: Rounding, now: float) -> None:
+        """Log that a write has sent a rounded value."""
+        text = f"{node.label}: {write.rounded}; round it, or declare the decimals of the parameter"
+        self._write((node, write.rounded.partition(" = ")[0]), logging.WARNING, text, now)
 
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:
         # R14: by node and state, so that a flapping node does not hide the messages of another one.

@@ -1,4 +1,5 @@
-"""The places that a command reads or changes. Used to check limits, and to find point values in overheard traffic.
+"""The places that a command reads or changes, and the values that it sends. Used to check limits, and to find point
+values in overheard traffic.
 
 A place is the smallest unit of a node: one element, one parameter, one register. Protocols that reach the same nodes
 use the same names for their places.
@@ -41,6 +42,16 @@ class Changing(Protocol):
 
     def changes(self, profile: Profile, /) -> Mapping[Hashable, Any]:
         """Return the value of each changed place after the write; None if it is not known."""
+        ...
+
+
+@runtime_checkable
+class Rounding(Protocol):
+    """A write that may send another value than it was given, because the telegram has too few characters."""
+
+    @property
+    def rounded(self) -> str:
+        """Return what is rounded, as text for the log; "" if the value is sent as it is."""
         ...
 
 

@@ -55,7 +55,8 @@ def test_ct_ansi_keeps_the_contract() -> None:
             lambda: Write(1, 100, 0),
             lambda: Write(1, 21, math.nan),
             lambda: Write(1, 21, 1e12),
-            lambda: Write(1, 21, 0.12345678901),
+            lambda: Write(1, 21, -99999999999.5),
+            lambda: Write(1, 21, 123456789012),
             lambda: Write(1, 21, "1"),  # type: ignore[arg-type]  # that is what is refused
             lambda: Read(1, 17).open(0, PROFILE.timings),
         ],
@@ -100,6 +101,49 @@ def test_data_have_a_decimal_point_or_none(data: str, value: float) -> None:
 )
 def test_a_value_is_written_shortest_exact(value: float, text: str) -> None:
     assert Write(1, 21, value).text == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (44.400000000000006, "+44.4"),
+        (-0.1 - 0.2, "-0.3"),
+        (0.12345678901, "+0.123456789"),
+        (-0.1234567895, "-0.12345679"),  # half away from zero
+        (1 / 3, "+0.333333333"),
+        (123456789.25, "+123456789.3"),
+        (12345678901.5, "+12345678902"),
+        (-9999999999.96, "-10000000000"),
+        (1e-17, "+0"),
+    ],
+)
+def test_a_value_with_too_many_decimals_is_rounded_to_those_that_fit(value: float, text: str) -> None:
+    write = Write(1, 21, value)
+    assert write.text == text
+    assert write.changes(PROFILE) == {(1, 21): float(text)}
+    assert write.rounded == f"write 01.21 = {text} is rounded from {value!r}, which has more digits than a telegram"
+
+
+@pytest.mark.parametrize("value", [44.4, -47.6, 5, True, 0.0, 123456789.5, 0.123456789])
+def test_a_value_that_fits_is_not_rounded(value: float) -> None:
+    assert Write(1, 21, value).rounded == ""
+    assert float(Write(1, 21, value).text) == value
+
+
+def test_a_rounded_write_is_logged_once_for_each_parameter(caplog: pytest.LogCaptureFixture) -> None:
+    async def story(drive: CtAnsiDrive) -> None:
+        for value in (44.400000000000006, 44.400000000000006, 44.4):
+            await drive.write("1.21", value, verify=True)
+        await drive.point("1.22").write(0.1 + 0.2)
+        assert await drive.read("1.21", 2) == (44.4, 0.3)
+
+    told(story)
+    logged = [record.getMessage() for record in caplog.records if "rounded" in record.getMessage()]
+    assert [text.partition("node 12: ")[2].partition(" is")[0] for text in logged] == [
+        "write 01.21 = +44.4",
+        "write 01.22 = +0.3",
+    ]
+    assert "rounded from 44.400000000000006" in logged[0]
 
 
 @pytest.mark.parametrize(("menu", "number"), [(0, 0), (99, 99)])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from decimal import Decimal
+from decimal import ROUND_HALF_UP, Decimal
 from typing import Any, ClassVar, SupportsFloat
 
 from busmaster.contract.arguments import whole_number
@@ -75,7 +75,8 @@ class ReadRun(mentor.ReadRun):
 class Write:
     """Write one parameter: a number in its shortest exact form, with a decimal point if necessary; a bit as 1 or 0.
 
-    Raises InvalidCommand for a value that does not fit into twelve characters.
+    A number with more decimals than fit into twelve characters is rounded to those that fit, half away from zero. Then
+    `rounded` is not empty and is logged. Raises InvalidCommand for a value that does not fit even without decimals.
     """
 
     menu: int
@@ -96,12 +97,22 @@ class Write:
             return str(int(self.value))
         if not is_sendable(self.value):
             raise InvalidCommand(f"{self.value!r} is not a number that can be sent")
-        text = f"{Decimal(str(self.value)):+f}"
-        if "." in text:
-            text = text.rstrip("0").rstrip(".")
+        number = Decimal(str(self.value))
+        text = _shortest(number)
+        if len(text) > LONGEST_DATA:
+            # Calculated values have up to 17 digits: 44.400000000000006.
+            whole = len(f"{number:+.0f}")
+            text = _shortest(number.quantize(Decimal(1).scaleb(min(0, whole + 1 - LONGEST_DATA)), ROUND_HALF_UP))
         if len(text) > LONGEST_DATA:
             raise InvalidCommand(f"{self.value!r} does not fit into {LONGEST_DATA} characters")
-        return "+0" if float(text) == 0 else text
+        return text
+
+    @property
+    def rounded(self) -> str:
+        """Return what is rounded, as text for the log; "" if the value is sent as it is."""
+        if isinstance(self.value, bool) or Decimal(str(self.value)) == Decimal(self.text):
+            return ""
+        return f"{self} is rounded from {self.value!r}, which has more digits than a telegram"
 
     def __str__(self) -> str:
         return f"write {self.menu:02d}.{self.number:02d} = {self.text}"
@@ -113,6 +124,14 @@ class Write:
         body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX
         request = reset(address) + STX + body + bytes((bcc(body),))
         return Writing(request, timings.write) if address else Broadcast(request, timings.write)
+
+
+def _shortest(number: Decimal) -> str:
+    """Return the shortest text of a number, with its sign."""
+    text = f"{number:+f}"
+    if "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return "+0" if float(text) == 0 else text
 
 
 def is_sendable(value: SupportsFloat) -> bool:

@@ -29,7 +29,8 @@ class CtAnsiDrive(ParameterHandle):
         speed = await drive.read("1.21")
 
     The drive sends decimal points itself. `decimals`: number of digits to which a parameter's values are rounded before
-    they are written, half away from zero; without an entry a value is sent unchanged.
+    they are written, half away from zero. Without an entry a value is sent unchanged. If it has more decimals than fit
+    into twelve characters, it is rounded to those that fit, and a warning is logged.
     """
 
     profile: ClassVar[Profile] = PROFILE
