@@ -51,4 +51,16 @@ def differing(terminal: bytes, line: LineSettings) -> LineSettings | None:
     return None if port == line else port
 
 
-__all__ = ["differing", "set_rate", "words"]
+def mismatch_text(port: LineSettings, line: LineSettings) -> str:
+    """Return what is wrong with a port that is set otherwise than the line, as a sentence for the user."""
+    if port.baudrate != line.baudrate:
+        what, wanted = f"{port.baudrate} baud", f"{line.baudrate} baud"
+    else:
+        what, wanted = port.framing, line.framing
+    return (
+        f"the other side sends with {what}, but the emulated line has {wanted}: neither can read the other. "
+        f"Set the other side to {wanted}, or emulate a line with {what}"
+    )
+
+
+__all__ = ["differing", "mismatch_text", "set_rate", "words"]

@@ -6,6 +6,7 @@ which is half a frame. A thread without work sleeps until it is woken.
 
 from __future__ import annotations
 
+import logging
 import os
 import pty
 import queue
@@ -20,11 +21,13 @@ from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator import port_settings
 from busmaster.emulator.device import NEVER
 from busmaster.emulator.line import Line
 
 T = TypeVar("T")
+logger = logging.getLogger("busmaster")
 SPIN = 100e-6
 """Seconds for which the thread waits without sleeping: the kernel wakes a thread some 60 microseconds late."""
 CHUNK = 4096
@@ -145,10 +148,19 @@ class PtyServer(LineServer):
     """A line on a pseudo-terminal. `path` is `link` if given, else the terminal's own.
 
     The terminal is raw and is held open, so that clients may come and go. It is set to the line's rate; a client that
-    sets another hears, and is heard, as by a UART. Raises FileExistsError if `link` is there and is no symbolic link.
+    sets another hears, and is heard, as by a UART. The first bytes at each other rate are reported once: `report` is
+    called with a text, in the server's thread; by default it is logged. Raises FileExistsError if `link` is there and
+    is no symbolic link.
     """
 
-    def __init__(self, line: Line, link: str | os.PathLike[str] | None = None) -> None:
+    def __init__(
+        self,
+        line: Line,
+        link: str | os.PathLike[str] | None = None,
+        report: Callable[[str], object] = logger.warning,
+    ) -> None:
+        self._report = report
+        self._reported: set[LineSettings] = set()
         self._master, self._slave = pty.openpty()
         self._device = os.ttyname(self._slave)
         self._link = None if link is None else os.fspath(link)
@@ -178,9 +190,14 @@ class PtyServer(LineServer):
             self._terminal = terminal
             self.line.host = port_settings.differing(terminal, self.line.settings)
         try:
-            return os.read(source, CHUNK)
+            data = os.read(source, CHUNK)
         except BlockingIOError:
             return b""
+        # With the bytes and not with the setting: a client may open the port first and set its rate later.
+        if data and self.line.host is not None and self.line.host not in self._reported:
+            self._reported.add(self.line.host)
+            self._report(f"{self.path}: {port_settings.mismatch_text(self.line.host, self.line.settings)}")
+        return data
 
     def _deliver(self, data: bytes) -> None:
         try:
@@ -255,9 +272,14 @@ class TcpServer(LineServer):
             client.close()
 
 
-def serve_pty(line: Line, link: str | os.PathLike[str] | None = None) -> PtyServer:
-    """Serve `line` on a pseudo-terminal, and make `link` (replacing a symbolic link) point to it until closed."""
-    return PtyServer(line, link)
+def serve_pty(
+    line: Line, link: str | os.PathLike[str] | None = None, report: Callable[[str], object] = logger.warning
+) -> PtyServer:
+    """Serve `line` on a pseudo-terminal, and make `link` (replacing a symbolic link) point to it until closed.
+
+    `report` is called once for each other baud rate at which a client sends; by default it is logged as a warning.
+    """
+    return PtyServer(line, link, report)
 
 
 def serve_tcp(line: Line, host: str = "127.0.0.1", port: int = 0) -> TcpServer:

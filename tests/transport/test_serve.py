@@ -42,6 +42,14 @@ def ask(port: int, request: bytes, length: int, seconds: float = PATIENCE) -> by
     return got
 
 
+def until(true: Callable[[], bool]) -> None:
+    """Waits until it is true."""
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def opened(path: str) -> int:
     return os.open(path, os.O_RDWR | os.O_NOCTTY)
 
@@ -71,6 +79,41 @@ def test_a_pty_answers_where_the_kernel_does_not_tell_how_it_is_set(monkeypatch:
     with serve_pty(mint_line()) as server:
         port = opened(server.path)
         assert ask(port, WRITE, 1) == b"\x06"
+        os.close(port)
+
+
+def set_rate(port: int, rate: int) -> None:
+    settings = termios.tcgetattr(port)
+    settings[4] = settings[5] = rate
+    termios.tcsetattr(port, termios.TCSANOW, settings)
+
+
+def test_each_other_baud_rate_of_a_client_is_reported_once() -> None:
+    reports: list[str] = []
+    with serve_pty(mint_line(), report=reports.append) as server:
+        port = opened(server.path)
+        for rate, reported in ((termios.B9600, 1), (termios.B9600, 1), (termios.B19200, 2)):
+            assert ask(port, WRITE, 1)[-1:] == b"\x06"
+            set_rate(port, rate)
+            for _ in range(3):
+                ask(port, WRITE, 1, 0.1)
+            until(lambda wanted=reported: len(reports) == wanted)  # type: ignore[misc]
+            set_rate(port, termios.B57600)
+        os.close(port)
+    assert [report.partition(": ")[2].partition(":")[0] for report in reports] == [
+        "the other side sends with 9600 baud, but the emulated line has 57600 baud",
+        "the other side sends with 19200 baud, but the emulated line has 57600 baud",
+    ]
+    assert all(report.startswith(server.path) for report in reports)
+    assert "Set the other side to 57600 baud, or emulate a line with 9600 baud" in reports[0]
+
+
+def test_another_baud_rate_is_logged_by_default(caplog: pytest.LogCaptureFixture) -> None:
+    with serve_pty(mint_line()) as server:
+        port = opened(server.path)
+        set_rate(port, termios.B9600)
+        os.write(port, READ)
+        until(lambda: "9600 baud" in caplog.text)
         os.close(port)
 
 

@@ -6,6 +6,7 @@ import os
 import random
 import time
 from collections.abc import Sequence
+from functools import partial
 from math import inf
 
 import click
@@ -13,7 +14,7 @@ import click
 from busmaster import Rfc2217Port, SerialPort, TcpPort
 from busmaster.app.cli.arguments import line_settings, nodes_option, seconds_option, single_nodes
 from busmaster.app.cli.lines import file_argument, load
-from busmaster.app.cli.output import emit
+from busmaster.app.cli.output import Level, emit, note
 from busmaster.app.cli.parsing import Whole, option_type, parsed
 from busmaster.app.cli.protocols import protocol_option
 from busmaster.app.config import LineFile, emulated_line
@@ -150,7 +151,9 @@ def nodes_to_emulate(profile: Profile, nodes: Sequence[int] | None) -> Sequence[
 def serve(line: Line, link: str | None, address: tuple[str, int] | None) -> LineServer:
     """Serve the line on TCP if there is an address, else on a pty. Raises LineDown for what cannot be had."""
     try:
-        return serve_tcp(line, *address) if address else serve_pty(line, link or None)
+        return (
+            serve_tcp(line, *address) if address else serve_pty(line, link or None, partial(note, level=Level.WARNING))
+        )
     except OSError as error:
         where = f"{address[0]}:{address[1]}" if address else link or "a pseudo-terminal"
         hint = "use another port, or 0 for a free one" if address else "name a link that is not there yet"
