@@ -274,14 +274,16 @@ class MergedRead:
 
     def __post_init__(self) -> None:
         kind = ReadBits if self.table in ReadBits.tables else ReadRegisters
-        reads = [kind(first, count, self.table) for first, count in self.spans]
-        if not reads:
+        if not self.spans:
             raise InvalidCommand("a merged read has one span or more")
-        first = reached = min(read.first for read in reads)
-        for read in sorted(reads, key=lambda read: read.first):
-            if read.first > reached:
+        first = reached = min(self.spans)[0]
+        for start, count in sorted(self.spans):
+            # no ReadRegisters of each: a group of 500 points is merged in one step of the event loop
+            whole_number(start, 0, HIGHEST, "an address")
+            whole_number(count, 1, kind.most, "how many")
+            if start > reached:
                 raise InvalidCommand(f"merged reads have a gap at {self.table} {reached}")
-            reached = max(reached, read.first + read.count)
+            reached = max(reached, start + count)
         # here and not in `open`, which is called between the end of a silence and the write
         object.__setattr__(self, "whole", kind(first, reached - first, self.table))
 

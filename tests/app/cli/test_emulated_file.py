@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 import pytest
+import serial
 
 from busmaster.app.cli.emulate import own_port
 from busmaster.app.cli.lines import other_port
@@ -112,6 +113,19 @@ def test_run_shows_what_the_emulated_line_holds(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_emulate_reports_another_baud_rate_of_its_client() -> None:
+    with started("emulate", "--protocol", "hcp2") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        try:
+            with serial.Serial(process.stdout.readline().strip(), 9600) as port:
+                port.write(b"\x07")
+                assert process.stderr.readline().startswith("busmaster: /dev/")
+        finally:
+            process.terminate()
+        assert process.stderr.read() == ""
+
+
 def test_emulate_says_where_the_file_asks_for_what_no_device_has(tmp_path: Path) -> None:
     path, _ = file_of(VALUES[0][0].replace("outputs = 5", "outptus = 5"), ["outputs"], tmp_path)
     with started("emulate", str(path)) as process:
