@@ -233,13 +233,13 @@ KINDS = {
 
 KINDS |= {name: Kind(READER, floods.on_service(raw, READER)) for name, raw in floods.SERVICE.items()}
 KINDS |= {"write: stopped holder of a sequence": Kind(WRITER, floods.stopped_holder)}
-KINDS |= {name: Kind("", idle) for name in floods.PAGE}
+KINDS |= {name: Kind("", idle) for interface in floods.INTERFACES for name in interface.attacks}
 
 
 async def attack(name: str, address: str, connections: int) -> None:
     """Be the attackers, until this process is ended."""
-    if name in floods.PAGE:
-        await floods.at(floods.PAGE[name], address, WRITER)
+    if (interface := floods.interface_of(name)) is not None:
+        await floods.at(interface.attacks[name], address, WRITER)
     kind = KINDS[name]
 
     async def come(number: int) -> None:
@@ -280,12 +280,12 @@ async def run(name: str, connections: int, seconds: float) -> Outcome:
         address = f"unix:{folder}/busmaster/line.sock"
         attacked, target = owner, f"tcp://127.0.0.1:{tcp}"
         attackers: Process | None = None
-        page: Process | None = None
+        interface, attacked_interface = floods.interface_of(name), None
         try:
             async with await _entered(owner, address) as bus:
-                if name in floods.PAGE:
-                    page, target = await floods.page(address, f"{folder}/tokens")
-                    attacked = page
+                if interface is not None:
+                    attacked, target = await interface.start(address, target, f"{folder}/tokens")
+                    attacked_interface = attacked
                 busy = await _busy(bus)
                 attackers = await asyncio.create_subprocess_exec(
                     *(sys.executable, "-m", "tests.app.service.attackers", "--attack", name),
@@ -296,8 +296,8 @@ async def run(name: str, connections: int, seconds: float) -> Outcome:
                 await asyncio.sleep(2.0)
                 measured = await _measure(bus, f"tcp://127.0.0.1:{tcp}", seconds)
                 megabytes = _resident(attacked.pid)
-                if page is not None:
-                    measured["others"] = await floods.page_answers(target)
+                if interface is not None:
+                    measured["others"] = await interface.answers(target)
             began = time.monotonic()
             owner.send_signal(signal.SIGTERM)
             assert owner.stderr is not None
@@ -316,7 +316,7 @@ async def run(name: str, connections: int, seconds: float) -> Outcome:
                 measured["others"],
             )
         finally:
-            for process in (attackers, page, owner):
+            for process in (attackers, attacked_interface, owner):
                 if process is not None and process.returncode is None:
                     process.kill()
                     await process.wait()

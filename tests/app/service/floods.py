@@ -1,7 +1,8 @@
 """Attacks below the level of requests, for `python -m tests.app.service.attackers`: connections, frames and bodies.
 
 Each is made by one attacking process, from its first connection on; the other connections only stay. Attacks whose name
-begins with `page` are on a `busmaster web` over the attacked line, and `address` is then its URL.
+begins with `page` are on a `busmaster web` over the attacked line, those that begin with `modbus-tcp` on a `busmaster
+modbus-tcp` that passes requests through to its unit, which may be written; `address` is then the URL of the interface.
 """
 
 from __future__ import annotations
@@ -10,12 +11,15 @@ import asyncio
 import contextlib
 import gzip
 import os
+import random
 import resource
 import signal
 import socket
 import sys
 import zlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from busmaster import RemoteBus, connect
@@ -90,13 +94,14 @@ async def connections(host: str, port: int, token: str) -> None:
     await asyncio.gather(*(hold() for _ in range(count)))
 
 
-async def _again(
-    host: str, port: int, talk: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-) -> None:
+Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+
+async def _again(host: str, port: int, talk: Talk, source: str = FROM) -> None:
     """Connect again and again, and talk."""
     while True:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-            reader, writer = await asyncio.open_connection(host, port, local_addr=(FROM, 0))
+            reader, writer = await asyncio.open_connection(host, port, local_addr=(source, 0))
             try:
                 await talk(reader, writer)
             finally:
@@ -195,6 +200,78 @@ async def page_pings(host: str, port: int, token: str) -> None:
     await asyncio.gather(*(_again(host, port, talk) for _ in range(8)))
 
 
+READ = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
+WRITE = bytes.fromhex("0001 0000 0006 01 06 003c 0001")
+READ_REPLY, WRITE_REPLY = 11, 12
+SOURCES = [f"127.0.0.{last}" for last in range(2, 10)]
+"""The interface has 32 connections of one address, and 128 in all: these have more."""
+
+
+async def _from_all(host: str, port: int, talk: Talk) -> None:
+    """Talk at 40 connections of each address."""
+    await asyncio.gather(*(_again(host, port, talk, source) for source in SOURCES for _ in range(40)))
+
+
+async def modbus_half(host: str, port: int, token: str) -> None:
+    """Send half a header, and stay."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(READ[:4])
+        await reader.read(-1)
+
+    await _from_all(host, port, talk)
+
+
+async def modbus_bytes(host: str, port: int, token: str) -> None:
+    """Send a byte each second."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            for byte in READ:
+                writer.write(bytes((byte,)))
+                await writer.drain()
+                await asyncio.sleep(1.0)
+
+    await _from_all(host, port, talk)
+
+
+async def modbus_garbage(host: str, port: int, token: str) -> None:
+    """Send random bytes, and headers of other protocols and lengths."""
+    chance = random.Random(1)
+    heads = [bytes.fromhex(head) for head in ("00010001000601", "00010000000101", "0001000000ff01", "00010000ffff01")]
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(chance.choice([chance.randbytes(1000), *heads]) + chance.randbytes(1000))
+        await reader.read(-1)
+
+    await asyncio.gather(*(_again(host, port, talk) for _ in range(32)))
+
+
+async def modbus_queued(host: str, port: int, token: str) -> None:
+    """Send reads without a pause, and read no reply."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            writer.write(READ * 1000)
+            await writer.drain()
+
+    await _from_all(host, port, talk)
+
+
+def _requests(request: bytes, size: int) -> Raw:
+    """Return what makes one request after the other at 32 connections."""
+
+    async def flood(host: str, port: int, token: str) -> None:
+        async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            while True:
+                writer.write(request)
+                await reader.readexactly(size)
+
+        await asyncio.gather(*(_again(host, port, talk) for _ in range(32)))
+
+    return flood
+
+
 async def stopped_holder(bus: RemoteBus, number: int) -> None:
     """Have a process take a sequence of 5 s and stop it (SIGSTOP) while it holds the line; then the next one."""
     if number:
@@ -237,6 +314,16 @@ PAGE: dict[str, Raw] = {
     "page: deflate bombs": page_deflate,
     "page: ping floods": page_pings,
 }
+MODBUS: dict[str, Raw] = {
+    "modbus-tcp: 10,000 connections": connections,
+    "modbus-tcp: half a header": modbus_half,
+    "modbus-tcp: a byte a second": modbus_bytes,
+    "modbus-tcp: garbage": modbus_garbage,
+    "modbus-tcp: queued reads": modbus_queued,
+    "modbus-tcp: reads": _requests(READ, READ_REPLY),
+    "modbus-tcp: writes": _requests(WRITE, WRITE_REPLY),
+}
+MODBUS_READER: dict[str, Raw] = {"modbus-tcp of role read: reads": _requests(READ, READ_REPLY)}
 
 
 def on_service(raw: Raw, token: str) -> Callable[[RemoteBus, int], Awaitable[None]]:
@@ -258,7 +345,7 @@ async def at(raw: Raw, address: str, token: str) -> None:
     await raw(place.hostname, place.port, token)
 
 
-async def page(address: str, tokens: str) -> tuple[asyncio.subprocess.Process, str]:
+async def page(address: str, _tcp: str, tokens: str) -> tuple[asyncio.subprocess.Process, str]:
     """Start `busmaster web` for a line, and return it with its URL once the line is followed."""
     started = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "busmaster", "web", "--bind", "127.0.0.1:0", "--token-file", tokens, address),
@@ -285,6 +372,68 @@ async def page_answers(url: str) -> bool:
             finally:
                 writer.transport.abort()
     return False
+
+
+async def modbus_tcp_of_a_reader(_address: str, tcp: str, tokens: str) -> tuple[asyncio.subprocess.Process, str]:
+    """Start `busmaster modbus-tcp` with a token of the role `read`, whose requests use what the owner leaves."""
+    text = await asyncio.to_thread(Path(tokens).read_text)
+    known = dict(line.split() for line in text.splitlines())
+    return await modbus_tcp(tcp, tcp, tokens, {**os.environ, "BUSMASTER_TOKEN": known["reader"]})
+
+
+async def modbus_tcp(
+    address: str, _tcp: str, _tokens: str, environment: Mapping[str, str] | None = None
+) -> tuple[asyncio.subprocess.Process, str]:
+    """Start `busmaster modbus-tcp` for a line, and return it with its URL once it replies."""
+    started = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "busmaster", "modbus-tcp", "--bind", "127.0.0.1:0", "--pass-through"),
+        *("--allow-unit", "1", address),
+        stderr=asyncio.subprocess.PIPE,
+        env=environment,
+    )
+    assert started.stderr is not None
+    url = ""
+    while not url and (line := (await started.stderr.readline()).decode()):
+        place = line.partition("clients find it at ")[2].strip()
+        url = f"modbus://{place}" if place else ""
+    while not await modbus_answers(url):  # noqa: ASYNC110  nothing reports that it knows the nodes of the line
+        await asyncio.sleep(0.1)
+    return started, url
+
+
+async def modbus_answers(url: str) -> bool:
+    """Return whether an interface that is attacked reads the unit for another client within 5 s."""
+    place = urlsplit(url)
+    with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError):
+        async with asyncio.timeout(5.0):
+            reader, writer = await asyncio.open_connection(place.hostname, place.port)
+            try:
+                writer.write(READ)
+                return (await reader.readexactly(9))[7:] == b"\x03\x02"
+            finally:
+                writer.transport.abort()
+    return False
+
+
+class Interface(NamedTuple):
+    """An interface that is attacked: how it is started, and whether it replies to another client."""
+
+    attacks: dict[str, Raw]
+    start: Callable[[str, str, str], Awaitable[tuple[asyncio.subprocess.Process, str]]]
+    """Takes the line's address, the one by TCP, and the file of its tokens."""
+    answers: Callable[[str], Awaitable[bool]]
+
+
+INTERFACES = (
+    Interface(PAGE, page, page_answers),
+    Interface(MODBUS, modbus_tcp, modbus_answers),
+    Interface(MODBUS_READER, modbus_tcp_of_a_reader, modbus_answers),
+)
+
+
+def interface_of(name: str) -> Interface | None:
+    """Return the interface that an attack is on; None for the service."""
+    return next((one for one in INTERFACES if name in one.attacks), None)
 
 
 if __name__ == "__main__":
