@@ -78,7 +78,7 @@ def test_nothing_is_cut_or_needs_scrolling_to_the_side(
     elif situation == NODE_DOWN:
         assert len(bad) == 3, f"of {DEAD_DRIVE} alone"
         [reason] = reasons  # once for the three, and not in the table's columns
-        assert "down" in reason
+        assert "not responding" in reason
         assert "the next 2 points" in reason
     else:
         assert len(bad) == len(qualities)
