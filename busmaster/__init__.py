@@ -126,7 +126,7 @@ ON_DEMAND = {
     "connect": "busmaster.app.service.remote",
     "open_line": "busmaster.app.line.configured_line",
 }
-"""Public names that a bus alone does not need, and the modules which are imported when these are asked for."""
+"""Public names that a bus alone does not need, and the modules that are imported when one of them is used."""
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""The bounds of everything that a file or a client can say: what goes beyond one is refused, and the refusal names it.
+"""The bounds of all content of a file and all requests of a client. Input beyond a bound is rejected with its name.
 
 Each bound is declared here and nowhere else. The page docs/reference/bounds.md is made of this module: a line
 `# Title` begins a section of that page, and the text below a name is its row. Times are in seconds.
@@ -9,8 +9,8 @@ from __future__ import annotations
 # Files
 
 LONGEST_FILE = 4 << 20
-"""Bytes of a file that is read whole: a LINE.toml, a template, a list of symbols, a table of points, a token file, a
-file of learned reply times, a certificate. A LINE.toml with 20 000 named points has about half of it."""
+"""Bytes of a file that is read whole. Such files are: LINE.toml, template, list of symbols, table of points, tokens,
+learned reply times, certificate. A LINE.toml with 20 000 named points has about half of it."""
 LONGEST_LINE_RECORD = 1 << 14
 """Bytes of a `NAME.line` file in the folder of the sockets."""
 MOST_NESTED = 16
@@ -50,7 +50,7 @@ SHORTEST_TOKEN = 16
 # Clients of the service
 
 LONGEST_REQUEST = 1 << 16
-"""Bytes of one message of a client: what it takes to understand one holds up the line."""
+"""Bytes of one message of a client: the time for parsing one delays the line."""
 MOST_PARTS = 1 << 13
 """Values in one message of a client: of as many bytes, those of many small ones take longest to understand."""
 LONGEST_ANSWER = 1 << 20
@@ -118,7 +118,7 @@ LONGEST_REPLY = 5.0
 LONGEST_WAIT = 86_400.0
 """Seconds of `start_within` and `finish_within` of a client's request: a day."""
 LONGEST_SUSPENSION = 86_400.0
-"""Seconds for which a node can be suspended: a day. A suspension does not end with the program that asked for it."""
+"""Seconds for which a node can be suspended: a day. A suspension does not end with the program that requested it."""
 
 # Logins by token or password, at whatever interface
 
@@ -150,7 +150,7 @@ AUDIT_WITHIN = 5.0
 MOST_COMMANDS = 100
 """MQTT commands that wait for their turn, and refusals that wait to be answered: more are only counted."""
 LONGEST_NAME = 256
-"""Characters of a point's name in the answer to an MQTT command: a longer one is answered without it."""
+"""Characters of a point's name in the reply to an MQTT command: a longer name is omitted from the reply."""
 LONGEST_SENDER = 100
 """Characters of the name that the sender of an MQTT command gives itself."""
 

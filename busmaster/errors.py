@@ -1,7 +1,7 @@
 """The exceptions of busmaster.
 
 Each failed request raises a new instance of a `BusError` subclass. It contains the line, the node, the command and the
-number of attempts. Its text states in one sentence what happened, where, and what to do. It can be pickled, and so be
+number of attempts. Its text states in one sentence the event, the place and the remedy. It can be pickled, and so be
 sent to another process.
 
 A wrong argument is not a bus error: it raises `InvalidCommand` when the command is created or the request is made.
@@ -32,14 +32,16 @@ class Addressed(Protocol):
 
 
 class InvalidCommand(ValueError):
-    """An argument is out of range or not allowed by the protocol, or a bus is used in the wrong way (opened twice, or
-    used from another thread or event loop). Nothing was sent."""
+    """An argument is out of range or not allowed by the protocol, or a bus is used in the wrong way. Nothing was sent.
+
+    Wrong uses of a bus are to open it twice, and to use it from another thread or event loop.
+    """
 
 
 class BusError(Exception):
     """A request ended without a value.
 
-    `what`: the event ("no reply within 100 ms"). `hint`: what to do. `command`: the command as text. `attempts`: number
+    `what`: the event ("no reply within 100 ms"). `hint`: the remedy. `command`: the command as text. `attempts`: number
     of attempts on the wire. `line`: name of the line's port. `label`, `address`: those of the node ("node 5", 5). Each
     is None if it is unknown, or if the error does not refer to one node.
     """
@@ -106,9 +108,9 @@ class Refused(BusError):
     """The node understood the request and refused it (NAK; EOT in Mentor II).
 
     A protocol's exchange raises it with `what` only, and with `confirm=False` if a repetition would give no new
-    information (MSC has already sent it four times; a multi-value write may have stored a part). The arbiter adds the
-    rest, and repeats the request once if `confirm` is True. `temporary`: the node may accept the same request later
-    (a Modbus unit that is busy). Merged reads are then not divided.
+    information. Examples: MSC has already sent the request four times; a multi-value write may have stored a part. The
+    arbiter adds the other fields, and repeats the request once if `confirm` is True. `temporary`: the node may accept
+    the same request later (a Modbus unit that is busy). Merged reads are then not divided.
     """
 
     hint = "check that it exists, is writable and within the node's limits"

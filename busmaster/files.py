@@ -24,8 +24,8 @@ def open_file(path: str, flags: int, mode: int = MODE) -> int:
 def read_file(path: str | os.PathLike[str], most: int = LONGEST_FILE) -> bytes:
     """Return the content of a regular file of at most `most` bytes. Never waits for another program.
 
-    Raises OSError for a file that cannot be read or is larger, and for a FIFO or a device: opening a FIFO waits for a
-    writer, and a device may have no end.
+    Raises OSError for a file that cannot be read or is larger, and for a FIFO or a device. Opening a FIFO would wait
+    for a writer, and a device may have no end.
     """
     name = os.fspath(path)
     descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)

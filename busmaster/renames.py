@@ -52,7 +52,7 @@ ROOT = {name: (where, name) for name, where in _MOVED.items()} | {
     "LatenessLowered": ("busmaster.events", "MaxReplyDelayLowered"),
     "LatenessRaised": ("busmaster.events", "MaxReplyDelayRaised"),
 }
-"""Names that the root had in 0.2: the module that has the thing now, and what it is called there."""
+"""Names that the root had in 0.2: the module that has the object now, and its name there."""
 STATISTICS = {
     "unasked_bytes": "unexpected_bytes",
     "settles": "resyncs",

@@ -51,14 +51,14 @@ class _Exchange:
         Only the frames are used.
         """
         if self.attempt is not None and self.request is None:
-            return False  # its protocol is not known here: the frames say nothing
+            return False  # its protocol is not known here, so the frames prove nothing
         if frame.fault == UNEXPECTED or self.request is None or self.released or self.is_broadcast:
             return True
         last = self.last
         if last is None or self.kind is None or self.judge()[0] is Outcome.NO_REPLY:
             return False
         if last.kind is Kind.NOISE:
-            # no reader looks for the start of a reply in noise, but for these
+            # Only the readers of these protocols search noise for the start of a reply.
             return not self.kind.profile.noise_tolerant
         return frame.kind is Kind.NOISE
 
@@ -166,7 +166,7 @@ class Assembler:
     def _take(self, frame: Frame) -> None:
         """Create the packet of one frame."""
         if self._told:
-            frame.sender = self._sender  # which its bytes may not tell
+            frame.sender = self._sender  # its bytes may not show it
         from_host = frame.sender is Direction.HOST
         asks = from_host and frame.kind in (Kind.READ, Kind.WRITE)
         if asks and not self._told:
@@ -203,10 +203,10 @@ class Assembler:
             packet.transaction, packet.attempt = attempt.transaction, attempt.number
 
     def _overdue_reply(self) -> str:
-        """Return a description of what an unexpected frame may be, or ""."""
+        """Return the possible origin of an unexpected frame, or ""."""
         attempt = self._exchange.attempt
         late = self._told and attempt is not None and attempt.verdict is Verdict.NO_REPLY
-        return f"perhaps a late answer to {attempt.command}" if late and attempt is not None else ""
+        return f"perhaps a late reply to {attempt.command}" if late and attempt is not None else ""
 
     @property
     def _name(self) -> str:

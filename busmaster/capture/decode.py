@@ -57,7 +57,7 @@ class Decoder:
         self._rejected_at = 0.0
         self._rejected_joined = False
         self._joined = False
-        """What is in the buffer came in one piece with what was before it."""
+        """The bytes in the buffer arrived in one piece with the bytes before them."""
         self._started = 0.0
         self._heard = 0.0
         self._spoken = 0.0

@@ -29,7 +29,7 @@ class Kind(enum.StrEnum):
     NAK = "nak"
     EOT = "eot"
     NOISE = "noise"
-    """No frame at all, or one that was cut short: `fault` says which."""
+    """Not a frame, or an incomplete one: see `fault`."""
 
 
 @dataclass(slots=True)
@@ -37,7 +37,7 @@ class Frame:
     """One received frame.
 
     `item`: the quantity as on the command line ("100", "01.17", "2008:32", "flag:5"). `value`: the data as text,
-    several values joined by commas. `fault`: what is wrong with the frame, or empty. `node`: for a reply that of its
+    several values joined by commas. `fault`: description of its fault, or empty. `node`: for a reply that of its
     request, because only MSC's replies contain it.
     """
 

@@ -58,8 +58,8 @@ class CutOff(CaptureError):
 
 
 class Outcome(enum.IntEnum):
-    """How an exchange ended, or that a frame belongs to none (UNASKED). Values from AMBIGUOUS on are used by a master
-    only."""
+    """How an exchange ended, or that a frame belongs to none (UNEXPECTED). Only a master uses the values from AMBIGUOUS
+    on."""
 
     NONE = 0
     OK = 1
@@ -162,7 +162,7 @@ def read_packets(file: BinaryIO) -> Iterator[Packet]:
         try:
             packet = _take_block(kind, body, order, interfaces)
         except (struct.error, IndexError) as error:
-            raise CaptureError("a block that is too short for what it holds: the file is damaged") from error
+            raise CaptureError("a block is too short for its content: the file is damaged") from error
         if packet is not None:
             yield packet
 

@@ -97,8 +97,8 @@ class _Heard:
 class _Run:
     """A new exchange, run with the recorded bytes.
 
-    With `pauses`, a reply with a pause longer than its inter-byte timeout ends for the reader, as it did for the
-    arbiter, unless that allowed for an adapter that holds bytes back. Which of the two happened is not recorded.
+    With `pauses`, a pause longer than the inter-byte timeout ends a reply for the reader, as for the arbiter. But the
+    arbiter may have allowed for an adapter that holds bytes back. Which of the two happened is not recorded.
     """
 
     def __init__(self, asked: _Heard, command: Command[Any], profile: Profile, pauses: bool = False) -> None:
@@ -210,7 +210,7 @@ class _Run:
             recorded.values = self._values
             recorded.text = recorded.text.removeprefix(lead) if recorded.text.startswith(lead) else ""
         elif recorded.outcome is Outcome.AMBIGUOUS and now.outcome is Outcome.OK:
-            now = Result(Outcome.AMBIGUOUS, f"{now.text}, which was not believed")
+            now = Result(Outcome.AMBIGUOUS, f"{now.text}, but ambiguous: not delivered")
         return _replayed(self.asked, str(self._command), recorded, now)
 
     def _hand_over(self) -> None:

@@ -35,7 +35,7 @@ def closed_size(data: bytes, start: int) -> int:
 
 
 def checked(raw: bytes, start: int, check: Callable[[bytes], int]) -> str:
-    """Return what is wrong with the checksum (the last byte) of the bytes from `start` on; "" if it is correct."""
+    """Return the fault of the checksum (the last byte) of the bytes from `start` on; "" if it is correct."""
     right = check(raw[start:-1])
     return "" if raw[-1] == right else f"bad checksum {raw[-1]:02X}, not {right:02X}"
 

@@ -22,8 +22,8 @@ LONGEST_NUMBER = 20
 class Between(NamedTuple):
     """The least and the most that a number may be, bounds included, and its unit: beside its type, in `Annotated`.
 
-    The reader of a file rejects other numbers. If `self_checked`, the class that has the number does so itself, and its
-    message says more.
+    The reader of a file rejects other numbers. If `self_checked`, the class that has the number does so itself, with a
+    more specific message.
     """
 
     least: float = -inf

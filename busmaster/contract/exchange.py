@@ -81,7 +81,7 @@ class FrameError(Exception):
     `whole`: True only for a whole frame with the right echo and a bad checksum. Its reply has begun, so the line does
     not wait for overdue replies, only for silence (R3). `send`: a closing ACK that the device needs nevertheless (MSC);
     otherwise it retransmits into other exchanges. `heard`: all bytes received in place of the reply, if they may belong
-    to another request: they can clear overdue replies (R15). `hint`: what to do, if it differs from the hint for most
+    to another request: they can clear overdue replies (R15). `hint`: the remedy, if it differs from the hint for most
     garbled replies.
     """
 

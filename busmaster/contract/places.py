@@ -51,7 +51,7 @@ class Rounding(Protocol):
 
     @property
     def rounded(self) -> str:
-        """Return what is rounded, as text for the log; "" if the value is sent as it is."""
+        """Return a text for the log if the value was rounded, else ""."""
         ...
 
 

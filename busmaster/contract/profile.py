@@ -74,7 +74,7 @@ class Profile:
     unknown line.
 
     `checked_requests`: a node detects a flipped bit in any request. Without that, a damaged read returns another item,
-    which would be taken for the requested one if the line has continued. Then reply windows cannot be learned.
+    and it would be delivered as the requested one if the line has continued. Then reply windows cannot be learned.
 
     `acks_are_commands`: a node that has just replied takes an ACK or a NAK, even one from another node, for the host's
     request for the next value or a repetition. So the line never continues before the reply to a write is over.

@@ -16,7 +16,7 @@ class ReplyTiming:
     Raises `InvalidCommand` unless 0 <= late_after <= window <= max_reply_delay and inter_byte_timeout > 0,
     driver_release_time >= 0.
 
-    `silence` is set if the window is learned: after this many seconds without a byte the line continues before the
+    `silence` is set if the window is learned. After this many seconds without a byte the line continues before the
     maximum reply delay has passed, and the reply is overdue until then (R15). None: the line waits for the maximum
     reply delay (R3).
     """

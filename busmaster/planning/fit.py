@@ -51,7 +51,7 @@ class PlannedGroup:
 
 @dataclass(frozen=True, slots=True)
 class MergedReads:
-    """One merged exchange of a group: how many single commands it replaces, and what it saves per cycle."""
+    """One merged exchange of a group: how many single commands it replaces, and its saving per cycle."""
 
     node: str
     command: str
@@ -65,8 +65,8 @@ class GroupPlan:
 
     `cycle`, `longest_cycle`: mean and longest time from a cycle's due time to its last value, without disturbances.
     `missed`: share of cycles that cannot start in time, so that the actual period is `achieved` seconds. `worst_wait`,
-    `worst_cycle`: the bounds of R9 from due time to start and to end. `fitting_period`: shortest period with which the
-    schedule would fit comfortably, all else unchanged. None if it already fits, or if this group alone cannot make it
+    `worst_cycle`: the bounds of R9 from due time to start and to end. `fitting_period`: shortest period of this group
+    with which the schedule would fit comfortably. None if it already fits, or if this group alone cannot make it
     fit. `could_save`: savings per cycle by merges that are not enabled.
     """
 
@@ -286,7 +286,7 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
     background: list[tuple[float, int, float, _Draft]] = []
 
     def release(now: float) -> Generator[int, None, float]:
-        """Queue what is due. Returns when more will be due."""
+        """Queue the polls that are due. Returns the time of the next one."""
         while (due := schedule.next_due()) <= now:
             for poll in schedule.release(now):
                 draft: _Draft = poll.group

@@ -63,8 +63,8 @@ def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
 def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
     """Return the longest time, in seconds, for which one attempt can occupy the line, without repetitions in it.
 
-    This is the H of R9, resynchronisation included: for each step the request, its maximum reply delay and its longest
-    reply; then the silence after the last byte, which a slow reply delays.
+    This is the H of R9, resynchronisation included. Each step takes the request, its maximum reply delay and its
+    longest reply; then follows the silence after the last byte, which a slow reply delays.
     """
     before = worst = 0.0
     steps = [(len(exchange.request), exchange.timing, exchange.sizes)]
@@ -113,7 +113,7 @@ class Bounds:
 
         `ahead`: number of queued URGENT or COMMAND requests of this program. For URGENT, this is the wait of a write.
         Before each request, MOST_BEFORE others may go if its reply could be ambiguous (R15). An urgent write is never
-        held back for this; an urgent read waits for that many more. Each other program may go before it twice, and each
+        held back for this; an urgent read waits for that many more. Each other program may go before it twice. Each
         exchange may be a sequence for which the line is held; a lower class has a slot behind each of those.
         """
         each = 1 + MOST_BEFORE

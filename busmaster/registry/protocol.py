@@ -28,11 +28,11 @@ HIGHEST_CAPTURE_ID = 255
 OptionKind: TypeAlias = Literal[
     "flag", "whole", "number", "positive", "share", "delay", "text", "numbers", "addresses", "tables"
 ]
-"""What an option can be in LINE.toml, and as what the argument comes.
+"""Type of an option in LINE.toml, and of the argument.
 
 A "whole" number is 1 or more; "positive" is any number above 0, "share" one from 0 to 1. A "delay" is a number of
-seconds or two bounds, and comes as a `Delay`. "numbers" is a list of whole numbers, and comes as a frozenset;
-"addresses" a table of names and the address that each stands for; "tables" are tables by name, of `fields`.
+seconds or two bounds; the argument is a `Delay`. "numbers" is a list of whole numbers; the argument is a frozenset.
+"addresses" is a table of names and their addresses. "tables" are tables by name, of `fields`.
 """
 
 

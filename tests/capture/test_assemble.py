@@ -250,7 +250,7 @@ def test_a_reply_after_the_masters_verdict_is_a_stray_that_may_be_late() -> None
     tape.heard(1.12, VALUE)
     assert [line[1:] for line in tape.lines()][1:] == [
         (b"", NO_REPLY, "read element 1: no reply within 100 ms"),
-        (VALUE, UNEXPECTED, "perhaps a late answer to read element 1"),
+        (VALUE, UNEXPECTED, "perhaps a late reply to read element 1"),
     ]
 
 

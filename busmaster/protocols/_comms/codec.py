@@ -79,7 +79,7 @@ class WriteElements:
 
     last: ClassVar[int]
     hints: ClassVar[Mapping[int, str]] = {}
-    """What to do about a refusal, for elements that nodes refuse for reasons of their own."""
+    """Remedies for refusals, for elements that nodes refuse for special reasons."""
     writes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ class Reading(TelegramReader[float]):
 
 
 class Writing(AcknowledgeReader):
-    """One attempt to write one element. `hint`: what to do if the node refuses it; None for the usual hint."""
+    """One attempt to write one element. `hint`: the remedy if the node refuses it; None for the usual hint."""
 
     __slots__ = ("_hint",)
 

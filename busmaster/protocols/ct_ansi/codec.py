@@ -109,7 +109,7 @@ class Write:
 
     @property
     def rounded(self) -> str:
-        """Return what is rounded, as text for the log; "" if the value is sent as it is."""
+        """Return a text for the log if the value was rounded, else ""."""
         if isinstance(self.value, bool) or Decimal(str(self.value)) == Decimal(self.text):
             return ""
         return f"{self} is rounded from {self.value!r}, which has more digits than a telegram"
