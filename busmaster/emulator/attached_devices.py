@@ -2,8 +2,8 @@
 
 Every device receives every byte. An undisturbed frame of the host is passed in one piece to the device with a matching
 route; the other devices receive it only if they are attentive. Incomplete, corrupted or joined frames are passed to all
-devices byte by byte, unless they contain no byte with which a route begins: then they cannot change the state of an
-idle device.
+devices byte by byte. If they contain no byte with which a route begins, they cannot change the state of an idle device,
+and are passed to attentive devices only.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class AttachedDevices:
             self.overhear(frame, start, end, None, whole=False)
             return
         left: list[Device] = []
-        # Asked while it waits for something too, as a Mentor II drive does after a read: else all hear byte by byte.
+        # Also while the device is attentive, as a Mentor II drive is after a read: byte by byte to all would be slow.
         for device in routed:
             if device in self.cut_off or (self._faulty(device) and misses(device, start, end, True, self._chance)):
                 self._note(device, end)
@@ -79,7 +79,7 @@ class AttachedDevices:
     def overhear(self, data: bytes, start: float, end: float, talker: Device | None, whole: bool) -> None:
         """Process bytes that are not a request in one piece.
 
-        With `whole` they are a reply in one piece, which begins with no route.
+        With `whole` they are a reply in one piece, which does not begin with a route.
         """
         if whole or self._openers.isdisjoint(data):
             if not self._attentive:
@@ -96,7 +96,7 @@ class AttachedDevices:
                 self.hear((device,), bytes((byte,)), start, end)
 
     def wake(self) -> None:
-        """Wake the devices whose time has come."""
+        """Wake the devices whose wake-up time has been reached."""
         now = self.wakeup
         self.wakeup = NEVER
         for device in self.devices:
@@ -125,7 +125,7 @@ class AttachedDevices:
         return bool(device.faults.hearing) or device.away_until > 0.0
 
     def _note(self, device: Device, now: float) -> None:
-        """Note what it has come to say, whether it must hear everything from now on, and when it wants to be woken."""
+        """Collect its replies, whether it must receive every byte from now on, and the time at which to wake it."""
         if device.restarted:
             device.restarted = False
             self._take_back(device, now)

@@ -1,4 +1,4 @@
-"""What a receiver gets from several simultaneous transmissions: bits on the wire, undefined where two drivers disagree.
+"""The bits on the wire during simultaneous transmissions. A bit is random if two drivers send different levels.
 
 Only collisions are handled here. A frame that is alone on the line is never split into bits.
 """
@@ -36,7 +36,7 @@ class Collision:
         self._driven: list[bool] = []
         self._talks: list[tuple[int, int, Device | None]] = []
         self._decoded: dict[tuple[Device | None, bool], list[tuple[float, float, int]]] = {}
-        """What each listener hears in the end. The host looks after each byte: half of a campaign was spent on this."""
+        """The bytes that each listener receives. Cached, because the host reads after each byte."""
 
     def add(self, start: float, data: bytes, talker: Device | None, hold: float = 0.0) -> None:
         """Transmit `data` from `start` on; the driver then holds the line idle for `hold` seconds.

@@ -1,4 +1,4 @@
-"""Applies faults: what a device does not receive, and what becomes of a transmitted frame."""
+"""Applies faults: to the bytes that a device receives, and to transmitted frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from busmaster.emulator.faults import FORGED, NO_NOISE, Faults
 
 
 def misses(device: Device, start: float, end: float, request: bool, chance: Chance) -> bool:
-    """Return True if `device` misses what was on the line from `start` to `end`. `request`: a whole frame addressed to
+    """Return True if `device` misses the bytes on the line from `start` to `end`. `request`: a whole frame addressed to
     it."""
     if start < device.away_until:
         return True
@@ -96,8 +96,8 @@ def noise(chance: Chance, longest: int) -> bytes:
 
 
 def flipped(data: bytes, chance: Chance, count: int) -> bytes:
-    """Return the data with the same bit flipped in `count` bytes; in fewer where there are not so many."""
-    mask = 1 << chance.randrange(0, 8)  # one for all: two bits in one place are what an exclusive-or does not see (R5)
+    """Return the data with the same bit flipped in `count` bytes; in all of them if there are fewer."""
+    mask = 1 << chance.randrange(0, 8)  # the same bit in all: an exclusive-or does not detect two flips of one bit (R5)
     changed = bytearray(data)
     places = list(range(len(data)))
     for _ in range(min(count, len(places))):

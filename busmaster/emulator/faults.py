@@ -1,14 +1,16 @@
-"""What can be wrong with a device or a line: zero by default, seeded, changeable while it runs.
+"""The faults of a device or a line: zero by default, seeded, changeable while it runs.
 
-Inside and outside the master's assumption (R3: one request causes at most one reply, which begins within its node's
-`max_reply_delay`): as long as every fault in use is one of `WITHIN`, and reply delay plus `late_by` stays within that
-maximum reply delay, no value that the master delivers may be wrong. `BEYOND` it the replies' anonymity or an 8-bit
-checksum makes a wrong value possible, and the campaigns count how often.
+The master assumes R3: one request causes at most one reply, which begins within its node's `max_reply_delay`. If all
+faults in use are in `WITHIN`, and reply delay plus `late_by` is at most that maximum reply delay, the master must not
+deliver a wrong value. With faults in `BEYOND` a wrong value is possible, because replies contain no address or only an
+8-bit checksum. The campaigns count how often this happens.
 
-Faults of a line strike every frame on it, the host's too; those of a device what it hears and says. There are two
-that are `WITHIN` only as a device's: a request that is heard `doubled` is answered twice; and one that is `truncated`
-by its last byte leaves a device of HCP, HCP2 or Mentor II waiting, which takes the first byte of the next request for
-it and answers NAK, to a request that went to somebody else.
+Faults of a line strike every frame on it, including those of the host. Faults of a device strike the frames that it
+receives and sends. Two faults are `WITHIN` only as faults of a device:
+
+- `doubled`: two copies of a request cause two replies.
+- `truncated`: a device of HCP, HCP2 or Mentor II that misses the last byte of a request waits for it. It processes the
+  first byte of the next request as that byte, and replies with a NAK to a request for another device.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from busmaster.errors import InvalidCommand
 FORGED = b"\x06\x15\x04"
 """Bytes that are a whole reply by themselves: ACK, NAK, EOT."""
 NO_NOISE = bytes(byte | parity for byte in FORGED + b"\x08" for parity in (0x00, 0x80))
-"""These, and BS, which is a whole request to a Mentor II; also as a line of 7 bits with parity carries them."""
+"""These, and BS, which is a whole request to a Mentor II; each also with the parity bit of a line of 7 bits."""
 
 HEARING = ("dead", "drop", "deaf", "restart", "flapping", "nak", "late")
 SPEAKING = (
@@ -43,7 +45,7 @@ Seconds: TypeAlias = Annotated[float, Between(0, unit="s", self_checked=True)]
 class Faults:
     """Each rate is the probability, from 0 to 1, that a fault strikes one frame. Set them at any time.
 
-    Raises InvalidCommand, on setting too, for a probability that is none.
+    Raises InvalidCommand, on setting too, for a value outside this range.
     """
 
     lost: Rate = 0.0
@@ -81,17 +83,17 @@ class Faults:
     flapping: Rate = 0.0
     """It goes away for up to `away_for` seconds when a request comes."""
     restart: Rate = 0.0
-    """It goes away as by `flapping`, and what was in its RAM is lost."""
+    """It goes away as by `flapping`, and the content of its RAM is lost."""
     dead: Rate = 0.0
     """Above 0: it does not receive or transmit."""
     drop: Rate = 0.0
-    """What it receives while it still has something to transmit is lost. At 0 a UART's queue keeps it."""
+    """Bytes that it receives while it still has bytes to transmit are lost. At 0 a UART's queue stores them."""
     late_by: Seconds = 0.1
     """The most seconds by which `late` delays a reply."""
     away_for: Seconds = 5.0
     """The most seconds for which `flapping` and `restart` keep it away."""
     hearing: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)
-    """The faults in use that concern what a device hears. Kept up to date by itself; so is `speaking`."""
+    """The faults in use that strike received frames. Updated automatically, like `speaking`."""
     speaking: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -1,19 +1,19 @@
-"""The wire: byte-timed, half-duplex, heard by everybody, told the time.
+"""The wire: half-duplex, with the time of each byte. All devices receive every byte. The caller passes the time.
 
-One who plays the host drives it with a few calls, in virtual or in real time:
+The host's side uses a few calls, in virtual or in real time:
 
-    line.send(data, now)      the host begins to talk (or goes on, behind what it is still sending)
-    line.next_event()         when to come back, unless something is sent before
+    line.send(data, now)      the host transmits, or continues after the bytes that it is still transmitting
+    line.next_event()         the time of the next call, unless the host sends before
     line.receive(now)         the bytes that have reached the host's port by now
     line.cut(now)             and line.restore(now)
 
-Time never runs backwards; calls that come early, or twice, do nothing.
+Time never runs backwards. Calls that are early or repeated have no effect.
 
 Theory of operation. A *talk* is a run of contiguous bytes by one talker. `_active` is the talk on the wire, or the next
-one to be; `_pending` holds those that start later. A talk that nobody disturbs stays one piece: it is heard as a whole
-when its last byte has ended, and given to the host in part before that if the host asks before. Only a talk that
-starts while another is on the wire is taken apart: both go into a `Collision` of bits, which the devices hear when all
-of it has passed. With `paced` False bytes take no time, and nothing ever overlaps.
+one; `_pending` contains those that start later. An undisturbed talk stays one piece. The devices receive it as a whole
+after its last byte. The host receives parts of it earlier if it calls `receive` earlier. If a talk starts while another
+is on the wire, both are converted to the bits of a `Collision`. The devices receive these bits after the end of the
+collision. With `paced` False bytes take no time, and talks never overlap.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ class Talk:
 class Line:
     """A line with `devices` on it. `faults` strike every frame, the host's too.
 
-    `chance` is a seeded random.Random: needed as soon as a delay or a fault is random, or talkers collide. `chunk`
-    bytes at a time reach the host (0: whole frames, as far as it does not ask before), `latency` seconds after they
-    were on the wire. `driver_release_time`: for how long the host's driver still holds the line after its last byte.
+    `chance` is a seeded random.Random: necessary if a delay or a fault is random, or if talkers collide. `chunk` bytes
+    at a time reach the host (0: whole frames, unless it calls `receive` before), `latency` seconds after they were on
+    the wire. `driver_release_time`: for how long the host's driver still holds the line after its last byte.
     `paced` False: bytes take no time.
     """
 
@@ -96,16 +96,16 @@ class Line:
         self.latency = latency
         self.driver_release_time = driver_release_time
         self.paced = paced
-        """Whether the host may rely on the baud rate (R4). Set it to False for a line behind a network: there bytes
-        take their time, and arrive at any."""
+        """Whether the host may rely on the baud rate (R4). Set it to False for a line behind a network: its bytes have
+        their duration on the wire, but can arrive at any time."""
         self.prompt = True
         """A frame's first byte is an event of its own, and so is each piece of a long one, as on a real port.
 
-        Needless if the host asks at each of its deadlines.
+        Not necessary if the host calls `receive` at each of its deadlines.
         """
         self.host: LineSettings | None = None
-        """How the host's port is set, where that is not as the line is: then neither hears the other rightly. Devices
-        pass over bytes with a wrong parity or stop bit; the host's port hands them over."""
+        """The settings of the host's port, if they differ from those of the line. Both sides then receive wrong bytes.
+        Devices drop bytes with a wrong parity or stop bit; the host's port delivers them."""
         self._piece = max(1, int(PIECE / self.tau)) if self.tau else 0
         self.collisions = 0
         """Talks that started while another was on the wire."""
@@ -123,7 +123,7 @@ class Line:
         for device in devices:
             self.add(device)
 
-    # Who is on it
+    # Devices
 
     @property
     def devices(self) -> list[Device]:
@@ -146,7 +146,7 @@ class Line:
         raise KeyError(address)
 
     def restart(self, device: Device, now: float) -> None:
-        """Fail the power of a device and bring it back at once: what was in its RAM is lost."""
+        """Switch a device off and on again: the content of its RAM is lost."""
         self._advance(now)
         self._attached.restart(device, now)
 
@@ -177,10 +177,10 @@ class Line:
         else:
             self._attached.cut_off = frozenset()
 
-    # What the host does
+    # Calls of the host
 
     def send(self, data: bytes, now: float) -> None:
-        """Have the host transmit `data`, behind what it is still transmitting."""
+        """Have the host transmit `data`, after the bytes that it is still transmitting."""
         self._advance(now)
         start = now if now > self._sent_by else self._sent_by
         if self.host is not None:
@@ -213,7 +213,7 @@ class Line:
             if self.prompt:  # in pieces: a pause as long as a long frame would look like its end
                 chunk = min(chunk or self._piece, self._piece) if talk.given else 1
             if talk.collision is not None:
-                # A stray byte that came only with the end of the host's request could be taken for its reply.
+                # If a stray byte arrived only with the end of the host's request, it would look like the reply.
                 end = min(end, self._next_byte(talk.collision, talk.given))
             elif chunk and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
@@ -254,7 +254,7 @@ class Line:
         heappush(self._pending, (talk.start, self._order, talk))
 
     def _take_back(self, talker: Device, now: float) -> None:
-        """Forget what `talker`, which restarted at `now`, has not begun to say by then."""
+        """Discard the talks of `talker`, which restarted at `now`, that have not begun by then."""
         self._pending = [entry for entry in self._pending if entry[2].talker is not talker]
         heapify(self._pending)
         talk = self._active
@@ -271,13 +271,13 @@ class Line:
             talk.collision.add(talk.start, talk.data, talk.talker, self._hold(talk))
 
     def _advance(self, now: float) -> None:
-        """Let happen, in order, all that happens up to `now`."""
+        """Process all events up to `now`, in order."""
         attached = self._attached
         while True:
             talk = self._active
             due = NEVER if talk is None else talk.end
             pending = self._pending
-            # Back to back is no overlap, though floats may say so by a hair.
+            # Talks back to back do not overlap, although rounding may make it look so.
             overlap = bool(pending) and pending[0][0] < due - self._rounding
             if overlap:
                 due = pending[0][0]
@@ -322,27 +322,27 @@ class Line:
     def _hold(self, talk: Talk) -> float:
         return self.driver_release_time if talk.talker is None else talk.talker.driver_release_time
 
-    # What the host hears of it
+    # Bytes for the host
 
     def _as_devices_hear(self, data: bytes, start: float) -> bytes:
-        """Return what is left for the devices of what a host says whose port is set otherwise, and echo it to that."""
+        """Echo `data` to a host whose port has other settings, and return the bytes that the devices receive."""
         assert self.host is not None
         if self.echo is not None:
             self._arrive(data, start + (len(data) * self.host.byte_time if self.tau else 0.0) + self.echo.delay)
         return bytes(byte for byte, whole in misheard(data, self.host, self.settings) if whole)
 
     def _heard_at_once(self, talk: Talk) -> bool:
-        """Return whether the host hears it as it comes; what is misheard is calculated as a whole."""
+        """Return True if the host receives it byte by byte. With other port settings it is calculated as a whole."""
         if self.host is not None:
             return False
         return talk.talker is not None or (self.echo is not None and not self.echo.delay and not self.echo.corrupt)
 
     def _count(self, talk: Talk, now: float) -> int:
-        """Return how many of its bytes have ended."""
+        """Return the number of its bytes that have ended."""
         return min(len(talk.data), int((now - talk.start) / self.tau + ROUNDING)) if self.tau else len(talk.data)
 
     def _give(self, talk: Talk, now: float) -> None:
-        """Let what has passed of it reach the host."""
+        """Deliver the bytes that have ended to the host."""
         if talk.collision is not None:
             data = self._host_hears(talk.collision, now)[talk.given :]
         elif self._heard_at_once(talk):
@@ -353,7 +353,7 @@ class Line:
         self._arrive(data, now)
 
     def _reach_host(self, talk: Talk) -> None:
-        """Let the rest of it reach the host."""
+        """Deliver the remaining bytes to the host."""
         if talk.collision is not None:
             self._arrive(self._host_hears(talk.collision, NEVER)[talk.given :], talk.end)
         elif talk.talker is not None:
@@ -371,7 +371,7 @@ class Line:
         return bytes(byte for _, byte in collision.heard(None, until, echo=self.echo is not None))
 
     def _next_byte(self, collision: Collision, given: int) -> float:
-        """Return when the host has heard the next byte of several talkers, whom it hears one byte at a time."""
+        """Return the time at which the host has received the next byte of a collision, one byte at a time."""
         begins = [start for start, _ in collision.heard(None, echo=self.echo is not None)]
         return begins[given] + self.tau if given < len(begins) else NEVER
 

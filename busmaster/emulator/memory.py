@@ -46,7 +46,7 @@ class MemoryPort:
 
     @property
     def paced(self) -> bool:
-        """Return whether bytes take their time on the wire."""
+        """Return True if bytes have a duration on the wire."""
         return self.line.paced
 
     def presence(self) -> None:
@@ -74,7 +74,7 @@ class MemoryTransport(asyncio.Transport):
         self._timer: asyncio.TimerHandle | None = None
         self._armed = inf
         line.prompt = True
-        line.receive(self._clock())  # what was said to nobody
+        line.receive(self._clock())  # discard the bytes from before the connection
         protocol.connection_made(self)
         self._arm(line.next_event())
 
@@ -83,7 +83,7 @@ class MemoryTransport(asyncio.Transport):
         return self._line if name == "line" else default
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Give all of `data` to the line at once, unless it is held: the line takes all, and sends it byte by byte."""
+        """Pass `data` to the line immediately, unless writes are held. The line sends it byte by byte."""
         if self._closing:
             return
         if self._held is None:
@@ -94,11 +94,11 @@ class MemoryTransport(asyncio.Transport):
         self._protocol.pause_writing()
 
     def get_write_buffer_size(self) -> int:
-        """Return how many bytes are held."""
+        """Return the number of held bytes."""
         return len(self._held or b"")
 
     async def tune(self, settings: LineSettings) -> None:
-        """Set the port to another rate and framing: what is not as the line is neither hears it nor is heard."""
+        """Set the port to another rate and framing. If they differ from the line, both sides receive wrong bytes."""
         self._line.host = None if settings == self._line.settings else settings
 
     def hold(self) -> None:

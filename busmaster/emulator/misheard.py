@@ -1,4 +1,4 @@
-"""What a UART makes of bytes that were sent at another rate, or in another framing, than it is set to.
+"""The bytes that a UART receives if they were sent at another rate or in another framing.
 
 The sender's bits are levels in time; the receiver waits for an edge, and looks at the levels in the middle of each of
 its own bits.
@@ -16,16 +16,16 @@ START = 0
 
 
 def misheard(data: bytes, sent: LineSettings, heard: LineSettings) -> Iterator[tuple[int, bool]]:
-    """Yield the bytes that one set to `heard` makes of contiguous ones sent as `sent`, and whether each is whole.
+    """Yield the bytes that a UART with the settings `heard` receives from contiguous bytes sent as `sent`.
 
-    One whose parity or stop bit is wrong is not.
+    With each byte comes True, or False if its parity or stop bit is wrong.
     """
     wave = _Wave(data, sent)
     bit = 1 / heard.baudrate
     parity = heard.parity != "N"
     began = wave.falling_edge(0.0)
     while began < wave.end:
-        if wave.level(began + bit / 2) != START:  # a spike: no start bit
+        if wave.level(began + bit / 2) != START:  # a spike, not a start bit
             began = wave.falling_edge(began + bit / 2)
             continue
         middle = began + (START_BIT + 0.5) * bit
@@ -43,23 +43,23 @@ def parity_bit(bits: list[int], parity: str) -> int:
 
 
 class _Wave:
-    """The levels of a line, from 0 to `end` seconds; it is idle before and behind."""
+    """The levels of a line, from 0 to `end` seconds; it is idle before and after."""
 
     def __init__(self, data: bytes, settings: LineSettings) -> None:
         self._parts = _levels(data, settings)
-        """Where each level ends, in seconds, and the level; no two neighbours are alike."""
+        """The end of each level, in seconds, and the level; two neighbours always differ."""
         self.end = self._parts[-1][0] if self._parts else 0.0
         self._at = 0
 
     def level(self, when: float) -> int:
-        """Return the level at a time, which is not before one that was asked for earlier."""
+        """Return the level at a time, which must not be before that of an earlier call."""
         parts = self._parts
         while self._at < len(parts) and parts[self._at][0] <= when:
             self._at += 1
         return parts[self._at][1] if self._at < len(parts) else IDLE
 
     def falling_edge(self, after: float) -> float:
-        """Return when the line next goes from idle to the level of a start bit, infinity if it does not."""
+        """Return the time of the next change from idle to the level of a start bit; infinity if there is none."""
         before = IDLE if not after else self.level(after)
         while self._at < len(self._parts):
             level = self._parts[self._at][1]

@@ -1,4 +1,4 @@
-"""Small motion models, told the time, so that positions move and speeds follow. Exact at any step.
+"""Small motion models for positions and speeds. The caller passes the time; the result is exact at any step.
 
 Units are the caller's: positions in counts or user units, speeds in those per second.
 """
@@ -26,7 +26,7 @@ class Ramp:
     now: float = NEVER
 
     def advance(self, now: float) -> None:
-        """Go on to `now`; never back."""
+        """Advance to `now`. An earlier time has no effect."""
         if self.now == NEVER:
             self.now = now
         left = now - self.now
@@ -76,7 +76,7 @@ class Axis:
         self._run(Motion.FOLLOW, speed, now)
 
     def stop(self, now: float) -> None:
-        """Stop at once, where it is at `now`: IDLE."""
+        """Stop immediately at the position of `now`: IDLE."""
         self.position(now)
         self._arrives = NEVER
         self._ramp.speed = self._ramp.target = 0.0
@@ -103,7 +103,7 @@ class Axis:
         self.motion = Motion.SWING
 
     def position(self, now: float) -> float:
-        """Return where it is at `now`."""
+        """Return the position at `now`."""
         ramp = self._ramp
         if self.motion is Motion.SWING:
             amplitude, omega, phase = self._swing
@@ -127,7 +127,7 @@ class Axis:
         return self._ramp.speed
 
     def idle(self, now: float) -> bool:
-        """Return whether it is in position: IDLE."""
+        """Return True if it is in position: IDLE."""
         self.position(now)
         return self.motion is Motion.IDLE
 

@@ -1,7 +1,7 @@
-"""What the other end of a pseudo-terminal is set to, as far as the kernel tells it.
+"""The settings of the other end of a pseudo-terminal, as far as the kernel reports them.
 
-It tells the rate, and whether odd parity is meant. Data bits and whether there is a parity at all it takes out of the
-settings of every pseudo-terminal: these are taken to be the line's.
+The kernel reports the rate and the flag for odd parity. It removes the data bits and the flag that enables parity from
+the settings of every pseudo-terminal, so they are assumed to be those of the line.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import replace
 from busmaster.contract.profile import LineSettings
 
 GET, SET = 0x802C542A, 0x402C542B
-"""TCGETS2 and TCSETS2, as most of Linux' machines number them: they tell any rate, termios the usual ones alone."""
+"""TCGETS2 and TCSETS2, as on most architectures of Linux. They support any rate, termios only the usual ones."""
 TERMIOS2 = struct.Struct("4I20s2I")
 CONTROL, RATES = 2, slice(5, 7)
-"""Of TERMIOS2: the control flags, and the rates of hearing and of saying."""
+"""Fields of TERMIOS2: the control flags, and the rates for input and output."""
 OTHER_RATE = 0o10000
-"""BOTHER: the rates are as they stand, not one of the codes."""
+"""BOTHER: the rates are numbers, not codes."""
 
 
 def words(descriptor: int) -> bytes:
-    """Return how a terminal is set, to be compared; nothing where the kernel does not tell it."""
+    """Return the settings of a terminal, for comparison; empty if the kernel does not report them."""
     try:
         return fcntl.ioctl(descriptor, GET, bytes(TERMIOS2.size))
     except OSError:
@@ -32,7 +32,7 @@ def words(descriptor: int) -> bytes:
 
 
 def set_rate(descriptor: int, baudrate: int) -> None:
-    """Set a terminal's rate, where the kernel lets it be set."""
+    """Set a terminal's rate, if the kernel permits it."""
     with contextlib.suppress(OSError):
         said = list(TERMIOS2.unpack(words(descriptor) or bytes(TERMIOS2.size)))
         said[CONTROL] = said[CONTROL] & ~termios.CBAUD | OTHER_RATE
@@ -41,7 +41,7 @@ def set_rate(descriptor: int, baudrate: int) -> None:
 
 
 def differing(terminal: bytes, line: LineSettings) -> LineSettings | None:
-    """Return how a terminal with these words is set, None where that is as the line is, or nobody knows."""
+    """Return the settings of a terminal with these words; None if they are those of the line, or unknown."""
     if len(terminal) != TERMIOS2.size:
         return None
     said = TERMIOS2.unpack(terminal)

@@ -93,11 +93,11 @@ class LineServer(ABC):
 
     @abstractmethod
     def _read(self, source: int) -> bytes:
-        """Return what the host says there."""
+        """Return the bytes that the host sent there."""
 
     @abstractmethod
     def _deliver(self, data: bytes) -> None:
-        """Hand `data` to the host, without waiting."""
+        """Pass `data` to the host, without waiting."""
 
     @abstractmethod
     def _shut(self) -> None: ...
@@ -110,7 +110,7 @@ class LineServer(ABC):
             self._error = error
         finally:
             self._shut()
-            self._closing = True  # before the queue is emptied: who puts later must see it
+            self._closing = True  # before the queue is emptied: a later put must see it
             while not self._actions.empty():
                 self._actions.get()[1].set_exception(RuntimeError(f"{self.path} is no longer served"))
 
@@ -147,10 +147,10 @@ class LineServer(ABC):
 class PtyServer(LineServer):
     """A line on a pseudo-terminal. `path` is `link` if given, else the terminal's own.
 
-    The terminal is raw and is held open, so that clients may come and go. It is set to the line's rate; a client that
-    sets another hears, and is heard, as by a UART. The first bytes at each other rate are reported once: `report` is
-    called with a text, in the server's thread; by default it is logged. Raises FileExistsError if `link` is there and
-    is no symbolic link.
+    The terminal is raw and stays open, so that clients can connect and disconnect. It has the line's rate. If a client
+    sets another rate, both sides receive wrong bytes, as from a UART. The first bytes at each other rate are reported
+    once: `report` is called with a text, in the server's thread; by default the text is logged. Raises FileExistsError
+    if `link` exists and is not a symbolic link.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class PtyServer(LineServer):
 
     def _read(self, source: int) -> bytes:
         terminal = port_settings.words(self._master)
-        if terminal != self._terminal:  # whoever says this has set it
+        if terminal != self._terminal:  # the client that sent these bytes has changed it
             self._terminal = terminal
             self.line.host = port_settings.differing(terminal, self.line.settings)
         try:

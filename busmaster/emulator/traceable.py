@@ -1,7 +1,7 @@
-"""Values that give themselves away: each encodes its node, its element and how often that element was written.
+"""Values that show their origin: each encodes its node, its element and how often that element was written.
 
-A campaign reads such a value and knows whose it is, so that a wrong one is recognised whatever its cause. It writes
-such values too: a device counts the writes that it took and those that were never meant for it.
+A campaign that reads such a value knows its origin, so that it recognises a wrong value regardless of the cause. It
+writes such values too: a device counts the writes that it accepted, and those that were meant for another device.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ SPREAD = 10_007
 
 
 def traceable_value(node: int, element: int, writes: int, modulus: int = 10**12) -> int:
-    """Return a value, 0 to modulus - 1, by who is asked (`node`), for what (`element`), and after how many writes.
+    """Return a value, 0 to modulus - 1, from the node, the element and the number of its writes.
 
-    `modulus` is how many values the protocol can carry: 10**12 for HCP and HCP2 (exact as text), 2**31 for MSC,
+    `modulus`: number of values that the protocol can transfer: 10**12 for HCP and HCP2 (exact as text), 2**31 for MSC,
     10**4 for Mentor II, 2**16 for DC104.
     """
     return (((node << 16) + element) * SPREAD + writes) % modulus
@@ -29,14 +29,14 @@ class TraceableMemory:
         self.modulus = modulus
         self.writes: defaultdict[int, int] = defaultdict(int)
         self.foreign_writes = 0
-        """Writes taken whose value was meant for another node or element, or was garbled unnoticed."""
+        """Accepted writes whose value was meant for another node or element, or was corrupted without detection."""
 
     def read(self, element: int) -> int:
         """Return the value of an element after the writes to it so far."""
         return traceable_value(self.node, element, self.writes[element], self.modulus)
 
     def elsewhere(self) -> int:
-        """Return a value of another node: what a reply carries that answers for somebody else."""
+        """Return a value of another node, for a reply with a wrong origin."""
         return traceable_value(self.node + 1, 0, 0, self.modulus)
 
     def write(self, element: int, value: float, slack: int = 64) -> None:

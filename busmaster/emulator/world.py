@@ -52,7 +52,7 @@ class World:
         tap: Tap | None = None,
     ) -> None:
         self.line = line
-        line.prompt = False  # a world asks at each of its deadlines
+        line.prompt = False  # a world calls `receive` at each of its deadlines
         self.now = now
         self.plugged = False
         self.arbiter = Arbiter(
@@ -73,12 +73,12 @@ class World:
         self._order = count()
         self.plug()
 
-    # What is done to it
+    # Requests and actions
 
     def node(
         self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> NodeRecord:
-        """Make the arbiter know a node. Call it once for each."""
+        """Add a node to the arbiter. Call it once per node."""
         return self.arbiter.add_node(profile, address, self.now, timings, retries)
 
     def request(
@@ -90,7 +90,7 @@ class World:
         return transaction
 
     def at(self, when: float, action: Callable[[], object]) -> None:
-        """Call `action` at that time, after what the line and the arbiter have to do then."""
+        """Call `action` at that time, after the events of the line and the arbiter at that time."""
         # Of two at one time the first goes first; the functions themselves have no order.
         heapq.heappush(self._actions, (max(when, self.now), next(self._order), action))
 
@@ -102,12 +102,12 @@ class World:
             self.arbiter.line_up(self.now, paced=self.line.paced)
 
     def unplug(self, cause: str = "unplugged") -> None:
-        """Take the port away, and lose what the line has for the host until it is back."""
+        """Remove the port. Bytes from the line are lost until it returns."""
         if self.plugged:
             self.plugged = False
             self.arbiter.line_down(cause, self.now)
 
-    # How it goes on
+    # Time
 
     def run(self, until: float) -> None:
         """Run to that time."""
@@ -133,7 +133,7 @@ class World:
         self.now = max(self.now, until)
 
     def run_until(self, done: Callable[[], bool], limit: float) -> bool:
-        """Run until `done()` holds, at most `limit` seconds on. Returns whether it came to hold."""
+        """Run until `done()` is true, at most `limit` seconds. Returns True if it became true."""
         end = self.now + limit
         while not done():
             self._pump()
@@ -159,7 +159,7 @@ class World:
             self._pump()
 
     def _hear(self, data: bytes) -> None:
-        """Hand the arbiter what came off the line."""
+        """Pass the bytes from the line to the arbiter."""
         if self.plugged:
             if self._record is not None:
                 self._record(f"{self.now:.6f} < {data.hex(' ')}")
@@ -169,7 +169,7 @@ class World:
             self._pump()
 
     def _say(self, data: bytes) -> None:
-        """Put on the line what the arbiter says."""
+        """Send the arbiter's bytes on the line."""
         if self._record is not None:
             self._record(f"{self.now:.6f} > {data.hex(' ')}")
         if self.plugged:
@@ -178,7 +178,7 @@ class World:
                 self.tap.transmitted(self.now, data, self.arbiter.attempt)
 
     def _pump(self) -> None:
-        """Put on the line what the arbiter says, and tell its events to whom they concern."""
+        """Send the arbiter's bytes on the line, and report its events."""
         arbiter = self.arbiter
         while True:
             data = arbiter.poll_transmit()
@@ -200,7 +200,7 @@ class World:
 
 
 def told(event: Event) -> str:
-    """Return an event in a line of text, the same on every run."""
+    """Return an event as one line of text, the same on every run."""
     match event:
         case Transaction():
             outcome = event.value if event.error is None else repr(event.error)
