@@ -52,7 +52,7 @@ def differing(terminal: bytes, line: LineSettings) -> LineSettings | None:
 
 
 def mismatch_text(port: LineSettings, line: LineSettings) -> str:
-    """Return what is wrong with a port that is set otherwise than the line, as a sentence for the user."""
+    """Return a sentence for the user about a port whose settings differ from those of the line."""
     if port.baudrate != line.baudrate:
         what, wanted = f"{port.baudrate} baud", f"{line.baudrate} baud"
     else:

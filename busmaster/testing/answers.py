@@ -1,4 +1,4 @@
-"""Whether an exchange says rightly what its good replies begin with: on that rests what is believed (R15)."""
+"""Checks that an exchange declares the beginnings of its good replies correctly. R15 depends on them."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ from busmaster.contract.exchange import Exchange
 
 
 def check_good_reply(exchange: Exchange[Any], turns: Sequence[Sequence[bytes]]) -> Iterator[str]:
-    """Say what does not hold of a fresh exchange whose good reply is the steps of these turns.
+    """Yield the faults of a fresh exchange whose good reply is the steps of these turns.
 
-    A turn is what the node says without a word of the host between. What decides comes last, and begins with one of
-    `answers`, or is it where that is one byte; each of `answers` is met with; all of the first turn is `overdue`.
+    A turn is the steps that the node sends without a byte of the host in between. The last step decides. It begins with
+    one of `answers`, or is equal to it if that is one byte. Each of `answers` occurs. All of the first turn is
+    `overdue`.
     """
     steps = [step for turn in turns for step in turn]
     answers = tuple(exchange.answers)
     if steps and not _begins(steps[-1], answers):
-        yield f"the good reply {steps[-1].hex(' ')} begins with none of its answers {_hex(answers)}"
+        yield f"the good reply {steps[-1].hex(' ')} does not begin with one of its `answers` {_hex(answers)}"
     for key in answers:
         if not any(_begins(step, (key,)) for step in steps):
-            yield f"no step of its good reply begins with its answer {key.hex(' ')}"
+            yield f"no step of its good reply begins with {key.hex(' ')} of its `answers`"
     for step in turns[0] if turns else ():
         if not _begins(step, exchange.overdue):
-            yield f"while nothing was heard yet, {step.hex(' ')} may come and is not overdue: {_hex(exchange.overdue)}"
+            yield f"before the first byte, {step.hex(' ')} can arrive and is not in `overdue`: {_hex(exchange.overdue)}"
 
 
 def check_exchangeable(asked: Exchange[Any], other: Exchange[Any]) -> str:
-    """Say what does not hold where `asked` takes the reply to `other`: what that owes is an answer to this. Else ''."""
+    """Return the fault if `asked` accepts the reply to `other`, but they have no common key; else ''."""
     may_come = {*other.answers, *other.overdue}
     if may_come & set(asked.answers):
         return ""
-    what = f"has the answers {_hex(asked.answers)}, and none that is overdue by another: {_hex(sorted(may_come))}"
+    what = f"has the `answers` {_hex(asked.answers)}, none of them a key of the other command: {_hex(sorted(may_come))}"
     if any(one.startswith(key) or key.startswith(one) for one in may_come for key in asked.answers):
-        what += " (one that only begins like another is another: give both the same)"
+        what += " (a key that only begins like another differs from it: use the same for both)"
     return what
 
 

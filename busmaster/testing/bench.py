@@ -66,12 +66,12 @@ Application = Callable[[Bus, "Stopwatch"], Awaitable[object]]
 
 @dataclass(frozen=True, slots=True)
 class Workload:
-    """What is requested of a line, and for how long. Times are in seconds. Raises InvalidCommand for what cannot be.
+    """The load on a line, and its duration. Times are in seconds. Raises InvalidCommand for invalid values.
 
-    `callers` read one after another, as fast as they get their values; None is one for each node, 0 none. With `every`,
-    each reads once in so many seconds, on a fixed grid. `priorities` are the classes of the reads, and how often each
-    is drawn. With `period`, a poll group reads one value of each node beside them. `items` are what is read; without
-    them the probe and the sync reads of the protocol, which harm no node.
+    Each of the `callers` reads again as soon as it has its value; None: one per node; 0: none. With `every`, each reads
+    once per this many seconds, on a fixed grid. `priorities`: the classes of the reads, and their shares. With
+    `period`, a poll group reads one value of each node in addition. `items`: the items to read; by default the probe
+    and the sync reads of the protocol, which harm no node.
     """
 
     seconds: float = 10.0
@@ -175,18 +175,18 @@ class Measurement:
 
     @property
     def begun(self) -> bool:
-        """Return whether anything was measured: the bus is open, and each node was read once."""
+        """Return True if the measurement has begun: the bus is open, and each node was read once."""
         return self._begun is not None
 
     # measuring
 
     async def run(self) -> None:
-        """Open the bus, measure for as long as the workload says, and close it. Raises LineDown if it cannot open."""
+        """Open the bus, measure for the duration of the workload, and close it. Raises LineDown if it cannot open."""
         async with self.bus:
             await self.run_open()
 
     async def run_open(self) -> None:
-        """Measure on a bus that is open."""
+        """Measure on an open bus."""
         await self._warm_up()
         ext.add_tap(self.bus, self._wire)
         self._begun = begun = self.bus.now()
@@ -227,15 +227,15 @@ class Measurement:
                 except Refused:
                     refused.append(read)
                 except BusError:
-                    break  # a node that is not there costs one read
+                    break  # a missing node costs one read
             if not self._known_reads and 0 < len(refused) < len(reads):
                 self._reads[handle] = [read for read in reads if read not in refused]
 
     def _callers(self, begun: float) -> Iterator[tuple[int, Sequence[Handle], float]]:
         """Yield each caller's number, its nodes, and when it begins.
 
-        Callers are spread over the nodes, or nodes over the callers; callers with a period begin spread over it, since
-        those of an application are not in step either.
+        Callers are spread over the nodes, or nodes over the callers; callers with a period begin spread over it, like
+        those of an application.
         """
         handles = list(self._reads)
         callers = len(handles) if self.workload.callers is None else self.workload.callers
@@ -308,10 +308,10 @@ class Measurement:
     async def _apply(self, application: Application) -> None:
         await application(self.bus, Stopwatch(self))
 
-    # what was measured
+    # the report
 
     def report(self) -> BenchReport:
-        """Return what was measured so far."""
+        """Return the results so far."""
         begun = self.bus.now() if self._begun is None else self._begun
         elapsed = (self.bus.now() if self._ended is None else self._ended) - begun
         kinds = [priority.name.lower() for priority in Priority if self.workload.priorities.get(priority)]
@@ -464,11 +464,12 @@ def bench(
 ) -> BenchReport:
     """Measure an emulated line of devices of one protocol, and return the report.
 
-    `baud` is the protocol's by default, `delay` the reply delay of the devices (2 ms), `faults` texts such as
-    "lost=0.1", and `workload` the arguments of `Workload`; `priorities` may be a text such as "command=8,urgent=1". The
-    line is on a pseudo-terminal, in a process of its own, and the measured loop is this thread's; with `virtual` it is
-    in virtual time, where the same arguments give the same report, on any machine. `application` runs beside the
-    callers, and may time its own calls: see `Stopwatch`. Raises InvalidCommand for what cannot be.
+    `baud`: by default that of the protocol. `delay`: reply delay of the devices (2 ms). `faults`: texts such as
+    "lost=0.1". `workload`: the arguments of `Workload`; `priorities` can be a text such as "command=8,urgent=1".
+
+    The line is on a pseudo-terminal, in a process of its own. The loop of this thread is measured. With `virtual` it is
+    in virtual time: the same arguments give the same report, on any machine. `application` runs beside the callers, and
+    can time its own calls: see `Stopwatch`. Raises InvalidCommand for invalid values.
     """
     if isinstance(workload.get("priorities"), str):
         workload["priorities"] = parse_priorities(workload["priorities"])
@@ -533,7 +534,7 @@ def emulated(
 
 
 def about(bus: Bus, protocol: str, port: str) -> dict[str, Any]:
-    """Return what a report says of the line."""
+    """Return the fields of a report about the line."""
     settings = bus.endpoint.settings
     return {
         "protocol": protocol,

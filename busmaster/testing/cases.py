@@ -17,7 +17,7 @@ class Case:
     """One exchange from the protocol's document.
 
     `steps`: the node's transmissions, one item per step: one for most protocols; in MSC the ACK and the packet; none
-    for a broadcast. A node that must be asked again (a NAK that the reader answers itself) transmits one step each
+    for a broadcast. If the reader repeats a request itself (after a NAK), the node transmits one step each
     time. The exchange ends with `value`, or `raises` Refused or its subclass. `request`: the bytes that must be sent,
     if they are to be checked.
     """

@@ -1,4 +1,4 @@
-"""What a command must be, whatever it asks: a value that stays what it is, and sends the same bytes every time."""
+"""Checks of a command: it must be an immutable value that sends the same bytes every time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OTHER_TIMINGS = Timings(
 
 
 def check_command(command: Command[Any], address: int, timings: Timings) -> Iterator[str]:
-    """Say what does not hold of a command, one sentence each."""
+    """Yield the faults of a command, one sentence each."""
     if not str(command) or str(command) == object.__repr__(command):
         yield f"{command!r} has no text: write __str__, as in 'read element 100'"
     twin = copy.deepcopy(command)
@@ -43,7 +43,7 @@ def check_command(command: Command[Any], address: int, timings: Timings) -> Iter
         yield f"{command!r} sends {first.request.hex(' ')!r}, and then {second.request.hex(' ')!r}"
     own = replace(command.open(address, OTHER_TIMINGS).timing, driver_release_time=0.0)
     if own not in (OTHER_TIMINGS.read, OTHER_TIMINGS.write):
-        yield f"{command!r} does not take the read or write timing that its node has"
+        yield f"{command!r} does not use the read or write timing of its node"
     yield from _check_announcements(command, first)
 
 
@@ -72,26 +72,26 @@ def _check_announcements(command: Command[Any], exchange: Exchange[Any]) -> Iter
         if not 0 <= sizes.typical <= sizes.longest:
             yield f"{command!r} announces a reply of typically {sizes.typical} and at most {sizes.longest} bytes"
     if not exchange.answered and not command.writes:
-        yield f"{command!r} is a read that is not answered"
+        yield f"{command!r} is a read without a reply"
     yield from _check_keys(command, exchange)
 
 
 def _check_keys(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]:
-    """Say what is wrong with the keys by which replies are compared and remembered.
+    """Yield the faults of the keys by which replies are compared and stored.
 
-    They are a tuple, and no key is empty, for that fits every byte.
+    They must be a tuple, without empty keys, because an empty key matches every byte.
     """
     for name in ("answers", "overdue"):
         keys: object = getattr(exchange, name, None)
         if not isinstance(keys, tuple) or not all(isinstance(key, bytes) and key for key in keys):
-            yield f"{command!r}: {name} is a tuple of what its replies begin with, not {keys!r}"
+            yield f"{command!r}: {name} must be a tuple of the beginnings of its replies, not {keys!r}"
         elif bool(keys) is not exchange.answered:
-            why = "is answered, and does not say by what" if exchange.answered else "is not answered, and says by what"
+            why = "has a reply, but no keys" if exchange.answered else "has no reply, but keys"
             yield f"{command!r} {why}: {name} is {keys!r}"
 
 
 def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
-    """Say which of `builders` does not raise InvalidCommand."""
+    """Yield a finding for each of `builders` that does not raise InvalidCommand."""
     for number, build in enumerate(builders):
         try:
             built = build()
@@ -104,20 +104,20 @@ def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
 
 
 def check_checks(profile: Profile) -> Iterator[str]:
-    """Say which of the checks write, or have answers that could be taken for each other."""
+    """Yield a finding for each sync read that writes, or whose reply could be confused with that of another."""
     seen: dict[bytes, Command[Any]] = {}
     for check in profile.sync_reads:
         if check.writes:
-            yield f"the check {check!r} writes"
+            yield f"the sync read {check!r} writes"
             continue
         for key in check.open(profile.addresses[0], profile.timings).answers:
             if key in seen:
-                yield f"the checks {seen[key]!r} and {check!r} have answers that begin alike: {key.hex(' ')}"
+                yield f"the sync reads {seen[key]!r} and {check!r} have replies with the same beginning: {key.hex(' ')}"
             seen[key] = check
 
 
 def check_addresses(profile: Profile) -> Iterator[str]:
-    """Say which addresses are sent the same request, and whether the probe writes."""
+    """Yield a finding for each two addresses with the same request, and if the probe writes."""
     probe = profile.probe
     if probe.writes:
         yield f"the probe {probe!r} writes"
@@ -126,7 +126,7 @@ def check_addresses(profile: Profile) -> Iterator[str]:
         for address in profile.addresses:
             request = probe.open(address, profile.timings).request
             if request in asked:
-                yield f"addresses {asked[request]} and {address} are sent the same {request.hex(' ')}"
+                yield f"addresses {asked[request]} and {address} have the same request {request.hex(' ')}"
             asked[request] = address
     yield from check_invalid(
         partial(profile.check_address, address)
@@ -136,15 +136,15 @@ def check_addresses(profile: Profile) -> Iterator[str]:
 
 
 def check_places(write: Command[Any], read: Command[Any], value: Any, profile: Profile) -> Iterator[str]:
-    """Say whether a write names other places than a read of the same, or another value: no limit would hold it.
+    """Yield a finding if a write declares other places or another value than the matching read returns.
 
-    Of commands that name none nothing is said: where a node has limits they are refused.
+    Limits would then not apply to the write. Commands without places are not checked: a node with limits rejects them.
     """
     if not isinstance(write, Changing) or not isinstance(read, Placed):
         return
     changes = write.changes(profile)
     missing = [place for place in read.places if place not in changes]
     if missing:
-        yield f"{write} does not say that it changes {missing}, which {read} reads"
+        yield f"{write} does not declare a change of {missing}, which {read} reads"
     elif all(changes[place] is not None for place in read.places) and read.shown(changes) != value:
-        yield f"{write} says that it changes what {read} reads to {read.shown(changes)!r}, which is {value!r} then"
+        yield f"{write} declares {read.shown(changes)!r} as the new value, but {read} returns {value!r}"

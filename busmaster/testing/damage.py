@@ -1,4 +1,4 @@
-"""What a line makes of a reply: chunks, flipped bits, noise."""
+"""Damage to a reply on the line: chunks, flipped bits, noise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from itertools import combinations, pairwise
 from random import Random
 
-FEW_BYTES = 10  # so many are cut in all ways, 511 at most
+FEW_BYTES = 10  # up to this length all splits are tried, 511 at most
 MANY_BYTES = 64
 
 
@@ -16,7 +16,7 @@ def bytewise(data: bytes) -> list[bytes]:
 
 
 def splits(data: bytes) -> Iterator[list[bytes]]:
-    """Yield ways to cut `data` into chunks: all for a few bytes; else into two, or three if there are not many.
+    """Yield ways to split `data` into chunks: all for a few bytes; else into two, or three if it is not long.
 
     One of them is one byte at a time.
     """

@@ -1,15 +1,19 @@
-"""The conformance kit for a protocol's listener: whether it reads off the line what was said on it.
+"""The conformance kit for a protocol's listener: it checks that the listener decodes the conversation on the line.
 
-    def test_the_dialect_reads_what_is_said():
+    def test_the_dialect_decodes_the_conversation():
         check_dialect(PROTOCOL, CASES)
 
-It takes the cases of `check_protocol`. Of each it derives, and raises `NotConformant` with all that does not hold:
+It uses the cases of `check_protocol`. For each case it checks the following, and raises `NotConformant` with all
+faults.
 
-- what the host and the node say is cut into the same frames in one chunk, one byte at a time, and with noise before it;
-- the request is a read or a write of that node without a fault, and speaks the command that sent it: what the dialect
-  makes of it sends the same bytes;
-- what decides is an answer: a value, or an acknowledgement; a refusal where the case raises one;
-- the command can be written down as JSON and read back.
+- The bytes of host and node are split into the same frames in one chunk, one byte at a time, and with noise before.
+
+- The request is a read or a write of that node without a fault. The command that the dialect makes from it sends the
+  same bytes.
+
+- The last step is the reply: a value, an acknowledgement, or a refusal if the case raises one.
+
+- The command can be converted to JSON and back.
 """
 
 from __future__ import annotations
@@ -34,7 +38,7 @@ NOISE = b"\xff\xff"
 
 
 def check_dialect(protocol: Protocol, cases: Iterable[Case]) -> None:
-    """Raise NotConformant, with all that does not hold of the protocol's dialect and of its written commands."""
+    """Raise NotConformant, with all faults of the protocol's dialect and of its commands in JSON."""
     findings = [f"{case}: {finding}" for case in cases for finding in _check(protocol, case)]
     if findings:
         raise NotConformant(protocol.name, findings)
@@ -45,9 +49,9 @@ def _check(protocol: Protocol, case: Case) -> Iterator[str]:
     frames = _hear(protocol, said)
     pieces = [(sender, byte) for sender, data in said for byte in bytewise(data)]
     if (found := _hear(protocol, pieces)) != frames:
-        yield f"one byte at a time it is {_told(found)} in place of {_told(frames)}"
+        yield f"one byte at a time it is {_told(found)} instead of {_told(frames)}"
     if (found := _hear(protocol, said, NOISE)) != frames:
-        yield f"behind noise it is {_told(found)} in place of {_told(frames)}"
+        yield f"after noise it is {_told(found)} instead of {_told(frames)}"
     yield from _check_request(protocol, case, frames)
     if case.steps:
         yield from _check_answer(case, frames)
@@ -55,7 +59,7 @@ def _check(protocol: Protocol, case: Case) -> Iterator[str]:
 
 
 def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
-    """Yield what both sides say, the host's closing word too."""
+    """Yield the bytes of both sides, including the closing byte of the host."""
     driver = Driver(case.command.open(case.address, protocol.profile.timings))
     yield Direction.HOST, driver.exchange.request
     heard = 0
@@ -70,7 +74,7 @@ def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
 
 
 def _hear(protocol: Protocol, said: Iterable[Said], noise: bytes = b"") -> list[Frame]:
-    """Return the frames without their times; noise before them is left out."""
+    """Return the frames without their times, and without noise before them."""
     decoder = Decoder(protocol.dialect())
     frames = decoder.feed(noise, 0.0) if noise else []
     for sender, data in said:
@@ -87,39 +91,39 @@ def _check_request(protocol: Protocol, case: Case, frames: Sequence[Frame]) -> I
     request = frames[0]
     wanted = Kind.WRITE if case.command.writes else Kind.READ
     if request.raw != asked or request.kind is not wanted or request.sender is not Direction.HOST or request.fault:
-        yield f"its request {asked.hex(' ')} is {_told(frames[:1])}, no {wanted.value} of the host's"
+        yield f"its request {asked.hex(' ')} is {_told(frames[:1])}, not a {wanted.value} of the host"
         return
     if profile.addressed and request.node != case.address:
-        yield f"its request is one to {request.node}"
+        yield f"its request is decoded as one to {request.node}"
     continued = [frame for frame in frames[1:] if frame.sender is Direction.HOST and frame.continues]
     try:
         command = protocol.dialect().command(request, continued)
         again = command.open(case.address, profile.timings).request
     except (InvalidCommand, ValueError, KeyError) as error:
-        yield f"no command speaks its request {_told(frames[:1])}: {error}"
+        yield f"its request {_told(frames[:1])} gives no command: {error}"
         return
     if again != asked or (continued and str(command) != str(case.command)):
-        yield f"its request is read as {command}, which sends {again.hex(' ')} in place of {asked.hex(' ')}"
+        yield f"its request is decoded as {command}, which sends {again.hex(' ')} instead of {asked.hex(' ')}"
 
 
 def _check_answer(case: Case, frames: Sequence[Frame]) -> Iterator[str]:
     answers = [frame for frame in frames if frame.sender is Direction.NODE]
     if not answers or not answers[-1].answers or answers[-1].fault:
-        yield f"its reply is {_told(answers[-1:])}, no answer to it"
+        yield f"its reply is {_told(answers[-1:])}, which does not end the request"
         return
     refused = answers[-1].kind in (Kind.NAK, Kind.EOT)
     if refused is not (case.raises is not None):
-        yield f"its reply is {_told(answers[-1:])}, {'a refusal' if refused else 'no refusal'}"
+        yield f"its reply is {_told(answers[-1:])}, {'a refusal' if refused else 'not a refusal'}"
 
 
 def _check_written(protocol: Protocol, command: Command[Any]) -> Iterator[str]:
     try:
         back = protocol.read_back(json.loads(json.dumps(protocol.write_down(command))))
     except (InvalidCommand, TypeError, ValueError) as error:
-        yield f"it cannot be written down and read back: {error}"
+        yield f"it cannot be converted to JSON and back: {error}"
         return
     if back != command:
-        yield f"it is written down, and read back as {back!r}"
+        yield f"it is converted to JSON, and back to {back!r}"
 
 
 def _told(frames: Sequence[Frame]) -> str:

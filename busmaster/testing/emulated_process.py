@@ -31,7 +31,7 @@ class EmulatedLine:
     """An emulated line of devices of one protocol, as plain values.
 
     `delay` is in seconds, lower and upper bound, before each reply, also within an exchange of several steps. `faults`
-    are texts such as "lost=0.1", of every device; what is random comes from `seed`. Bytes take their time.
+    are texts such as "lost=0.1", for every device. `seed`: for random delays and faults. Bytes have a duration.
     """
 
     protocol: str
@@ -97,7 +97,7 @@ def from_json(text: str) -> EmulatedLine:
 def main() -> None:
     """Serve the line of the first argument until standard input ends."""
     with serve_pty(from_json(sys.argv[1]).line()) as server:
-        print(server.path, flush=True)  # noqa: T201  its standard output is how it says so
+        print(server.path, flush=True)  # noqa: T201  the parent process reads the path here
         while os.read(sys.stdin.fileno(), 1):
             pass
 

@@ -101,16 +101,16 @@ class BudgetExceeded(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What was measured on one line. All times are in seconds.
+    """The results for one line. All times are in seconds.
 
-    A latency is the time from when a read was due, or called, to when the caller has its value, as an application
-    sees it. Reads that failed are in `errors` alone.
+    A latency is the time from the due time or the call of a read until its caller has the value. Failed reads are only
+    in `errors`.
     """
 
     line: Mapping[str, Any]
     """Protocol, port, baud rate and framing."""
     workload: Mapping[str, Any]
-    """What was requested of the line: see `Workload`."""
+    """The load on the line: see `Workload`."""
     elapsed: float
     values: int
     """Exchanges that brought a value to a caller or to the poll group."""
@@ -155,7 +155,7 @@ class BenchReport:
         return [text for budget in parsed for text in self._excess(budget, before)]
 
     def check(self, *budgets: Budget | str, before: BenchReport | None = None) -> None:
-        """Raise BudgetExceeded, with what was measured, if one is exceeded: `report.check("p99=20", "errors=0")`."""
+        """Raise BudgetExceeded, with the measured figure, if one is exceeded: `report.check("p99=20", "errors=0")`."""
         texts = self.exceeded(budgets, before=before)
         if texts:
             raise BudgetExceeded("; ".join(texts))
@@ -210,7 +210,7 @@ class BenchReport:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> BenchReport:
-        """Return the report that a JSON text holds. Raises InvalidCommand for a text that is no report."""
+        """Return the report in a JSON text. Raises InvalidCommand for a text that is not a report."""
         try:
             fields = json.loads(text)
             if fields["layout"] != LAYOUT:

@@ -1,4 +1,4 @@
-"""The conformance kit for a protocol: it runs over those that are here, and over one that you add.
+"""The conformance kit for a protocol: for those of busmaster, and for one that you add.
 
     def test_modbus_keeps_the_contract():
         check_protocol(
@@ -12,22 +12,31 @@
             invalid=[lambda: ReadRegister(70000)],
         )
 
-A few cases say what the manual says: a command, the node, what that node answers, and the value. From them the kit
-derives what the arbiter relies on (`busmaster.contract.exchange`), and raises `NotConformant` with all that does not
-hold:
+A few cases describe the content of the manual: a command, the node, its reply, and the value. From them the kit
+derives the properties on which the arbiter relies (`busmaster.contract.exchange`). It raises `NotConformant` with all
+faults.
 
-- every split of every reply gives what one chunk gives (of longer replies: into two, into three, and one byte at a
-  time); what is cut short is MORE, and an error when time runs out;
-- no single-bit flip of a reply is accepted, but for those that `unseen` lists with a reason;
-- no reply to another case is accepted, unless `names` says that replies cannot tell the two apart; no `foreign` one;
-- any bytes at all end in a value, FrameError or Refused, and every exchange has an end; the profile's listener, if it
-  has one, takes any bytes too;
-- what follows a reply is handed back; sizes, steps, starts and closing bytes are as announced;
-- so are `answers` and `overdue` (R15): good replies begin so, and commands whose good replies could be exchanged share
-  one; the profile's `checks` are reads, and share none;
-- commands are immutable, hashable values with a text; bad arguments raise InvalidCommand (`invalid`);
-- every attempt sends the same bytes, and no two addresses do;
-- what is written to an emulated `device` is read back (`round_trips`), and as what the write says that it changes.
+- Every split of a reply gives the same result as one chunk. Longer replies are split into two, into three, and into
+  single bytes. An incomplete reply is MORE, and an error when the time is over.
+
+- No single-bit flip of a reply is accepted, except those that `unseen` lists with a reason.
+
+- No reply to another case is accepted, unless `names` is equal for both, because replies do not distinguish them. No
+  `foreign` reply is accepted.
+
+- Any bytes end in a value, FrameError or Refused, and every exchange has an end. The listener of the profile, if there
+  is one, accepts any bytes too.
+
+- Bytes after a reply are returned. Sizes, steps, starts and closing bytes are as declared.
+
+- `answers` and `overdue` are as declared (R15). Good replies begin with them. Commands whose good replies could be
+  confused share a key. The profile's `sync_reads` are reads, and share no key.
+
+- Commands are immutable, hashable values with a text. Bad arguments raise InvalidCommand (`invalid`).
+
+- Every attempt sends the same bytes, and two addresses never send the same.
+
+- A value that was written to an emulated `device` is read back (`round_trips`), and is the one that the write declares.
 """
 
 from __future__ import annotations
@@ -48,7 +57,7 @@ from busmaster.testing.commands import check_addresses, check_checks, check_comm
 from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks, splits
 
 FINDINGS_EACH = 3
-"""How many findings of one kind a case may add: the rest would only repeat them."""
+"""Maximum number of findings of one kind per case: further ones would only repeat them."""
 UNEXPECTED = b"\x00\x7f"
 
 
@@ -65,15 +74,14 @@ def check_protocol(
     garbage: int = 100,
     seed: int = 0,
 ) -> Tally:
-    """Raise NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
+    """Raise NotConformant unless the protocol fulfils the contract for all of `cases`: see the module's text.
 
-    `names(command, address)` is what a reply to it names: where it is equal for two cases, the reply to one may be
-    taken for the other's. `device` is told what the host says, and returns what the device says at once (see
-    `answers_of`). `garbage` is the number of random replies for each case, drawn from `seed`. Returns how much was
-    tried.
+    `names(command, address)`: the identity that a reply contains. If it is equal for two cases, the reply to one can be
+    accepted for the other. `device` gets the bytes of the host, and returns the immediate reply of the device (see
+    `answers_of`). `garbage`: number of random replies for each case, drawn from `seed`. Returns the number of trials.
     """
     kit = _Kit(profile, list(cases), names, list(unseen), Random(seed))
-    if not kit.cases:  # without a case nothing is tried, and so nothing found
+    if not kit.cases:  # without a case nothing is checked
         raise NotConformant(profile.name, ["there is no case"])
     findings = [*check_addresses(profile), *check_checks(profile), *check_invalid(invalid)]
     for case in kit.cases:
@@ -119,7 +127,7 @@ class _Kit:
         return self.listen(case.command, case.address).feed(*chunks)
 
     def turns(self, case: Case) -> list[list[bytes]]:
-        """Return the steps, those in one list that come without a word of the host between: they may be one chunk."""
+        """Return the turns: lists of steps without a byte of the host in between, which can be one chunk."""
         driver = self.listen(case.command, case.address)
         turns: list[list[bytes]] = [[]]
         for step in case.steps:
@@ -131,15 +139,15 @@ class _Kit:
         return turns
 
     def runs(self, case: Case) -> Iterator[tuple[list[bytes], bytes]]:
-        """Yield each turn of the node as one chunk, and what it said in the turns before."""
+        """Yield each turn of the node as one chunk, with the bytes of the turns before."""
         runs = [b"".join(turn) for turn in self.turns(case) if turn]
         for number, run in enumerate(runs):
             yield runs[:number], run
 
-    # what a case says
+    # the reply of a case
 
     def check_reply(self, case: Case) -> Iterator[str]:
-        """Check the reply as it stands, and silence in its place."""
+        """Check the unchanged reply, and silence instead of it."""
         driver = self.listen(case.command, case.address)
         exchange = driver.exchange
         if case.request is not None and exchange.request != case.request:
@@ -170,7 +178,7 @@ class _Kit:
         fresh = case.command.open(case.address, self.profile.timings)
         yield from (f"{case}: {what}" for what in check_good_reply(fresh, self.turns(case)))
 
-    # what the line makes of a reply
+    # damage on the line
 
     def check_splits(self, case: Case) -> Iterator[str]:
         for before, run in self.runs(case):
@@ -183,7 +191,7 @@ class _Kit:
             if whole.ending is not None and whole.ending.delivered:
                 more = self.hear(case, *before, run + UNEXPECTED).ending
                 if more is None or more.rest != UNEXPECTED:
-                    yield f"{case}: what follows the reply in the same chunk is not handed back: {more}"
+                    yield f"{case}: bytes after the reply in the same chunk are not returned: {more}"
 
     def check_truncations(self, case: Case) -> Iterator[str]:
         for before, run in self.runs(case):
@@ -217,10 +225,10 @@ class _Kit:
     def check_exemptions(self) -> Iterator[str]:
         for unseen in self._unseen:
             if unseen not in self._needed:
-                yield f"{unseen} is seen after all, or no case has that reply: take it off the list"
+                yield f"{unseen} is detected, or no case has that reply: remove it from `unseen`"
 
     def check_starts(self, case: Case) -> Iterator[str]:
-        """Check that a byte that begins no reply gives none, whatever follows it."""
+        """Check that a byte that is not in `starts` never begins a reply."""
         if not case.steps:
             return
         starts = self.listen(case.command, case.address).exchange.starts
@@ -243,7 +251,7 @@ class _Kit:
                 yield from self._check_listener(self.profile.listen(), chunks)
 
     def _check_listener(self, listener: Listener, chunks: Iterable[bytes]) -> Iterator[str]:
-        """Check that one listener serves all that comes unexpected: it goes on after whatever it was fed."""
+        """Check that one listener accepts any unexpected bytes, one chunk after another."""
         for chunk in chunks:
             try:
                 listener.feed(chunk)
@@ -257,7 +265,7 @@ class _Kit:
     # the replies of others
 
     def check_replies_to_others(self) -> Iterator[str]:
-        """Check whatever one turn of a node brings, as far as nothing was said again in it."""
+        """Check the first turn of each case, without repetitions in it, against all other cases."""
         replies = {id(case): self._first_turn(case) for case in self.cases}
         for mine in self.cases:
             names = self._names(mine.command, mine.address)
@@ -278,12 +286,12 @@ class _Kit:
                 if other is not mine and exchanged is not None and exchanged.delivered:
                     asked, answered = (case.command.open(case.address, self.profile.timings) for case in (mine, other))
                     if what := check_exchangeable(asked, answered):
-                        yield f"{mine}: {what}, and takes the reply to {other}"
+                        yield f"{mine}: {what}, but it accepts the reply to {other}"
 
     def _first_turn(self, case: Case) -> bytes:
-        """Return the first turn of the node, where it shows what a reply is.
+        """Return the first turn of the node.
 
-        It is empty for a broadcast, a refusal, and where something had to be repeated.
+        It is empty for a broadcast, a refusal, and a case with a repetition.
         """
         driver = self.hear(case, *case.steps)
         repeated = len(b"".join(driver.said)) != sum(step.sent for step in driver.exchange.later)
@@ -298,7 +306,7 @@ class _Kit:
     ) -> Iterator[str]:
         """Check that `heard` is not accepted.
 
-        `good` replies may stand at the front of `heard`: what follows them is left over and resynchronises the line.
+        `heard` may begin with one of the `good` replies: the remaining bytes resynchronise the line.
         """
         self.tally["foreign"] += 1
         ending = self.listen(command, address).feed(heard).run_out()
@@ -317,7 +325,7 @@ class _Kit:
             command = trip.write(value)
             written = self._converse(command, trip.address, device)
             if not written.delivered:
-                yield f"{command}: the device's answer gives {written}"
+                yield f"{command}: the device's reply gives {written}"
                 continue
             read = self._converse(trip.read, trip.address, device)
             if not read.delivered or read.value != trip.read_back(value):

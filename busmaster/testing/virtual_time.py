@@ -4,7 +4,7 @@
         asyncio.run(main(), loop_factory=VirtualTimeLoop)     # Python 3.12; before: asyncio.Runner(loop_factory=...)
 
 Time stands still while anything is ready to run, and then jumps to the next timer. `asyncio.sleep`, timeouts, anyio and
-everything else that asks the loop for the time works unchanged. What waits for the real world does not: use
+all other code that uses the time of the loop works unchanged. What waits for the real world does not: use
 `MemoryPort`, not a pseudo-terminal. Threads (`asyncio.to_thread`) are waited for in earnest, while time stands still.
 """
 

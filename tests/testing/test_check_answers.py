@@ -69,12 +69,12 @@ class AnsweredWhole(Asking):
 @pytest.mark.parametrize(
     ("exchange", "finding"),
     [
-        (AnsweredByAList, "answers is a tuple of what its replies begin with, not \\["),
-        (AnsweredByAnything, r"answers is a tuple .* not \(b'',\)"),
-        (AnsweredBySomethingElse, "the good reply 11 03 .* begins with none of its answers 11 04"),
-        (AnsweredByTwo, "no step of its good reply begins with its answer 11 04"),
-        (SilentAboutItsAnswers, "is answered, and does not say by what"),
-        (NoneOverdue, "11 03 02 02 2b 38 f8 may come and is not overdue: 11 04"),
+        (AnsweredByAList, "answers must be a tuple of the beginnings of its replies, not \\["),
+        (AnsweredByAnything, r"answers must be a tuple .* not \(b'',\)"),
+        (AnsweredBySomethingElse, "the good reply 11 03 .* does not begin with one of its `answers` 11 04"),
+        (AnsweredByTwo, "no step of its good reply begins with 11 04 of its `answers`"),
+        (SilentAboutItsAnswers, "has a reply, but no keys"),
+        (NoneOverdue, "11 03 02 02 2b 38 f8 can arrive and is not in `overdue`: 11 04"),
     ],
 )
 def test_what_a_reader_says_wrongly_of_its_answers_is_found(exchange: type[Asking], finding: str) -> None:
@@ -84,7 +84,7 @@ def test_what_a_reader_says_wrongly_of_its_answers_is_found(exchange: type[Askin
 def test_commands_whose_replies_could_be_exchanged_and_that_share_no_answer_are_found() -> None:
     zero = checked(17, 3, 2, 0, 0)
     other = Case(ReadRegister(9, AnsweredWhole), 17, [zero], 0)
-    assert "has the answers 11 03 02 02 2b 38 f8, and none that is overdue by another: 11 03 02 00 00" in find(
+    assert "has the `answers` 11 03 02 02 2b 38 f8, none of them a key of the other command: 11 03 02 00 00" in find(
         reading_with(AnsweredWhole), other
     )
 
@@ -97,10 +97,10 @@ def test_a_broadcast_that_says_by_what_it_is_answered_is_found() -> None:
             return Done(None)
 
     case = Case(WriteRegister(7, 3, Broadcasting), 17, [])
-    assert "is not answered, and says by what: answers is (b'" in find(case)
+    assert "has no reply, but keys: answers is (b'" in find(case)
 
 
 def test_checks_that_write_or_prove_nothing_are_found() -> None:
-    assert "the check WriteRegister" in find(profile=replace(MODBUS, sync_reads=(WriteRegister(0, 0),)))
+    assert "the sync read WriteRegister" in find(profile=replace(MODBUS, sync_reads=(WriteRegister(0, 0),)))
     alike = replace(MODBUS, sync_reads=(ReadRegister(0), ReadRegister(1)))
-    assert "have answers that begin alike: 01 03 02" in find(profile=alike)
+    assert "have replies with the same beginning: 01 03 02" in find(profile=alike)

@@ -97,13 +97,13 @@ def test_a_dialect_that_reads_rightly_passes() -> None:
     ("dialect", "finding"),
     [
         (CutsTooSoon, "one byte at a time it is"),
-        (SwallowsWhatFollowsNoise, "behind noise it is"),
-        (TakesWritesForReads, "no write of the host's"),
-        (ReadsTheNextNode, "its request is one to 3"),
-        (SpeaksOfTheNextElement, "is read as read element 2, which sends"),
-        (SpeaksOfNothing, "no command speaks its request"),
-        (ForgetsWhatWasAsked, "no answer to it"),
-        (TakesRefusalsForAcknowledgements, "no refusal"),
+        (SwallowsWhatFollowsNoise, "after noise it is"),
+        (TakesWritesForReads, "not a write of the host"),
+        (ReadsTheNextNode, "its request is decoded as one to 3"),
+        (SpeaksOfTheNextElement, "is decoded as read element 2, which sends"),
+        (SpeaksOfNothing, "gives no command"),
+        (ForgetsWhatWasAsked, "which does not end the request"),
+        (TakesRefusalsForAcknowledgements, "not a refusal"),
     ],
     ids=lambda value: value.__name__ if isinstance(value, type) else "",
 )
@@ -112,7 +112,7 @@ def test_a_dialect_that_reads_wrongly_is_found(dialect: Callable[[], Dialect], f
 
 
 def test_a_command_that_is_not_listed_is_found() -> None:
-    assert "cannot be written down and read back" in findings(with_dialect(HcpDialect, {"read": Read}), [WRITE])
+    assert "cannot be converted to JSON and back" in findings(with_dialect(HcpDialect, {"read": Read}), [WRITE])
 
 
 def test_a_command_that_is_read_back_as_another_is_found() -> None:
@@ -127,4 +127,4 @@ def test_a_command_that_is_read_back_as_another_is_found() -> None:
             return super().read_back({key: value for key, value in written.items() if key != "idempotent"})
 
     forgetful = Forgetful(protocol.profile, protocol.kinds, protocol.commands, protocol.dialect)
-    assert "read back as Write(element=1" in findings(forgetful, [kept])
+    assert "and back to Write(element=1" in findings(forgetful, [kept])

@@ -171,7 +171,7 @@ class NumberingItsRequests(Asking):
         (CheckingNoCrc, "11 03 02 03 2b 38 f8 in place of 11 03 02 02 2b 38 f8 gives the value 811"),
         (CallingAForeignFrameWhole, r"the reply to read register 7 of 18, .* gives FrameError\('wrong echo'\)"),
         (ReadingOnlyWholeChunks, r"gives the value 555, and .* as 11 \|"),
-        (TakingTheRest, "what follows the reply in the same chunk is not handed back"),
+        (TakingTheRest, "bytes after the reply in the same chunk are not returned"),
         (ContentWithLess, "3 of the 7 bytes .* end when time runs out with the value 0"),
         (ContentWithSilence, "with no reply at all it ends with the value 0"),
         (Crashing, "KeyError"),
@@ -183,8 +183,8 @@ class NumberingItsRequests(Asking):
         (SizedBackwards, "typically 9 and at most 8 bytes"),
         (ClosingWithMoreThanItSays, "closes with 1 bytes, not with the 0 announced"),
         (WithALegTooMany, "1 steps in place of the 2 announced"),
-        (Unanswered, "a read that is not answered"),
-        (WithATimingOfItsOwn, "does not take the read or write timing"),
+        (Unanswered, "a read without a reply"),
+        (WithATimingOfItsOwn, "does not use the read or write timing"),
         (NumberingItsRequests, "sends .*, and then"),
     ],
 )
@@ -222,7 +222,7 @@ def test_a_flip_that_is_listed_is_let_pass_and_one_that_is_listed_in_vain_is_not
     )
     listed = [Unseen(REPLY, heard, "the first data byte is not checked") for heard in flips]
     check_protocol(MODBUS, [reading_with(heedless)], unseen=listed, names=named)
-    assert "take it off the list" in find(READING, unseen=listed[:1])
+    assert "remove it from `unseen`" in find(READING, unseen=listed[:1])
 
 
 # planted bugs in a command
@@ -294,7 +294,7 @@ def test_bad_arguments_that_are_not_refused_are_found() -> None:
 def test_bugs_in_a_profile_are_found() -> None:
     assert "the probe WriteRegister" in find(profile=replace(MODBUS, probe=WriteRegister(0, 0)))
     deaf = type("Deaf", (Loose,), {"open": lambda self, address, timings: ReadRegister(7).open(1, timings)})
-    assert "addresses 1 and 2 are sent the same 01 03" in find(profile=replace(MODBUS, probe=deaf()))
+    assert "addresses 1 and 2 have the same request 01 03" in find(profile=replace(MODBUS, probe=deaf()))
 
 
 class DeafListener:
@@ -367,8 +367,8 @@ class _OtherValue(_Changing):
 @pytest.mark.parametrize(
     ("write", "finding"),
     [
-        (_Elsewhere, "does not say that it changes [7], which read register 7 reads"),
-        (_OtherValue, "says that it changes what read register 7 reads to 30, which is 3 then"),
+        (_Elsewhere, "does not declare a change of [7], which read register 7 reads"),
+        (_OtherValue, "declares 30 as the new value, but read register 7 returns 3"),
     ],
 )
 def test_a_write_that_says_wrongly_what_it_changes_is_found(write: type[_Changing], finding: str) -> None:
