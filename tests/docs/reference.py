@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import ast
 import json
-import re
 import tomllib
 from collections.abc import Iterator
-from importlib import import_module
 from itertools import pairwise
 
 import busmaster
 import busmaster.bounds
 from busmaster.app.config.keys import MILLION, Key
 from busmaster.app.config.schema import json_schema, tables
+from tests.docs.api import api
 from tests.docs.command_line import manual, page
 from tests.docs.pages import ROOT
 
@@ -108,37 +107,6 @@ bound. They are not settings: a line and its views are tested with these. Each i
         value = getattr(busmaster.bounds, name)
         shown = f"{int(value):_d}".replace("_", " ") if value == int(value) and value < 1e9 else f"{value:g}"
         yield f"| `{name}` | {shown} | {' '.join(str(about.value.value).split())} |"
-
-
-def api() -> str:
-    """The reference of the API, in Markdown: the site puts in what the docstrings say."""
-    return "\n".join(_api())
-
-
-def _api() -> Iterator[str]:
-    yield """# The API
-
-Every public name, from the docstrings of this very version; [what is public](../public-api.md) says how names change.
-Times are in seconds and baud rates in bits a second, unless a name or a docstring says otherwise. A wrong argument
-raises `InvalidCommand` before anything is sent. On a code host this page is a list of modules: the site has the texts,
-and so has `help(busmaster.Bus)`. What a module shares with one before it is shown there.
-"""
-    table = (ROOT / "docs" / "public-api.md").read_text()
-    yield _module("busmaster", "applications", [])
-    shown = {getattr(busmaster, each) for each in busmaster.__all__ if callable(getattr(busmaster, each))}
-    for name, who in re.findall(r"^\| `(busmaster\.[\w.]+)` \| (.*) \|$", table, re.MULTILINE):
-        module = import_module(name)
-        shared = [each for each in module.__all__ if callable(getattr(module, each)) and getattr(module, each) in shown]
-        shown.update(getattr(module, each) for each in module.__all__ if callable(getattr(module, each)))
-        yield _module(name, who, shared)
-
-
-def _module(name: str, who: str, without: list[str]) -> str:
-    options = "".join(f"   :exclude-members: {', '.join(without)}\n" for _ in without[:1])
-    if not without:
-        options = "   :inherited-members: BaseException, Enum, int, object, tuple\n"
-    directive = f".. automodule:: {name}\n   :members:\n   :undoc-members:\n{options}"
-    return f"## {name}\n\nFor {who}.\n\n```{{eval-rst}}\n{directive}```\n"
 
 
 def files() -> dict[str, str]:

@@ -29,8 +29,8 @@ from tests.docs.shell import Shell, commands, joined
 
 BASE = Path(__file__).parent / "base.toml"
 COMMANDS = ("console", "sh")
-SHOWN = ("text", "ini", "yaml", "lua", "csv", "telegrams", "{eval-rst}")
-"""What is not run: drawings, files of other programs, what the site puts in. test_telegrams.py has the telegrams."""
+SHOWN = ("text", "ini", "yaml", "lua", "csv", "telegrams", "py")
+"""What is not run: drawings, files of other programs, signatures (`py`). test_telegrams.py has the telegrams."""
 
 
 def needed(block: Block) -> bool:

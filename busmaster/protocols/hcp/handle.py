@@ -12,9 +12,11 @@ from busmaster.protocols.hcp import codec as hcp
 class HcpController(MintHandle):
     """A Mint controller over HCP: nodes 0-15, comms elements 1-99.
 
-    winder = HcpController(bus, 2)
-    await winder.write(1, 100.0, 250.0)      # Comms(1) and Comms(2), in one telegram
-    position = await winder.read(4)
+        winder = HcpController(bus, 2)
+        await winder.write(1, 100.0, 250.0)      # Comms(1) and Comms(2), in one telegram
+        position = await winder.read(4)
+
+    `read` and `write` access comms elements by their number.
     """
 
     profile: ClassVar[Profile] = hcp.PROFILE

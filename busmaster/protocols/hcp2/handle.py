@@ -15,10 +15,12 @@ from busmaster.protocols.hcp2 import comms_array
 class Hcp2Controller(MintHandle):
     """A Mint controller over HCP2: nodes 0-255, comms elements 1-99 and the extended comms array, 100-255.
 
-    controller = Hcp2Controller(bus, 5)
-    await controller.write(1, 123.456)
-    position = await controller.axis(0).position.read()
-    await controller.io.outputs.write(0b101)
+        controller = Hcp2Controller(bus, 5)
+        await controller.write(1, 123.456)
+        position = await controller.axis(0).position.read()
+        await controller.io.outputs.write(0b101)
+
+    `read` and `write` access comms elements by their number.
     """
 
     profile: ClassVar[Profile] = hcp2.PROFILE
