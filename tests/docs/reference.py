@@ -1,6 +1,6 @@
-"""What is made of the program itself: the reference of LINE.toml, of the command line and of the API, the manual page.
+"""Generates the reference of LINE.toml, the bounds, the command line and the API, and the manual page.
 
-`python -m tests.docs.reference` writes the files; a test holds that they are today's.
+`python -m tests.docs.reference` writes the files. A test verifies that they are current.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ def line_toml() -> str:
 def _line_toml() -> Iterator[str]:
     yield """# LINE.toml
 
-One file describes a line: its port, its nodes, what is polled and where the values go. This page is made of the
-declarations by which the program reads the file: each key with its type, unit, range, default and meaning. A key that
-is not here is an error, with its line in the file and the nearest key that there is.
-[examples/line.toml](../../examples/line.toml) is a whole file with remarks.
+One file describes a line: its port, its nodes, its poll groups and its outputs. This page is generated from the
+declarations with which the program reads the file: each key with its type, unit, range, default and meaning. Any other
+key is an error. The error names the line in the file and the most similar key.
+[examples/line.toml](../../examples/line.toml) is a complete file with comments.
 
-All times are in seconds. A key without a default may be left out; its meaning says what holds then.
+All times are in seconds. A key without a default is optional; its meaning describes the behaviour without it.
 
 ## In an editor
 
-Editors that know JSON Schema complete keys, show these texts, and mark what is wrong while you type. In Visual Studio
-Code install the extension "Even Better TOML" and write the schema into a file:
+Editors with support for JSON Schema complete keys, show these texts, and mark errors while you type. In Visual Studio
+Code, install the extension "Even Better TOML" and write the schema to a file:
 
 ```sh
 busmaster check --schema > line.schema.json
 ```
 
-Then begin LINE.toml with the place of that file, from the folder of LINE.toml:
+Then begin LINE.toml with the path of that file, relative to the folder of LINE.toml:
 
 ```toml
 #:schema ./line.schema.json
 ```
 
-The schema has the options of every protocol that is installed. That of busmaster alone is
-[docs/line.schema.json](../line.schema.json). It knows single values: what depends on several of them, or on other
-files, only `busmaster check` finds.
+The schema contains the options of every installed protocol. [docs/line.schema.json](../line.schema.json) is the schema
+without other packages. It checks single values. Only `busmaster check` checks rules that depend on several values or on
+other files.
 """
     for table in tables():
         yield f"## {_titled(table.header)}\n\n{table.about}\n"
@@ -70,7 +70,7 @@ def _titled(header: str) -> str:
 
 def _default(key: Key) -> str:
     if key.required:
-        return "must be there"
+        return "required"
     match key.default:
         case None | "":
             return ""
@@ -89,9 +89,9 @@ def bounds() -> str:
 def _bounds() -> Iterator[str]:
     yield """# Bounds
 
-The bounds of everything that a file or a client can say. What goes beyond a bound is refused, and the refusal names the
-bound. They are not settings: a line and its views are tested with these. Each is declared once, in
-`busmaster/bounds.py`, from which this page is made. Times are in seconds.
+The bounds of all input from files and clients. Input beyond a bound is rejected, and the error names the bound. They
+are not settings: a line and its views are tested with these values. Each bound is declared once, in
+`busmaster/bounds.py`, from which this page is generated. Times are in seconds.
 """
     text = (ROOT / "busmaster" / "bounds.py").read_text()
     titles = {number: line[2:] for number, line in enumerate(text.splitlines(), 1) if line.startswith("# ")}
