@@ -1,4 +1,4 @@
-"""Measures of the structure: rooms, imports between them, public names, and the length of a request's way.
+"""Measures of the structure: rooms, imports between them, public names, comments, and the length of a request's way.
 
 They are the targets of the design for version 0.3. They report and gate nothing: the tests gate what must hold.
 
@@ -14,6 +14,8 @@ How each is counted:
 - A circle is a set of rooms that import each other, directly or by way of others. An arrow goes upward if it goes from
   the library into the application; those of the root's lazy names are not counted.
 - Statements are those of the syntax trees, without docstrings.
+- Lines of code have a token that is not a comment. Blank lines and docstrings, also those of attributes, are not code.
+  A comment line contains a comment, alone or after code. Comments for tools (`noqa`, `type:`, `pragma:`) do not count.
 - A request's way is traced with `sys.setprofile` on a line emulated in this process: the distinct functions of the
   package that ran during one warm call, without comprehensions and emulated devices; and their files. The remote write
   runs with its client in another thread, so that both sides are told apart. The objects are the instances of classes
@@ -33,6 +35,7 @@ import sys
 import tarfile
 import tempfile
 import threading
+import tokenize
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
@@ -44,6 +47,9 @@ APPLICATION = {"authorisation", "cli", "config", "discovery", "doctor", "interfa
 """The rooms of the application in revisions before `busmaster/app/` held them."""
 ROOT = "__init__"
 HERE = Path(__file__).parents[2]
+FOR_TOOLS = ("noqa", "type:", "pragma:")
+"""Beginnings of comments that are not for a reader."""
+LAYOUT = {tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 COMPREHENSIONS = {"<listcomp>", "<genexpr>", "<dictcomp>", "<setcomp>"}
 """Functions to the interpreter, of some versions, not to a reader."""
 WARM = 20
@@ -62,11 +68,13 @@ class Sources:
 
     package: Path
     trees: dict[str, ast.Module] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
     edges: dict[str, set[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for path in sorted(self.package.rglob("*.py")):
-            self.trees[self._named(path)] = ast.parse(path.read_text())
+            text = self.texts[self._named(path)] = path.read_text()
+            self.trees[self._named(path)] = ast.parse(text)
         self.edges = {name: set(self._imports(tree)) - {name} for name, tree in self.trees.items()}
 
     def _named(self, path: Path) -> str:
@@ -102,6 +110,12 @@ class Sources:
             for node in ast.walk(tree)
         )
 
+    def comments(self, rooms: set[str]) -> float:
+        """Return the number of comment lines per 100 lines of code of these rooms."""
+        lines = [lines_of(self.texts[name], tree) for name, tree in self.trees.items() if room_of(name) in rooms]
+        code = sum(code for code, _ in lines)
+        return round(100 * sum(comments for _, comments in lines) / code, 1) if code else 0.0
+
     def arrows(self) -> set[tuple[str, str]]:
         """Return each pair of rooms of which the first imports the second."""
         pairs = {(room_of(name), room_of(other)) for name, others in self.edges.items() for other in others}
@@ -123,6 +137,24 @@ class Sources:
 
 def _is_docstring(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def lines_of(text: str, tree: ast.Module) -> tuple[int, int]:
+    """Return the numbers of lines of code, and of lines with a comment for a reader."""
+    docstrings = {
+        line
+        for node in ast.walk(tree)
+        if isinstance(node, ast.stmt) and _is_docstring(node)
+        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    code, comments = set[int](), set[int]()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            if not token.string.lstrip("#: ").startswith(FOR_TOOLS):
+                comments.add(token.start[0])
+        elif token.type not in LAYOUT:
+            code.update(range(token.start[0], token.end[0] + 1))
+    return len(code - docstrings), len(comments)
 
 
 def room_of(module: str) -> str:
@@ -190,6 +222,8 @@ def structure(root: Path) -> dict[str, Any]:
         "modules": len(sources.trees),
         "statements": sum(everything.values()),
         **{f"statements of {room}": count for room, count in everything.items()},
+        "comment lines per 100 lines of code": sources.comments(set(rooms)),
+        **{f"comment lines per 100 lines of {room}": sources.comments({room}) for room in rooms},
         "names": {
             "circles of rooms": [sorted(circle) for circle in circles(eager)],
             "library modules that the application imports": sorted(seam),

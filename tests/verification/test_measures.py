@@ -38,6 +38,32 @@ def test_structure_of_a_small_package(root: Path) -> None:
     assert found["statements of bus"] == 3  # the function, its import and its return, not its docstring
 
 
+COMMENTED = '''"""A docstring
+of two lines."""
+
+# A comment of two
+# lines.
+X = """A text
+of two lines, # not a comment
+"""  # after code
+"""The docstring of X."""
+
+
+def f():  # type: ignore[no-untyped-def]
+    """Doc."""
+
+    return X  # noqa: B000
+'''
+
+
+def test_comments_are_counted_per_100_lines_of_code(root: Path) -> None:
+    (root / "busmaster" / "wire" / "bytes.py").write_text(COMMENTED)
+    found = structure(root)
+    assert found["comment lines per 100 lines of wire"] == 60.0  # 3 of 5: X has three lines, f two
+    assert found["comment lines per 100 lines of bus"] == 0.0
+    assert found["comment lines per 100 lines of code"] == pytest.approx(100 * 3 / (5 + 1 + 3 + 2), abs=0.05)
+
+
 def test_an_import_of_the_application_by_the_library_is_an_arrow_upward(root: Path) -> None:
     (root / "busmaster" / "wire" / "bytes.py").write_text("from busmaster.service import one\n")
     found = structure(root)
