@@ -25,8 +25,12 @@ PROTOCOL = Protocol(
             takes_decimals=True,
             emulated=(
                 *EMULATED,
-                Option("plus", "flag", about="A value that is not negative is sent with its sign."),
-                Option("width", "whole", about="Zeros fill a value up to so many characters; none do by default."),
+                Option("plus", "flag", about="Values from 0 up are sent with a sign."),
+                Option(
+                    "width",
+                    "whole",
+                    about="Values are filled with zeros to this length; by default not.",
+                ),
             ),
             capture_id=8,
         ),

@@ -15,7 +15,7 @@ PRINTABLE_CHECK = Option(
 FIXED_WIDTH = Option(
     "fixed_width",
     "whole",
-    about="Zeros fill a number up to so many characters (fixed format); none do by default (free format).",
+    about="Number of characters to which a number is filled with zeros (fixed format); by default free format.",
 )
 
 PROTOCOL = Protocol(
@@ -38,16 +38,18 @@ PROTOCOL = Protocol(
                 FIXED_WIDTH,
                 PRINTABLE_CHECK,
                 Option(
-                    "lag", "positive", about="Seconds in which the process value follows the setpoint; 60 by default."
+                    "lag",
+                    "positive",
+                    about="Time constant with which the process value follows the setpoint, in seconds; 60 by default.",
                 ),
                 Option(
                     "parameters",
                     "tables",
-                    about="Further parameters by mnemonic or tag, or other ones in place of those that it has: "
+                    about="Further parameters by mnemonic or tag, or replacements of existing ones: "
                     "`parameters = { SW = { hexadecimal = true }, tag247 = { low = -100, high = 100 } }`.",
                     fields=(
-                        Option("low", "number", about="The least that it takes; -99999 by default."),
-                        Option("high", "number", about="The most that it takes; 99999 by default."),
+                        Option("low", "number", about="Lower limit; -99999 by default."),
+                        Option("high", "number", about="Upper limit; 99999 by default."),
                         Option("read_only", "flag", about="Writes to it are refused."),
                         Option("write_only", "flag", about="Reads of it are refused."),
                         Option("hexadecimal", "flag", about="It is a word of 16 bits, sent as hexadecimal digits."),

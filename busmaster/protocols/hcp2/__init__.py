@@ -47,8 +47,8 @@ PROTOCOL = Protocol(
                 Option(
                     "ripple",
                     "share",
-                    about="By how much of itself, 0 to 1, the measured speed swings with every turn; 0.01 by "
-                    "default, 0 where it is not lively.",
+                    about="Share, 0 to 1, by which the measured speed varies with every turn; 0.01 by default, 0 if "
+                    "the drive is not lively.",
                 ),
                 Option(
                     "acceleration",
@@ -56,7 +56,7 @@ PROTOCOL = Protocol(
                     about="How fast its speed follows the reference, in % a second; 50 by default.",
                 ),
                 Option("hardware_enable", "flag", about="Its enable input is on, true by default."),
-                Option("stop_input", "flag", about="An input that is set up as error or stop input is on."),
+                Option("stop_input", "flag", about="An input that is configured as error or stop input is on."),
                 Option("axis_error", "whole", about="The axis errors with which it has tripped, or trips: a bitmap."),
                 Option("drive_error", "whole", about="The drive error with which it has tripped, or trips."),
                 Option(

@@ -18,8 +18,8 @@ EMULATED = (
     Option(
         "ripple",
         "share",
-        about="By how much of itself, 0 to 1, the measured speed swings with the shaft; 0.01 by "
-        "default, 0 where it is not lively.",
+        about="Share, 0 to 1, by which the measured speed varies with the shaft; 0.01 by default, 0 if the drive is "
+        "not lively.",
     ),
     Option("short_after_write", "flag", about="Short commands work after a write too."),
     Option("refuse_malformed", "flag", about="The reply to a malformed read request is a NAK, not silence."),
@@ -31,12 +31,12 @@ EMULATED = (
             Option(
                 "low",
                 "number",
-                about="The least that it takes, without its decimals; what its form can carry by default.",
+                about="Lower limit, without decimals; by default that of its form.",
             ),
             Option(
                 "high",
                 "number",
-                about="The most that it takes, without its decimals; what its form can carry by default.",
+                about="Upper limit, without decimals; by default that of its form.",
             ),
             Option("read_only", "flag", about="Writes to it are refused."),
             Option("wide", "flag", about="It has five digits and no sign, as `:wide` reads it."),

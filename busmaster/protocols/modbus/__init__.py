@@ -54,12 +54,12 @@ PROTOCOL = Protocol(
             whole_numbers=is_whole,
             width=width_of,
             emulated=(
-                Option("size", "whole", about="How many addresses each of its four tables has; 1000 by default."),
+                Option("size", "whole", about="Number of addresses of each of its four tables; 1000 by default."),
                 Option(
                     "functions",
                     "numbers",
-                    about="The function codes that it knows; all that busmaster sends by default. Others are "
-                    "answered by exception 1.",
+                    about="The function codes that it supports; by default all that busmaster sends. Others are "
+                    "refused with exception 1.",
                 ),
                 Option("read_only", "numbers", about="The holding registers that refuse writes, with exception 3."),
             ),

@@ -51,20 +51,22 @@ PROTOCOL = Protocol(
             emulated=(
                 ADDRESS_STEP,
                 MODEL,
-                Option("addresses", "whole", about="How many data addresses it has; 32768 by default."),
+                Option("addresses", "whole", about="Number of data addresses; 32768 by default."),
                 Option(
-                    "read_only_flags", "numbers", about="The flags that cannot be set or cleared, as inputs and timers."
+                    "read_only_flags",
+                    "numbers",
+                    about="The flags that cannot be set or cleared, such as inputs and timers.",
                 ),
-                Option("battery", "flag", about="Data outlives a power failure, and the program starts again."),
+                Option("battery", "flag", about="Data survives a power failure, and the program starts again."),
                 Option(
                     "period",
                     "positive",
-                    about="Every how many seconds its program adds 1 to the value at 2000; 0.1 by default.",
+                    about="Period in seconds with which its program adds 1 to the value at 2000; 0.1 by default.",
                 ),
                 Option(
                     "packet_delay",
                     "delay",
-                    about="From the end of an ACK to the packet that follows it; 0.002 by default.",
+                    about="Time from the end of an ACK to the packet after it; 0.002 by default.",
                 ),
             ),
             whole_numbers=everywhere,

@@ -121,10 +121,7 @@ class MscController(Handle):
         return Point(self.node, f"flag:{flag}", ReadFlag(flag), encode=encode)
 
     def _run_items(self, item: str, count: int) -> tuple[str, ...]:
-        """Return what each value of a run is called.
-
-        That is its address, or the run's with the value's number where it is unknown.
-        """
+        """Return the item of each value of a run: its address, or if it is unknown, the run's with a number."""
         name = item.partition(":")[0]
         if self.address_step is None:
             return tuple(f"{name}[{i}]" for i in range(count))
@@ -132,7 +129,7 @@ class MscController(Handle):
         return tuple(str(address + i * self.address_step) for i in range(count))
 
     async def _read_item(self, item: str, **options: Any) -> Any:
-        """Do as `point(item).read()` does; read the flags of a model without RFLAGS one by one."""
+        """Read as `point(item).read()` does. Flags of a model without RFLAGS are read one by one."""
         try:
             return await self.point(item).read()
         except Refused:
@@ -174,11 +171,11 @@ class MscController(Handle):
     async def read(
         self, item: int | str, count: int | None = None, **options: Unpack[ReadOptions]
     ) -> int | tuple[int, ...]:
-        """Return the value at a data address or symbol; with `count`, so many consecutive values, 32 an exchange.
+        """Return the value at a data address or symbol; with `count`, a tuple of this many, 32 per exchange.
 
-        More than 32 values are not all of one moment. Where the last 32 would reach beyond the data area and are
+        More than 32 values are not all of one moment. If the last 32 would reach beyond the data area and are
         refused, the values are read one by one. Raises Refused for an address outside the data area, and InvalidCommand
-        for more than 32 while the address step is unknown. `start_within` is for each exchange.
+        for more than 32 while the address step is unknown. `start_within` applies to each exchange.
         """
         address = self._address_of(item)
         if count is None:
