@@ -8,6 +8,7 @@
     PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of a bit "set", "clear" or null; retained
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
+    HOME/.../config           discovery messages of Home Assistant, with home_assistant = "HOME"; retained
 
     PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to be written; or {"value": 12.5, "id": "a1",
                               "expires": 1767225600}, of which value alone must be said
@@ -41,6 +42,7 @@ from anyio.abc import TaskStatus
 
 from busmaster import Bus, LineState, Point, Sample, Snapshot, ext
 from busmaster.app.outputs.base import PAUSE, TICK, Item, OutputKind, OutputLine, Unsuitable, check_extra, size_of
+from busmaster.app.outputs.home_assistant import HomeAssistant
 from busmaster.app.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.app.outputs.mqtt_connection import secrets, taking_in, topic_part, unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
@@ -117,6 +119,13 @@ class MqttOutput(SpillingOutput):
         self._in_charge = in_charge
         self._asks = asks
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
+        self._home: HomeAssistant | None = None
+        if settings.home_assistant is not None and in_charge:
+            self._home = HomeAssistant(
+                settings.home_assistant, settings.prefix, self._commands, reports_line=self._asks
+            )
+        self._announced: set[str] = set()
+        """Topics, below `prefix`, of which Home Assistant was informed on this connection."""
         self._arriving: Commands
         self._leaving = threading.Event()
         self._interface_is_closed = threading.Event()
@@ -186,6 +195,7 @@ class MqttOutput(SpillingOutput):
     async def _connected(self) -> None:
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
+            self._announced.clear()
             self._alarms = None
             tasks.start_soon(self._listen, client)
             await tasks.start(self._serve, client)
@@ -315,7 +325,27 @@ class MqttOutput(SpillingOutput):
                 for group in self._bus.groups
             )
             for point, sample in item.samples.items():
+                yield from self._announce_value(point, sample)
                 yield self._value(point, self._bus.as_of_now(point, sample) if current else sample)
+
+    def _announce_value(self, point: Point[Any], sample: Sample[Any]) -> Iterator[Outgoing]:
+        """Yield what Home Assistant must know of a point before its first value, which shows what it is."""
+        if self._home is not None and point.key not in self._announced and sample.error is None:
+            self._announced.add(point.key)
+            for config in self._home.value(point, sample.value):
+                yield Outgoing(*config, True)
+
+    def _announce(self, topic: str, alarms: Mapping[str, Point[Any]]) -> Iterator[Outgoing]:
+        """Yield what Home Assistant must know of a topic of the line, a node or an alarm before its first message."""
+        if self._home is None or topic in self._announced:
+            return
+        self._announced.add(topic)
+        kind, _, name = topic.partition("/")
+        if topic in alarms:
+            config = self._home.alarm(alarms[topic])
+        else:
+            config = self._home.health(name) if kind == "health" else self._home.line()
+        yield Outgoing(*config, True)
 
     def _value(self, point: Point[Any], sample: Sample[Any]) -> Outgoing:
         payload = json_line(time=micros(sample.wall), unit=point.unit, **sample_fields(sample))
@@ -360,13 +390,17 @@ class MqttOutput(SpillingOutput):
         for node in self._bus.nodes if self._asks else ():
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
         alarms = self._bus.alarms
+        with_alarms: dict[str, Point[Any]] = {}
         if alarms is not self._alarms:
             self._alarms = alarms
+            with_alarms = {f"{ALARMS}{topic_part(point.key)}": point for point in alarms}
             now |= {topic: ("alarm", None) for topic in self._published if topic.startswith(ALARMS)}
-            for point, alarm in alarms.items():
-                now[f"{ALARMS}{topic_part(point.key)}"] = ("alarm", None if alarm is None else alarm.name)
+            for topic, point in with_alarms.items():
+                alarm = alarms[point]
+                now[topic] = ("alarm", None if alarm is None else alarm.name)
         for topic, (name, state) in now.items():
             if self._published.get(topic, "") != state:
+                yield from self._announce(topic, with_alarms)
                 self._published[topic] = state
                 payload = json_line(**{"time": round(time.time(), 3), name: state, **more.get(topic, {})})
                 yield Outgoing(self._topic(topic), payload, True)

@@ -169,6 +169,15 @@ class MqttSettings(SpillingSettings):
     allow_commands: tuple[str, ...] = ()
     """The points that MQTT commands may write. By default none: commands are then ignored."""
 
+    home_assistant: Annotated[str | None, Parsed(_topic)] = None
+    """The discovery prefix of Home Assistant, usually `homeassistant`: points, nodes and alarms appear there by
+    themselves. By default no discovery messages are sent."""
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if self.home_assistant is not None and self.messages == "cycle":
+            raise InvalidCommand('home_assistant needs messages = "point": a discovered entity has a topic of its own')
+
     @property
     def destination(self) -> str:
         """Return the broker."""
