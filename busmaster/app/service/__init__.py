@@ -1,5 +1,5 @@
-"""One line for many programs: the process that owns it serves a Unix socket, by which others ask its nodes.
+"""One line for many programs: the process that owns it serves a Unix socket, through which others use its nodes.
 
-`service.py` listens, `client.py` is one program that has come, `remote.py` is what such a program holds in its hands.
-What is said between them is in docs/service.md. The core does not need this room; it needs the extra `service`.
+`service.py` listens, `client.py` is one connected program, `remote.py` is the bus in such a program. docs/service.md
+describes the messages. The core does not need this package; it needs the extra `service`.
 """

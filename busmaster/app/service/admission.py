@@ -32,7 +32,7 @@ class Admission:
     """Decides by their roles which programs are admitted, and which connections are closed for new ones.
 
     Each role has the places that are reserved for it, and MOST_CLIENTS are for all roles. RESERVED_FOR_SAFE are for
-    programs that say in `hello` that they only send the safe state, once they find no other place.
+    programs that declare in `hello` that they only send the safe state, if there is no other place.
     """
 
     def __init__(self, refusals: Refusals) -> None:
@@ -48,7 +48,7 @@ class Admission:
     def admit(self, permission: Permission, clients: Mapping[Client, Visit], *, safe_only: bool) -> bool:
         """Admit one more program beside `clients`, and return whether it gets a place for the safe state.
 
-        `safe_only`: it says that it only sends the safe state. Raises Malformed, saying why, if it is not admitted.
+        `safe_only`: it has declared that it only sends the safe state. Raises Malformed with the reason for a refusal.
         """
         if self._has_place(permission.role, clients):
             return False
@@ -59,7 +59,7 @@ class Admission:
             idle = next((client for client in here if not client.requests.sends_safe_state), None)
             if idle is None:
                 self._refusals.note_connection("safe")
-                raise Malformed(f"{len(here)} programs are sending the safe state already")
+                raise Malformed(f"{len(here)} programs are already sending the safe state; wait for them")
             clients[idle].connection.abort()
         return True
 
@@ -71,7 +71,7 @@ class Admission:
         return sum(max(0, count - RIGHTS[other].reserved) for other, count in counts.items()) < MOST_CLIENTS
 
     def _why_not(self, role: Role) -> str:
-        """Return what a refused program is told."""
+        """Return the text for a refused program."""
         others = ", ".join(
             f"{rights.reserved} more are for role {other.value}"
             for other, rights in RIGHTS.items()
@@ -81,20 +81,20 @@ class Admission:
 
 
 class ConnectionRate:
-    """How fast each peer connects. One that connects again and again would otherwise take the time of the line's loop:
+    """How fast each peer connects. One that connects repeatedly would otherwise use up the time of the line's loop:
     a login costs about as much as thirty requests.
 
-    After FREE_CONNECTIONS a peer's connections are let in CONNECTIONS_A_SECOND; MOST_DELAYED wait for that, and others
-    are refused. So a client that comes in a crowd waits, and needs no second attempt.
+    After FREE_CONNECTIONS, a peer's connections are admitted at CONNECTIONS_A_SECOND; MOST_DELAYED wait for that, and
+    others are refused. So a client that connects together with others waits, and needs no second attempt.
     """
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
         self._used_until: OrderedDict[Hashable, float] = OrderedDict()
-        """Until when the connections that came have used what each peer has; the peer that came longest ago first."""
+        """Time until which the past connections use up the allowance of each peer, least recently connected first."""
 
     def delay(self, peer: Hashable) -> float | None:
-        """Count a connection of a peer. Return for how many seconds it has to wait, None if it is refused."""
+        """Count a connection of a peer. Return the seconds for which it must wait, None if it is refused."""
         now = self._now()
         used_until = max(now, self._used_until.pop(peer, now)) + 1 / CONNECTIONS_A_SECOND
         delay = used_until - now - FREE_CONNECTIONS / CONNECTIONS_A_SECOND
@@ -106,18 +106,18 @@ class ConnectionRate:
 
 
 def connecting_peer(origin: int | str | None, process: int) -> Hashable:
-    """Return what stands for a peer that connects, by its `origin`: a user, or an address.
+    """Return the key of a peer that connects, by its `origin`: a user, or an address.
 
-    Each process of the owner's user and of root stands for itself: one that connects again and again must not delay
-    the command that sends the safe state. Processes of another user have one rate together: it could have many.
+    Each process of the owner's user and of root has its own key: one that connects repeatedly must not delay the
+    command that sends the safe state. Processes of another user have one rate together, because there can be many.
     """
     return (origin, process) if origin in (0, os.getuid()) else origin
 
 
 def stranger_to_close(strangers: Collection[Visit]) -> Visit | None:
-    """Return the connection without a first message that is closed for one more; None while there is room.
+    """Return the connection without a first message that is closed for a new one; None if there is space.
 
-    Of the user or the address that has most of them it is the oldest: whoever opens many closes its own.
+    It is the oldest of the user or address with the most connections, so a peer that opens many closes its own.
     """
     if len(strangers) < MOST_STRANGERS:
         return None

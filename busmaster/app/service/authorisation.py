@@ -1,4 +1,4 @@
-"""The one authorisation of a line for what comes from outside."""
+"""The authorisation of a line for writes from outside."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from busmaster.errors import (
 from busmaster.ext import Command
 
 FRESH = 1.0
-"""Seconds for which a command may wait that does not say until when it is meant."""
+"""Seconds for which a command without an expiry time may wait."""
 LARGEST_KEPT = 1e100
-"""Of what is kept as a number; beyond it nobody means one, and its text is kept."""
+"""Largest number that is stored as a number. Larger ones are invalid, and stored as text."""
 NEVER_SENT = (ArithmeticError, TypeError, ValueError, RecursionError)
-"""What is raised of values of which no frame can be made, InvalidCommand among them."""
+"""Exceptions for values that cannot be encoded into a frame, including InvalidCommand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wish:
-    """What somebody outside wants to have written.
+    """A write that a client requests.
 
-    `arrived` is when it came, by the bus's clock; None of a person who waits for its end. `expires` is when it is no
-    longer meant, in seconds since 1970; None where it does not say so. `command` is what a program would have sent,
-    which is held against its `permission`; None where the interface's own list has named the point.
+    `arrived`: time of arrival, by the bus's clock; None if a user waits for the result. `expires`: time after which the
+    write is not valid, in seconds since 1970; None for no limit. `command`: the command that a program would send,
+    which is checked against its `permission`; None if the interface's own list permits the point.
     """
 
     interface: str
@@ -58,9 +58,9 @@ class Wish:
 
 
 Durable: TypeAlias = Awaitable[str] | None
-"""What is done when an audit entry is on the disk: "", or the reason why it is not. None where that is not awaited."""
+"""Result when an audit entry is on the disk: "", or the reason why it is not. None if that is not awaited."""
 Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], tuple[WriteRecord, Durable]]
-"""Keeps a record: of what was wished, what became of it and why, the value before, and the seconds that it took."""
+"""Stores an audit entry: the request, its outcome and the reason, the value before, and the duration in seconds."""
 
 
 class SafeWrites(Protocol):
@@ -68,11 +68,11 @@ class SafeWrites(Protocol):
 
     @property
     def values(self) -> Mapping[str, float]:
-        """Return the value of each of its points, by its name; of no point where there is no safe state."""
+        """Return the value of each point, by name; empty if there is no safe state."""
         ...
 
     def refusal(self, permission: Permission, /) -> str:
-        """Return why somebody may not have it sent, "" if he may."""
+        """Return why a client may not send it, "" if it may."""
         ...
 
     async def enter(
@@ -83,7 +83,7 @@ class SafeWrites(Protocol):
 
 
 class Passage:
-    """One write on its way, in `with`: however that ends, a record is kept of it. What is raised is raised on."""
+    """One write in progress, for `with`: every end is stored in the audit log. Exceptions are raised again."""
 
     def __init__(self, wish: Wish, now: Callable[[], float], keep: Keep) -> None:
         self.record: WriteRecord | None = None
@@ -104,21 +104,21 @@ class Passage:
         self.end(error)
 
     def end(self, error: BaseException | None) -> None:
-        """Keep its record: what it ended with, None for a write that is confirmed."""
+        """Store the audit entry with the error, or None for a confirmed write."""
         outcome, text = outcome_of(error)
         took = self._now() - self._began
         self.record, self._durable = self._keep(self._wish, outcome, text, self._before, took)
 
     async def not_durable(self) -> str:
-        """Wait until the audit entry of a write is on the disk, where an output must have it there before the write is
-        acknowledged. Return the reason why it is not, "" if it is or nothing is to be awaited.
+        """Wait until the audit entry of a write is on the disk, if an output requires that before the acknowledgement.
+        Return the reason why it is not, "" if it is or no output requires it.
         """
         why = "" if self._durable is None else await self._durable
-        return f"it was written, but its audit entry is not on the disk: {why}" if why else ""
+        return f"the value was written, but its audit entry is not on the disk: {why}" if why else ""
 
 
 def outcome_of(error: BaseException | None) -> tuple[Outcome, str]:
-    """Return what became of a write that ended so, and why."""
+    """Return the outcome of a write that ended with this error, and the reason."""
     match error:
         case None:
             return Outcome.WRITTEN, ""
@@ -130,17 +130,17 @@ def outcome_of(error: BaseException | None) -> tuple[Outcome, str]:
             sent = error.attempts or isinstance(error, WriteUnconfirmed | VerifyFailed)
             return Outcome.UNCONFIRMED if sent else Outcome.NOT_STARTED, error.what
         case ArithmeticError() | TypeError() | ValueError() | RecursionError():
-            return Outcome.REFUSED, f"this cannot be sent: {error}"  # before a frame was made of it
+            return Outcome.REFUSED, f"the value cannot be sent: {error}"  # before a frame was made of it
         case _:
-            return Outcome.UNCONFIRMED, "the program gave up before it was done"
+            return Outcome.UNCONFIRMED, "the program cancelled the write before it ended"
 
 
 class Authorisation:
-    """What all interfaces of one line pass. `read_only` lets no write through, nor does it once the line is `leaving`.
+    """Checks the writes of all interfaces of one line. `read_only` rejects every write, and so does `leaving`.
 
-    `record` is told of every one.
+    `record` is called with each audit entry.
 
-    `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
+    `write` raises nothing except for a cancellation. Every request results in an audit entry.
     """
 
     def __init__(self, bus: Bus, *, read_only: bool = False, access: Access | None = None) -> None:
@@ -148,9 +148,9 @@ class Authorisation:
         self.leaving = False
         self._access = access or Access()
         self.safe_state: SafeWrites | None = None
-        """What the line's file calls safe; None of a line without a file."""
+        """The safe state of the line's file; None for a line without a file."""
         self.on_access: list[Callable[[], None]] = []
-        """Called when other roles or tokens hold."""
+        """Called when roles or tokens have changed."""
         self.record: Callable[[WriteRecord], Durable] = lambda _: None
         self.refusals = Refusals()
         """Connections and logins that were refused, at whatever interface."""
@@ -162,7 +162,7 @@ class Authorisation:
 
     @property
     def access(self) -> Access:
-        """Return what other programs may do. Those of `on_access` are told when it is set."""
+        """Return the permissions of other programs. Setting it calls the functions in `on_access`."""
         return self._access
 
     @access.setter
@@ -172,27 +172,27 @@ class Authorisation:
             tell()
 
     def take_secrets(self, secrets: Mapping[str, bytes]) -> None:
-        """Have these tokens hold from now on, and no other: their digests by their names."""
+        """Replace the tokens: digests by name."""
         self.access = replace(self.access, secrets=secrets)
 
     def refusal(self, wish: Wish) -> str:
-        """Return why it is not let through, "" if it is."""
+        """Return why a write is not permitted, "" if it is."""
         if self.leaving:
-            return "the line is being left: nothing was sent"
+            return "the line is closing; nothing was sent"
         if self.read_only:
             return "this line is read-only"
         if wish.point is None:
-            return "the line's file does not allow this: see allow_commands"
+            return "the line's file does not permit this write; add the point to allow_commands"
         if wish.command is not None and (refusal := wish.permission.refusal(wish.point.node, wish.command)):
             return refusal
         if self._left(wish) <= 0:
-            return "it is too old: nothing was sent"
+            return "the command has expired; nothing was sent"
         if self._running.get(wish.interface, 0) >= MOST_AT_ONCE:
-            return f"{MOST_AT_ONCE} commands are being written already"
+            return f"{MOST_AT_ONCE} commands are already being written; wait for them"
         return ""
 
     async def write(self, wish: Wish) -> WriteRecord:
-        """Write it, unless it is refused, and return what became of it."""
+        """Write it, unless it is refused, and return the audit entry."""
         passage = self.begin(wish)
         try:
             with passage:
@@ -200,21 +200,21 @@ class Authorisation:
                     raise InvalidCommand(refusal)
                 await self._pass(wish)
         except (BusError, *NEVER_SENT):
-            pass  # it is in the record
+            pass  # it is in the audit log
         assert passage.record is not None
         if why := await passage.not_durable():
             return passage.record._replace(outcome=Outcome.UNCONFIRMED, error=cut(why))
         return passage.record
 
     def begin(self, wish: Wish) -> Passage:
-        """Let pass what this process itself wishes: its safe state, or what a person writes on its command line.
+        """Begin a write of this process itself: its safe state, or a write from its command line.
 
-        Nothing of it is refused here. The write is for the caller to do, within `with`; a record is kept of it.
+        It is not checked here. The caller does the write within `with`, and it is stored in the audit log.
         """
         return Passage(wish, self.bus.now, self._keep)
 
     def refuse(self, wish: Wish, error: str) -> WriteRecord:
-        """Keep a record of what was not even tried."""
+        """Store the audit entry of a write that was refused before it began."""
         return self._keep(wish, Outcome.REFUSED, error, _before(wish.point), 0.0)[0]
 
     async def _pass(self, wish: Wish) -> None:
@@ -227,7 +227,7 @@ class Authorisation:
             self._running[wish.interface] -= 1
 
     def _left(self, wish: Wish) -> float:
-        """Return for how many seconds it may still wait; inf for one of a person who waits for its end."""
+        """Return for how many seconds the write may still wait; inf if a user waits for the result."""
         if wish.expires is not None:
             return wish.expires - time.time()
         return inf if wish.arrived is None else wish.arrived + FRESH - self.bus.now()
@@ -247,19 +247,19 @@ class Authorisation:
             took=took,
             id=wish.id,
         )
-        # of one that is unconfirmed somebody has to find out what became of it
+        # an unconfirmed write has an unknown result, which the user must check
         level = logging.WARNING if outcome is Outcome.UNCONFIRMED else logging.INFO
         self._log.log(level, "%s", record.text)
         return record, self.record(record)
 
 
 def _before(point: Point[Any] | None) -> Any:
-    """Return what it held when it was last read, None if that may not be so any more."""
+    """Return the last value that was read, None if it may have changed since."""
     return None if point is None else ext.last_value(point)
 
 
 def _shown(value: Any) -> Any:
-    """Return the value as it fits into a record."""
-    if isinstance(value, bytes):  # a command that was not read: as it came, but for what could harm a terminal
+    """Return the value in the form of an audit entry."""
+    if isinstance(value, bytes):  # a command that was not decoded: unchanged, except for control characters
         return cut(repr(value.decode(errors="replace"))[1:-1])
     return value if isinstance(value, int | float) and abs(value) < LARGEST_KEPT else cut(repr(value))

@@ -1,4 +1,4 @@
-"""One program that has come to the line's owner: what it asks is done here, and ends when it goes."""
+"""One program that is connected to the line's owner. Its requests are run here, and end with the connection."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ def _reads_of(role: Role) -> RequestOptions:
 
 
 class Client:
-    """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for.
+    """One connected program. `take` handles its messages in their order; `leave` ends all of its requests.
 
-    `in_safe_place`: it has one of the places for programs that only send the safe state, and nothing else is done for
-    it.
+    `in_safe_place`: it has one of the places for programs that only send the safe state, and all other requests are
+    rejected.
     """
 
     def __init__(
@@ -77,55 +77,55 @@ class Client:
         self._number = number
         self._nodes: dict[NodeKey, Node] = {}
         self._stops: dict[NodeKey, int] = {}
-        """How often each had been told to stop when this client named it: the client counts from there."""
+        """Number of stops of each node when this client named it. The client counts from there."""
         self._stopping: set[Node] = set()
-        """Nodes that it tells to stop, of which it may not write all: it counts with the write that follows, if that is
-        let through."""
+        """Nodes that the client stops without the permission to write all of them. Such a stop counts with the write
+        that follows, if that is permitted."""
         self._refused: dict[NodeKey, str] = {}
-        """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
+        """Why a node could not be used as the client named it. Requests are refused until it is named correctly."""
         self.requests = Requests(self, line, self._tell_result, self._refuse)
-        """What it has asked of the line."""
+        """Its requests that have not ended."""
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
         self._role = self.permission.role
         self.reads = _reads_of(self._role)
-        """The options of its reads that say none."""
+        """Default options of its reads."""
         self.turn = ext.line_of(line.bus).add_client(line.share, self.rights.owner_time, peer.account)
-        """What its requests take turns by, with those of the others."""
+        """Its entry in the rotation of the line's clients."""
         self._holds: dict[int, Hold | str] = {}
-        """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
+        """Its exclusive sequences, by the number from the client; or the reason why one could not begin."""
         self._planning: asyncio.Task[None] | None = None
         self._gathered: dict[int, list[Point[Any]]] = {}
         """Points for poll groups that it will make, by the streams of those."""
 
     @property
     def permission(self) -> Permission:
-        """Return what it may do, as it is now."""
+        """Return its present permission."""
         return self.peer.permission(self._line.authorisation.access)
 
     @property
     def rights(self) -> Rights:
-        """Return what its role may have of the line. `tell_access` changes it: it is not found for every request."""
+        """Return the rights of its role. `tell_access` updates it, so that it is not looked up for every request."""
         return RIGHTS[self._role]
 
     @property
     def read_only(self) -> bool:
-        """Return whether nothing that it writes is let through, as it is now."""
+        """Return whether none of its writes is permitted at present."""
         return self._line.authorisation.read_only or not self.permission.writes
 
     @property
     def errands(self) -> tuple[Errand, ...]:
-        """Return what it asked for that is not done yet."""
+        """Return its requests that have not ended."""
         return self.requests.errands
 
-    # what is said to it
+    # messages to the client
 
     def tell(self, stream: int, method: str, body: str) -> None:
-        """Say something of a stream; it is dropped where the client does not keep up."""
+        """Send a message of a stream; it is dropped if the client does not keep up."""
         self.outbox.put_news(stream, self._news(stream, method, body))
 
     def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
-        """Say something of a part of a stream that replaces what was said of it before."""
+        """Send a message about a part of a stream, which replaces an earlier unsent one."""
         self.outbox.put_latest((stream, method, part), self._news(stream, method, body))
 
     def _news(self, stream: int, method: str, body: str) -> str:
@@ -134,7 +134,7 @@ class Client:
         return f"{head}{body}}}}}"
 
     def tell_access(self) -> None:
-        """Have another role hold at once, and say what the program may do now."""
+        """Apply a changed role at once, and send the new permission."""
         role = self.permission.role
         if role is not self._role:
             self._role, self.reads = role, _reads_of(role)
@@ -142,7 +142,7 @@ class Client:
         self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
 
     def tell_stops(self, node: NodeRecord) -> None:
-        """Say how often a node was told to stop, if this client knows it."""
+        """Send the number of stops of a node, if this client uses it."""
         key = (node.profile.name, node.address)
         if key in self._nodes:
             params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
@@ -150,22 +150,22 @@ class Client:
 
     @property
     def has_values(self) -> bool:
-        """Return whether it follows anything of the line, and so may hold values that a write makes stale."""
+        """Return whether it follows a stream of the line, and so can hold values that a write makes stale."""
         return bool(self._streams)
 
     def tell_touched(self, params: Mapping[str, Any], key: Hashable) -> None:
-        """Say which values a write has made stale; `key` stands for these same values."""
+        """Send which values a write has made stale; `key` identifies these values."""
         self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
 
-    # what it says
+    # messages from the client
 
     def take(self, said: Mapping[str, Any]) -> None:
-        """Do what a message asks. Raises Malformed for what no client of this version says."""
+        """Handle a message. Raises Malformed for one that no client of this version sends."""
         number, method, params = said.get("id"), said.get("method"), said.get("params", {})
         if not isinstance(method, str) or not isinstance(params, dict):
             raise Malformed("a message has a method, and its parameters by name")
         if self.in_safe_place and method not in FOR_SAFE_STATE:
-            raise Malformed("all other places are taken: this program can send the safe state, and nothing else")
+            raise Malformed("all other places are taken; this program can only send the safe state")
         if number is None:
             try:
                 self._notified(method, params)
@@ -211,7 +211,7 @@ class Client:
                     self._stopping.add(node)
 
     def _take_refusals(self, interface: object, kind: object, peers: object) -> None:
-        """Count what an interface in another process reports. What is not a count is ignored."""
+        """Count the refusals that an interface in another process reports. Other data is ignored."""
         if not (isinstance(interface, str) and is_interface_name(interface)):
             return
         if not (isinstance(kind, str) and kind in KINDS and isinstance(peers, dict)):
@@ -223,13 +223,13 @@ class Client:
                 refusals.note(interface, kind, peer, count)
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
-        """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""
+        """Return the immediate reply to a request. Raises InvalidCommand, BusError, or Malformed."""
         match method:
             case "node":
                 return self._name_node(params)
             case "check":
                 if len(params["commands"]) > MOST_CHECKED:
-                    raise InvalidCommand(f"{MOST_CHECKED} writes are checked at once, and no more")
+                    raise InvalidCommand(f"more than {MOST_CHECKED} writes in one check; send several checks")
                 for command in params["commands"]:
                     errand = errand_of({**params, "command": command}, self, self._line)
                     if isinstance(errand, Writing):
@@ -260,10 +260,10 @@ class Client:
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
 
     def _begin_plan(self, number: int, params: Mapping[str, Any]) -> None:
-        """Have a plan calculated: one at a time."""
+        """Begin to calculate a plan: one at a time."""
         try:
             if self._planning is not None and not self._planning.done():
-                raise InvalidCommand("one plan is calculated for a program at a time")
+                raise InvalidCommand("a plan for this program is already being calculated; wait for it")
             more = groups_of(params.get("groups", []), self._line.bus)
         except REFUSED as error:
             self._refuse(number, refusal_of("plan", error))
@@ -279,15 +279,15 @@ class Client:
             self._tell_result(number, plan)
 
     def _steer(self, method: str, params: Mapping[str, Any]) -> None:
-        """Do what changes how the line is polled, for all who use it: it is told whose wish that was.
+        """Change how the line is polled for all clients. The events name the program that did it.
 
-        Raises InvalidCommand where he may not write to the nodes that it is about.
+        Raises InvalidCommand if the program may not write to the nodes.
         """
         if method == "suspend":
             node = self._line.node(params["protocol"], params["address"])
             self._check_steering(node)
             node.suspend(params["for"])
-            did = f"{node.label} is suspended for {params['for']:g} s" if node.suspended else f"{node.label} goes on"
+            did = f"{node.label} is suspended for {params['for']:g} s" if node.suspended else f"{node.label} is resumed"
         else:
             group = self._line.group(params["group"])
             if method == "demand":
@@ -295,13 +295,13 @@ class Client:
                 return
             self._check_steering(*(point.node for point in group.points))
             group.pause() if params["paused"] is True else group.resume()
-            did = f"{group.name} {'is paused' if group.paused else 'goes on'}"
-        self._line.journal.note(f"{did}, says {self.peer}")
+            did = f"{group.name} is {'paused' if group.paused else 'resumed'}"
+        self._line.journal.note(f"{did} by {self.peer}")
 
     def _check_steering(self, *nodes: Requester) -> None:
         if not all(map(self.permission.reaches, nodes)):
             raise InvalidCommand(
-                f"{self.permission.who} may not have this rest: that is for who may write to its nodes"
+                f"{self.permission.who} may not pause or suspend this; that needs the permission to write to its nodes"
             )
 
     # nodes
@@ -348,13 +348,13 @@ class Client:
                 check_within(times, profile, address)
         node = ext.lend_node(bus, profile, address, timings=times, retries=retries, budgeted=rights.budgeted)
         if known is not None:
-            ext.give_back(bus, node)  # it was asked for its complaint alone
+            ext.give_back(bus, node)  # lent only for the error that it would raise
         self._nodes[name, address] = node
         self._stops.setdefault((name, address), node.stops)
         return node
 
     def stops_before(self, node: Node) -> int:
-        """Return how often a node had been told to stop when this client named it."""
+        """Return the number of stops of a node when this client named it."""
         return self._stops[node.profile.name, node.address]
 
     def takes_stop(self, node: Node) -> bool:
@@ -385,7 +385,7 @@ class Client:
         return hold
 
     def _hold(self, params: Mapping[str, Any]) -> None:
-        """Begin a sequence; the requests of one that cannot be begun are told why."""
+        """Begin a sequence. If it cannot begin, its requests are refused with the reason."""
         number = params.get("sequence")
         if isinstance(number, int) and not isinstance(self._holds.get(number), Hold) and len(self._holds) < MOST_HOLDS:
             try:
@@ -397,9 +397,9 @@ class Client:
 
     def _begin_hold(self, params: Mapping[str, Any]) -> Hold:
         node = self.node(params["protocol"], params["address"])
-        if not self.permission.reaches(node):  # who may only read keeps nobody waiting so
+        if not self.permission.reaches(node):  # a program that only reads must not keep others waiting like this
             raise InvalidCommand(
-                f"{node.label}: {self.permission.who} may not hold the line for it: who may write to it does"
+                f"{node.label}: {self.permission.who} may not hold the line; that needs the permission to write to it"
             )
         return ext.hold(node, seconds(params["max_hold"], "max_hold"), self.turn)
 
@@ -467,11 +467,11 @@ class Client:
     # its end
 
     def release(self) -> None:
-        """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
+        """Send the result of all of its requests, because the service ends, and perhaps the bus too."""
         self.requests.end()
 
     async def leave(self) -> None:
-        """End all that it asked for, and give back its nodes."""
+        """End all of its requests, and give back its nodes."""
         if self._planning is not None:
             self._planning.cancel()
         for stream in list(self._streams):

@@ -1,5 +1,5 @@
-"""One end of a WebSocket, without a task: what is said leaves in the turn of the loop in which it is said, and what
-comes is heard in that in which it came. The library knows the bytes; here are the transport, the time, and the end.
+"""One end of a WebSocket, without a task: messages are sent and delivered in the same turn of the loop. The library
+encodes and decodes the bytes. This module adds the transport, the timers and the end of a connection.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from websockets.server import ServerProtocol
 
 PING_EVERY = 20.0
-"""Seconds between two pings. One that says nothing at all between two of them is let go."""
+"""Seconds between two pings. A peer that sends nothing between two of them is disconnected."""
 LONGEST_REFUSAL = 300
 """Bytes of the words of a refusal that are shown."""
 CLOSE_WITHIN = 1.0
-"""Seconds that the other end has to hear the last of it."""
+"""Seconds for the other end to receive the last message."""
 NORMAL, GOING_AWAY, NO_TEXT, POLICY = 1000, 1001, 1007, 1008
 
 END_OF_HEAD = b"\r\n\r\n"
@@ -39,27 +39,27 @@ _ANY_URI = "ws://busmaster/"
 
 
 class Hearer(Protocol):
-    """Who hears what comes. Nothing of it may raise: the connection would be lost."""
+    """Receives the messages of a connection. Its methods must not raise, because the connection would be lost."""
 
     def opened(self) -> None:
-        """Hear that messages may be said, and will come."""
+        """Handle the opening: from now on messages can be sent, and will arrive."""
         ...
 
     def heard(self, message: str | bytes) -> None:
-        """Hear a message: bytes are none of JSON-RPC's."""
+        """Handle a message. Bytes are not JSON-RPC."""
         ...
 
     def writable(self) -> None:
-        """Hear that the connection is not full any more."""
+        """Handle that the connection is not full any more."""
         ...
 
     def lost(self) -> None:
-        """Hear that the connection is over, for whatever reason: the last that is heard."""
+        """Handle the end of the connection, for any reason. It is the last call."""
         ...
 
 
 class TokenCheck(Hearer, Protocol):
-    """Who hears what comes to one that serves, and decides whether it may."""
+    """Receives the messages of a serving connection, and decides whether it is admitted."""
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
         """Return after how many seconds a connection that was made is read; None if it is closed."""
@@ -71,8 +71,8 @@ class TokenCheck(Hearer, Protocol):
 
 
 class Connection(asyncio.BufferedProtocol):
-    """One end of a connection, for an event loop. `hearer` hears what comes, at most `read_at_once` bytes in a turn;
-    a message of more than `longest` bytes is the last."""
+    """One end of a connection, for an event loop. `hearer` receives the messages, at most `read_at_once` bytes in a
+    turn; a message of more than `longest` bytes ends the connection."""
 
     _serves: bool
 
@@ -80,7 +80,7 @@ class Connection(asyncio.BufferedProtocol):
         self, core: ServerProtocol | ClientProtocol, hearer: Hearer, *, longest: int, read_at_once: int
     ) -> None:
         self.full = False
-        """Whether what was said last has not left yet: what is said now waits behind it in memory."""
+        """Whether earlier messages are still unsent. Later ones wait behind them in memory."""
         self._core = core
         self._hearer = hearer
         self._buffer = memoryview(bytearray(read_at_once))
@@ -88,12 +88,12 @@ class Connection(asyncio.BufferedProtocol):
         self._loop: asyncio.AbstractEventLoop
         self._is_open = False
         self._talks = False
-        """Whether messages are said and heard: it is open, and the end of it is not said yet."""
+        """Whether messages are exchanged: the connection is open, and its end is not announced yet."""
         self._rest = bytearray()
-        """The beginning of a frame that has not come whole."""
+        """The beginning of an incomplete frame."""
         self._longest = longest + LONGEST_HEAD
         self._key = b""
-        """For the mask of what is said next: an owner has none."""
+        """Key for the mask of the next message; empty for an owner."""
         self._masks = False
         """Whether each message has another key."""
         self._part: bytearray | None = None
@@ -109,20 +109,20 @@ class Connection(asyncio.BufferedProtocol):
 
     @property
     def transport(self) -> asyncio.Transport:
-        """Return what it runs on, once it is made."""
+        """Return the transport, once it exists."""
         assert self._transport is not None
         return self._transport
 
     def say(self, text: str) -> None:
-        """Say a message: nothing where the connection ends already."""
+        """Send a message, unless the connection is ending."""
         transport = self._transport
         if self._talks and transport is not None and not transport.is_closing():
             transport.write(text_frame(text.encode(), self._key))
             if self._masks:
-                self._key = new_key()  # already: what is said next is to wait for nothing
+                self._key = new_key()  # in advance, so that the next message does not wait for it
 
     def close(self, code: int = NORMAL, reason: str = "") -> None:
-        """Say that this is the end, behind all that was said; the other end has CLOSE_WITHIN to agree."""
+        """Announce the end, after all messages. The other end has CLOSE_WITHIN to agree."""
         if self._talks:
             self._core.send_close(code, reason)
             self._write()
@@ -224,7 +224,7 @@ class Connection(asyncio.BufferedProtocol):
         """Look at a frame that is not a whole message."""
 
     def _feed(self, data: bytes) -> None:
-        """Have the library see to what is no whole text."""
+        """Let the library handle everything except whole texts."""
         self._core.receive_data(data)
         self._write()
         for event in self._core.events_received():
@@ -268,7 +268,7 @@ class Connection(asyncio.BufferedProtocol):
             self._set_timer("close", CLOSE_WITHIN, self.abort)
 
     def _ping(self) -> None:
-        """Let go of one of whom nothing came since it was pinged. While nothing is read from it that says nothing."""
+        """Disconnect a peer that has sent nothing since the last ping, unless reading is paused."""
         if self._silent and self.transport.is_reading():
             self.abort()
         elif self._talks:
@@ -282,7 +282,7 @@ class Connection(asyncio.BufferedProtocol):
 
 
 class ServedConnection(Connection):
-    """The end of whoever serves."""
+    """The server's end."""
 
     _core: ServerProtocol
     _hearer: TokenCheck
@@ -316,9 +316,9 @@ class ServedConnection(Connection):
             self._frames, self._counted_from = 0, now
         self._frames += 1
         if self._frames > MOST_FRAMES and self._talks:
-            self._core.fail(POLICY, f"{MOST_FRAMES} pings and pieces of messages in a second at most")
+            self._core.fail(POLICY, f"more than {MOST_FRAMES} pings and pieces of messages in a second")
             self._write()
-            self.pause()  # what else it sends is not read: it has CLOSE_WITHIN to take this
+            self.pause()  # its further data is not read: it has CLOSE_WITHIN to receive this
 
     def _shake_hands(self, event: Request) -> None:
         refusal = self._hearer.refusal(event)
@@ -330,10 +330,10 @@ class ServedConnection(Connection):
 
 
 class AskingConnection(Connection):
-    """The end of whoever connects, and shows a token if he has one.
+    """The client's end, with a token if there is one.
 
-    `masks`: what it says passes where something between the two ends could take it for something else. In the kernel is
-    nothing, and each end is spared the time of a mask.
+    `masks`: whether messages are masked, as required where a proxy between the two ends could misinterpret them. There
+    is no proxy on a Unix socket, and both ends save the time.
     """
 
     _core: ClientProtocol
@@ -351,31 +351,31 @@ class AskingConnection(Connection):
 
     @property
     def status(self) -> int | None:
-        """Return the HTTP status with which the other end did not let us in, None if it did, or said none."""
+        """Return the HTTP status of a refusal, None if there was none."""
         response = getattr(self._core.handshake_exc, "response", None)
         return None if response is None else int(response.status_code)
 
     @property
     def refusal(self) -> str:
-        """Return the words with which the other end did not let us in, "" if it said none."""
+        """Return the text of a refusal, "" if there was none."""
         body = getattr(getattr(self._core.handshake_exc, "response", None), "body", None)
         text = bytes(body or b"")[:LONGEST_REFUSAL].decode(errors="replace").strip()
         return text if text.isprintable() else ""
 
     @property
     def complaint(self) -> str | None:
-        """Return why the other end cannot be spoken with, None as long as it can."""
+        """Return why communication with the other end failed, None if it did not."""
         return None if self._core.handshake_exc is None else str(self._core.handshake_exc)
 
     @property
     def farewell(self) -> str:
-        """Return why the other end let go of us, "" as long as it has not said so."""
+        """Return the reason with which the other end closed the connection, "" if it has not."""
         said = self._core.close_rcvd
         return "" if said is None else said.reason
 
     @property
     def owner_ended(self) -> bool:
-        """Return whether the other end let go of us because it ends in good order."""
+        """Return whether the other end closed the connection because it ends in an orderly way."""
         said = self._core.close_rcvd
         return said is not None and said.code == GOING_AWAY
 
@@ -418,18 +418,18 @@ def origin_of(connected: socket.socket | None) -> int | str | None:
 
 
 def check_installed() -> tuple[type[ServerProtocol], type[ClientProtocol], Callable[[str], Any]]:
-    """Return what knows the bytes of either end. Raises InvalidCommand, with what to install, where it is missing."""
+    """Return the protocol classes of the library. Raises InvalidCommand with the missing package."""
     try:
         from websockets.client import ClientProtocol
         from websockets.server import ServerProtocol
         from websockets.uri import parse_uri
     except ImportError:
-        raise InvalidCommand("lines are shared by way of websockets: pip install 'busmaster[service]'") from None
+        raise InvalidCommand("sharing a line needs websockets; pip install 'busmaster[service]'") from None
     return ServerProtocol, ClientProtocol, parse_uri
 
 
 def _quiet() -> logging.Logger:
-    """Return a log for what the library says of connections that come and go: it is no news of the line's."""
+    """Return a log for the library's messages about connections, which are not of interest to the user."""
     log = logging.getLogger("busmaster.app.service.connections")
     if not log.handlers:
         log.addHandler(logging.NullHandler())

@@ -1,4 +1,4 @@
-"""One request of a client: a command that is built here again, and so checked again, and runs on the line."""
+"""One request of a client: a command that is built again here, and so checked again, and run on the line."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from busmaster.ext import (
 )
 
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
-"""Of a request, those that a client may say."""
+"""Options of a request that a client can set."""
 INTERFACE = "service"
 
 
 class Asker(Protocol):
-    """Who asks for it."""
+    """The client that sends the request."""
 
     @property
     def peer(self) -> Peer: ...
@@ -48,7 +48,7 @@ class Asker(Protocol):
 
     @property
     def reads(self) -> RequestOptions:
-        """Return the options of its reads that say none: their class is the highest that its role has for reads, but
+        """Return the default options of its reads. Their priority is the highest that its role has for reads, except
         for URGENT."""
         ...
 
@@ -61,15 +61,15 @@ class Asker(Protocol):
 
     @property
     def turn(self) -> LineClient:
-        """Return what its requests take turns by, but for those of its sequences."""
+        """Return its entry in the rotation of clients, except for its sequences."""
         ...
 
     def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
-        """Return whose turn a request takes: the program's, or that of its sequence. Raises InvalidCommand."""
+        """Return the rotation entry of a request: the program's, or that of its sequence. Raises InvalidCommand."""
         ...
 
     def stops_before(self, node: Node, /) -> int:
-        """Return the stops of a node from which this client counts."""
+        """Return the number of stops of a node from which this client counts."""
         ...
 
     def takes_stop(self, node: Node, /) -> bool:
@@ -77,23 +77,23 @@ class Asker(Protocol):
         ...
 
     def tell_stops(self, node: NodeRecord, /) -> None:
-        """Say how often a node was told to stop."""
+        """Send the number of stops of a node."""
         ...
 
 
 class Task(NamedTuple):
-    """What is asked for: a command for a node, and what reads what it writes (`touches`); perhaps its point."""
+    """A requested command for a node, the command that reads the written value (`touches`), and perhaps its point."""
 
     node: Node
     command: Command[Any]
     touches: Command[Any] | None = None
     value: Any = None
-    """As the record of a write has it."""
+    """The value in the form of the audit log."""
     point: Point[Any] | None = None
 
     @classmethod
     def of_node(cls, params: Mapping[str, Any], asker: Asker) -> Task:
-        """Return a command that a client names. Raises InvalidCommand for what the protocol does not have."""
+        """Return the command that a client sends. Raises InvalidCommand for one that the protocol does not have."""
         node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
         command, touches = protocol.read_back(params["command"]), params.get("touches")
         value = str(command) if command.writes else None
@@ -103,7 +103,7 @@ class Task(NamedTuple):
     def of_point(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Task:
         """Return the write of a value to a point of a poll group.
 
-        Raises InvalidCommand, and keeps a record of it, for what cannot be written.
+        Raises InvalidCommand, after an audit entry, for a value that cannot be written.
         """
         _, point = line.point(params["group"], params["key"])
         value = value_of(params["value"])
@@ -121,12 +121,12 @@ class Task(NamedTuple):
 
 
 Told: TypeAlias = Callable[["Errand", Any, BaseException | None], object]
-"""Hears the end of an errand: its value, or its error; neither of one that was given up, see there."""
+"""Called at the end of a request with its value or its error; with neither if it was cancelled, see there."""
 
 
 class Reading:
-    """A command that writes nothing, for one client. It is told itself what became of it: at once, for the turn of the
-    loop that a future takes is a part of what a program waits beyond what the line takes.
+    """A command that writes nothing, for one client. It gets the result itself, at once: the turn of the loop that a
+    future takes would add to the time that a program waits.
     """
 
     __slots__ = ("_over", "_request", "_told", "command", "given_up", "node")
@@ -149,44 +149,44 @@ class Reading:
 
     @property
     def sent(self) -> bool:
-        """Return whether an attempt of it was handed to the line."""
+        """Return whether an attempt was passed to the line."""
         return self._request.sent
 
     def begin(self, told: Told) -> None:
-        """Have it done; `told` hears its end once, perhaps before this returns.
+        """Start the command; `told` is called once at its end, perhaps before this returns.
 
-        Raises BusError or InvalidCommand where nothing could be begun.
+        Raises BusError or InvalidCommand if it could not be started.
         """
         self._told = told
         ext.start(self.node, self._request, self)
 
     def cancel(self) -> None:
-        """Give it up: what is on the wire runs out unheard."""
+        """Cancel the command. If it is on the wire, its reply is discarded."""
         if not self._over:
             if self._request.transaction is not None:
                 ext.give_up(self.node, self._request.transaction)
             self._over = self.given_up = True
             self._told(self, None, None)
 
-    # what the line tells
+    # called by the line
 
     def done(self) -> bool:
-        """Return whether nobody waits for it any more."""
+        """Return whether the result is not awaited any more."""
         return self._over
 
     def set_result(self, value: Any, /) -> None:
-        """Hear what was read."""
+        """Handle the value that was read."""
         self._over = True
         self._told(self, value, None)
 
     def set_exception(self, error: BaseException, /) -> None:
-        """Hear why nothing was."""
+        """Handle the error of a failed read."""
         self._over = True
         self._told(self, None, error)
 
 
 class Writing:
-    """A command that writes, with its options, for one client. It passes authorisation."""
+    """A command that writes, with its options, for one client. It is checked by authorisation."""
 
     def __init__(
         self,
@@ -204,7 +204,7 @@ class Writing:
         self.command = task.command
         self.given_up = False
         self.doing: asyncio.Task[Any] | None = None
-        """What is done for it, once it is begun."""
+        """The running write, once it has begun."""
         self._request = Request(task.command, ORDINARY, task.touches, stops_seen, stop, client)
         self._task = task
         self._options = options
@@ -217,11 +217,11 @@ class Writing:
 
     @property
     def sent(self) -> bool:
-        """Return whether an attempt of it was handed to the line."""
+        """Return whether an attempt was passed to the line."""
         return self._request.sent
 
     def check(self) -> None:
-        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        """Raise InvalidCommand for a write that would be refused now, after an audit entry."""
         wish = self._wish()
         try:
             if refusal := self._line.authorisation.refusal(wish):
@@ -232,7 +232,7 @@ class Writing:
             raise
 
     def begin(self, told: Told) -> None:
-        """Have it done; `told` hears its end once."""
+        """Start the write; `told` is called once at its end."""
         self._told = told
         if self._asker.takes_stop(self.node):
             self._stop_node()
@@ -240,14 +240,14 @@ class Writing:
         self.doing.add_done_callback(self._written)
 
     def cancel(self) -> None:
-        """Give it up: what is on the wire runs out unheard."""
+        """Cancel the write. If it is on the wire, its reply is discarded."""
         if self.doing is not None:
             self.doing.cancel()
 
     # inside
 
     def _stop_node(self) -> None:
-        """Count the stop that this write is, if it may be written; else its program is told how many count."""
+        """Count this write as a stop if it is permitted. Otherwise send the program the number of stops."""
         if self._line.authorisation.refusal(self._wish()):
             self._asker.tell_stops(ext.record_of(self.node))
         else:
@@ -269,10 +269,10 @@ class Writing:
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
                 raise NotStarted(
-                    f"it came {age:.1f} s after it was asked for",
+                    f"the request arrived {age:.1f} s after the program made it",
                     node=self.node,
                     command=str(self.command),
-                    hint="see whether the program that asked, or the one that owns the line, stood still meanwhile",
+                    hint="check whether the requesting program, or the owner of the line, was stopped meanwhile",
                 )
             self._request.options = ext.checked_options(
                 self.node, _left(self._options, self._line.bus.now() - self._asked)
@@ -283,20 +283,20 @@ class Writing:
             raise
         passage.end(None)
         if why := await passage.not_durable():
-            hint = "see why that output is down; the value need not be written again"
+            hint = "check why that output failed; the value need not be written again"
             raise WriteUnconfirmed(why, node=self.node, command=str(self.command), hint=hint)
         return value
 
     def _truth(self, error: BaseException) -> BaseException:
-        """Return what is kept of a write that ended so: one that was given up may never have been sent."""
+        """Return the error for the audit log. A cancelled write may never have been sent."""
         if isinstance(error, Exception):
             return error
         if self.sent:
-            return WriteUnconfirmed("its program gave up before it was answered")
-        return NotStarted("its program gave up before it was sent")
+            return WriteUnconfirmed("its program cancelled it before the reply")
+        return NotStarted("its program cancelled it before it was sent")
 
     def _wish(self) -> Wish:
-        """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
+        """Return the request for the audit log, with the name and unit of a point if a poll group has it."""
         command, point, value = self.command, self._task.point, self._task.value
         if point is None and isinstance(command, Changing):
             changes = command.changes(self.node.profile)
@@ -319,14 +319,14 @@ Errand: TypeAlias = Reading | Writing
 
 
 def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
-    """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
+    """Return the request of a client. Raises InvalidCommand for a command that the protocol does not have."""
     if isinstance(said, PlainRead):
         return Reading(asker.node(said.protocol, said.address), said.command, asker.turn, None, asker.reads)
     task = Task.of_point(said, asker, line) if "key" in said else Task.of_node(said, asker)
     node, command = task.node, task.command
     given = cast("CommandOptions", said.get("options") or {})
     if not set(given) <= OPTIONS:
-        raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
+        raise InvalidCommand(f"unknown options in {', '.join(given)}; use {', '.join(sorted(OPTIONS))}")
     RequestOptions.of(given, node.label)  # checked here, before it may wait
     _check_waits(given, node)
     now, stops_seen = line.bus.now(), said.get("stops_seen")
@@ -352,7 +352,7 @@ def _check_waits(options: CommandOptions, node: Node) -> None:
 
 
 def _left(options: CommandOptions, age: float) -> CommandOptions:
-    """Return the options of a request, less the seconds since it was asked for."""
+    """Return the options of a request, reduced by the seconds since it was made."""
     left: dict[str, Any] = dict(options)
     for name in ("start_within", "finish_within"):
         limit = left.get(name)
@@ -378,10 +378,10 @@ def _encoded(point: Point[Any], value: Any) -> Command[Any]:
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:
-    """Return True for what stops. Raises InvalidCommand for what does more: a stop passes whatever the limits."""
+    """Return True for a stop. Raises InvalidCommand for any other write, because limits do not apply to stops."""
     changes = command.changes(node.profile) if isinstance(command, Changing) else {"": None}
     if any(value != 0 for value in changes.values()):
-        raise InvalidCommand(f"{node.label}: {command} is no stop, which writes 0 and nothing else: leave out `stop`")
+        raise InvalidCommand(f"{node.label}: {command} is not a stop, which only writes 0; leave out `stop`")
     return True
 
 
@@ -390,5 +390,5 @@ def _value(point: Point[Any], changes: Mapping[Hashable, Any], otherwise: Any) -
     assert isinstance(point.command, Placed)
     try:
         return point.value_of(point.command.shown(changes))
-    except Exception:  # of a decoder; the record then says what was sent
+    except Exception:  # of a decoder; the audit log then has the value on the line
         return otherwise

@@ -1,4 +1,4 @@
-"""What passes on a line, exchange by exchange, told to those who look; while nobody does it costs nothing."""
+"""The exchanges on a line, for clients that watch it. Without such clients, it costs nothing."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ ENCODED_AT_ONCE = 40
 MOST_KEPT = 500
 """Exchanges between two messages: of more, the oldest are left out, and counted."""
 MOST_BYTES = 256
-"""Of one exchange, or of what came unexpected, that are told."""
+"""Maximum number of bytes that are reported for one exchange, or for unexpected bytes."""
 LONGEST_RESULT = 200
 HEARD_AT_ONCE = 200
 """Pieces of what passes that are put into their order at once."""
 
 
 class Passage:
-    """One attempt at a command with all that was said; without an attempt, bytes that nobody had asked for."""
+    """One attempt at a command with all of its bytes; or, without an attempt, unexpected bytes."""
 
     __slots__ = ("attempt", "bytes", "said")
 
     def __init__(self, attempt: Attempt | None) -> None:
         self.attempt = attempt
         self.said: list[list[Any]] = []
-        """When, by whom, and what, as it is told."""
+        """Time, sender and bytes, in the form of the message."""
         self.bytes = 0
 
     def add(self, now: float, by_master: bool, data: bytes) -> None:
-        """Add what was said."""
+        """Add bytes that were sent or received."""
         if self.bytes < MOST_BYTES:
             told = data[: MOST_BYTES - self.bytes].hex()
             self.said.append([round(now * 1e6), "master" if by_master else "node", told])
@@ -50,9 +50,9 @@ class Passage:
 
 
 class Listener:
-    """The tap: it keeps what passes until it is taken.
+    """The tap: it stores exchanges until they are taken.
 
-    It is told between a reply and the next request, so it makes nothing of it then.
+    It is called between a reply and the next request, so it only stores the bytes.
     """
 
     def __init__(self) -> None:
@@ -61,25 +61,25 @@ class Listener:
         self._passages: deque[Passage] = deque()
         self._last: Passage | None = None
         self._has_begun = False
-        """An attempt began: what came before that may be the answer to one that nobody listened to."""
+        """An attempt has begun. Earlier bytes can be the reply to an attempt that was not recorded."""
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        """Hear what the master says: with a new attempt its request, with none what closes the attempt before."""
+        """Store bytes of the master: the request of a new attempt, or without one the end of the attempt before."""
         self._heard.append((now, True, data, attempt))
         if len(self._heard) == HEARD_AT_ONCE:
             self._put_in_order()
 
     def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        """Hear what comes."""
+        """Store received bytes."""
         self._heard.append((now, False, data, attempt))
         if len(self._heard) == HEARD_AT_ONCE:
             self._put_in_order()
 
     def attempted(self, attempt: Attempt, /) -> None:
-        """Hear that an attempt is over, which it says itself."""
+        """Do nothing: an attempt has its own end."""
 
     def take(self) -> tuple[list[Passage], int]:
-        """Return what is over, in its order, and how many exchanges were ever left out; what is on the wire is kept."""
+        """Return the completed exchanges in their order, and the number of all that were dropped."""
         self._put_in_order()
         over: list[Passage] = []
         while self._passages and self._passages[0].is_over:
@@ -135,8 +135,8 @@ class ExchangesBroadcast(Broadcast):
 
 
 def said_passage(passage: Passage) -> list[Any]:
-    """Return an exchange that is over as it is said: values in an order that is fixed, times in whole microseconds,
-    bytes in hexadecimal digits. It is said of each, so its names are not, and floats take ten times as long.
+    """Return a completed exchange as a list for JSON: values in a fixed order, times in whole microseconds, bytes in
+    hexadecimal digits. Names would be repeated for each exchange, and floats take ten times as long.
     """
     attempt = passage.attempt
     if attempt is None or attempt.verdict is None:

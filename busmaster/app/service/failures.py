@@ -10,7 +10,7 @@ from busmaster.errors import BusError, InvalidCommand, Refused
 
 FIELDS = ("what", "line", "label", "address", "command", "attempts", "hint")
 DEEPEST = 5
-"""Causes behind causes that are told."""
+"""Maximum number of causes of an error that are sent."""
 REFUSED = (
     BusError,
     Malformed,
@@ -21,7 +21,7 @@ REFUSED = (
     OverflowError,  # a number of some hundred digits
     RecursionError,  # a list in a list in a list
 )
-"""What may be raised of a request: by the line, and by parameters that are not what they should be."""
+"""Exceptions of a request: from the line, or from invalid parameters."""
 KNOWN: dict[str, type[BusError]] = {
     name: thing
     for name in errors.__all__
@@ -30,7 +30,7 @@ KNOWN: dict[str, type[BusError]] = {
 
 
 def said_error(error: Exception) -> dict[str, Any]:
-    """Return an error as JSON-RPC has it; what it was is in its `data`."""
+    """Return an error in the form of JSON-RPC; its class is in its `data`."""
     if isinstance(error, Malformed):
         return {"code": error.code, "message": str(error)}
     if isinstance(error, BusError):
@@ -41,8 +41,8 @@ def said_error(error: Exception) -> dict[str, Any]:
 
 
 def refusal_of(method: str, error: Exception) -> Exception:
-    """Return why a request is refused, in words for its program: of REFUSED, what is raised of parameters that are
-    none of its method's says too little.
+    """Return why a request is refused, as text for its program. Exceptions from invalid parameters get a text with the
+    method.
     """
     if isinstance(error, BusError | InvalidCommand | Malformed):
         return error
@@ -64,7 +64,7 @@ def error_data(error: BusError, depth: int = 0) -> dict[str, Any]:
 
 
 def error_of(said: dict[str, Any]) -> Exception:
-    """Return the error that was said: a fresh one, with all its fields."""
+    """Return a new error with all fields of the received one."""
     data = said.get("data") or {}
     if data.get("error") == "InvalidCommand":
         return InvalidCommand(data["what"])

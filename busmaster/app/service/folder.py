@@ -1,7 +1,7 @@
-"""Where the sockets of lines are, and whose they are.
+"""The sockets of lines, and their owners.
 
-Beside each socket NAME.sock is NAME.line, which its owner has locked: it says which process serves which port. The
-lock, and not the socket, says who may listen, so that of two that start at once one alone succeeds.
+Beside each socket NAME.sock is NAME.line, which the owner has locked. It contains the process and its port. The lock,
+not the socket, decides who may listen, so that only one of two simultaneous starts succeeds.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LONGEST_PATH = 107
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Who serves a line: its name, its port, the socket, and the process; of the port, what it was opened with."""
+    """The owner of a line: its name, port, socket and process, and the settings with which the port was opened."""
 
     name: str
     port: str
@@ -49,15 +49,15 @@ class Owner:
 
 
 def line_name(text: str) -> str:
-    """Return what a line is called after its file or its port: /dev/ttyUSB0 is "ttyUSB0"."""
+    """Return the name of a line, from its file or its port: /dev/ttyUSB0 is "ttyUSB0"."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", os.path.basename(text.rstrip("/")) or text).strip(".-")[:LONGEST_LINE_NAME]
     return name or "line"
 
 
 def checked_name(name: str) -> str:
-    """Return a line's name. Raises InvalidCommand for what can be none: a socket is called so."""
+    """Return a line's name. Raises InvalidCommand for an invalid one, because the socket has this name."""
     if name != line_name(name):
-        raise InvalidCommand(f"{name!r} is no name of a line: like {line_name(name)!r}, it has letters, digits and _.-")
+        raise InvalidCommand(f"{name!r} is not a name of a line; use letters, digits and _.-, like {line_name(name)!r}")
     return name
 
 
@@ -85,7 +85,7 @@ def _folder() -> Path:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Return whether a folder is this user's, or root's, and nobody else may write there."""
+    """Return whether a folder is this user's, or root's, and no other user may write there."""
     try:
         found = folder.lstat()
     except OSError:
@@ -118,20 +118,20 @@ def find_owner(port: str) -> Owner | None:
 
 
 def _devices(port: str) -> set[Hashable]:
-    """Return what a port is, whatever leads to it and is said of it: a device, or the addresses of a serial server."""
+    """Return the identity of a port, independent of its spelling: a device, or the addresses of a serial server."""
     name = port.partition("?")[0].removeprefix("socket://")
     if name.startswith("/"):
         return {os.path.realpath(name)}
     try:
         return addresses_of(name)
-    except (InvalidCommand, OSError):  # it is the name of a line, or of a host that nobody knows now
+    except (InvalidCommand, OSError):  # it is the name of a line, or of an unknown host
         return {name}
 
 
 def addresses_of(name: str) -> set[Hashable]:
     """Return the addresses of `HOST:PORT`, each in the one spelling that is compared. It may take long.
 
-    Raises InvalidCommand for what is something else, OSError for a host that is not known.
+    Raises InvalidCommand for any other text, OSError for an unknown host.
     """
     host, port = host_and_port(name)
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
@@ -150,26 +150,26 @@ def plain_address(text: str) -> str:
 
 
 def socket_path(address: str) -> str:
-    """Return the socket that `unix:PATH`, or a line's or a port's name, stands for.
+    """Return the socket of `unix:PATH`, or of the name of a line or port.
 
-    Raises LineDown where nobody serves a line of that name: an owner that has ended leaves nothing that could tell its
-    name from one that never was, and whoever waits for the owner to come back waits for the name.
+    Raises LineDown if there is no running line of that name. The name of a stopped line cannot be distinguished from an
+    unknown name, so a caller that waits for the owner waits for the name.
     """
     if address.startswith("unix:"):
         return address.removeprefix("unix:").removeprefix("//")
     owner = find_owner(address)
     if owner is None:
         names = ", ".join(owner.name for owner in owners()) or "none"
-        what = f"no program of this user serves {address!r}, and there are the lines: {names}"
-        raise LineDown(what, hint="start busmaster run, or name one of those, or unix:PATH")
+        what = f"no running line named {address!r} (running: {names})"
+        raise LineDown(what, hint="start it with: busmaster run LINE.toml; or name a running line, or unix:PATH")
     return owner.socket
 
 
 class ServedSocket:
-    """The socket of its owner's line, listening, in `with`. Raises InvalidCommand, naming the process, where one does
-    so already.
+    """The listening socket of its owner's line, for `with`. Raises InvalidCommand with the process if the socket is
+    already served.
 
-    What a process that has died left there is replaced. `mode` is the socket's; `group` is a group's number.
+    The socket of a process that has died is replaced. `mode` is the socket's; `group` is a group's number.
     """
 
     def __init__(self, owner: Owner, *, mode: int = 0o600, group: int | None = None) -> None:
@@ -182,7 +182,7 @@ class ServedSocket:
 
     def __enter__(self) -> ServedSocket:
         if len(os.fsencode(self._path)) > LONGEST_PATH:
-            raise InvalidCommand(f"{self._path} is too long for a socket: {LONGEST_PATH} bytes at most")
+            raise InvalidCommand(f"{self._path} has more than {LONGEST_PATH} bytes; use a shorter path for the socket")
         try:
             self._take_lock()
             try:
@@ -204,7 +204,7 @@ class ServedSocket:
             self._path.unlink()
         with contextlib.suppress(OSError):
             self._line.unlink()
-        os.close(self._lock)  # last: until then nobody else begins
+        os.close(self._lock)  # last: until then no other process begins
 
     @property
     def _line(self) -> Path:
@@ -222,10 +222,10 @@ class ServedSocket:
                 os.close(self._lock)
                 other = _read(self._line)
                 who = "another process" if other is None else f"process {other.pid}, for {other.port}"
-                mend = "use it, or end that first"
+                mend = "use it, or stop that process first"
                 if other is not None and not _devices(other.port) & _devices(self.owner.port):
-                    mend = "call this line something else, after which its socket is named"
-                raise InvalidCommand(f"{self._path} is served already by {who}: {mend}") from None
+                    mend = "give this line another name, which is also the name of its socket"
+                raise InvalidCommand(f"{self._path} is already served by {who}; {mend}") from None
             os.close(self._lock)
         os.ftruncate(self._lock, 0)
         os.write(self._lock, json.dumps(asdict(self.owner)).encode())
@@ -233,9 +233,9 @@ class ServedSocket:
     def _listen(self) -> None:
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISSOCK(self._path.lstat().st_mode):
-                raise InvalidCommand(f"{self._path} is no socket: it is left alone")
+                raise InvalidCommand(f"{self._path} is not a socket and is not replaced; use another path")
             if _listens(self._path):
-                raise InvalidCommand(f"{self._path} is the socket of another program: it is left alone")
+                raise InvalidCommand(f"{self._path} is the socket of another program; stop it, or use another path")
             self._path.unlink()
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
@@ -264,7 +264,7 @@ def _read(path: Path) -> Owner | None:
     try:
         said = json.loads(read_file(path, LONGEST_LINE_RECORD))
         owner = Owner(**said)
-        # Another program of this user may have made the file: what is not as we write it is not a line's.
+        # Another program of this user may have made the file. A file with other contents is ignored.
         texts = [said[name] for name in ("name", "port", "socket")]
         fits = all(isinstance(text, str) and "\0" not in text for text in texts) and type(said["pid"]) is int
         return owner if fits else None
@@ -273,7 +273,7 @@ def _read(path: Path) -> Owner | None:
 
 
 def _listens(path: Path | str) -> bool:
-    """Return whether somebody listens there; True too where this user may not ask."""
+    """Return whether a process listens there; True also if this user may not connect."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
         try:

@@ -15,8 +15,8 @@ NO_MASK = bytes(4)
 
 
 def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
-    """Return how many bytes the frame that begins so has, or how many it takes to tell, and the text in it: None unless
-    it has come, is a whole text, and is masked or not as its sender is to do.
+    """Return the size of the frame at the start, or the number of bytes needed to know it, and the text of the frame.
+    The text is None unless it is complete, a whole text, and masked as required.
     """
     come = len(data)
     if come < 2:

@@ -1,4 +1,4 @@
-"""A served line, as the programs that come to it share it: what is told of it is worked out once for all of them."""
+"""A served line, shared by the connected programs: its messages are made once for all of them."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class ServedLine:
         self.authorisation = authorisation
         self.share = share
         self.title = title
-        """What is written over what a person sees of the line."""
+        """Title above the views of the line."""
         self.safe_wishes = SafeWishes(authorisation)
         self.planner = Planner(bus)
         self.journal = Journal(bus)
-        """What happens from now on, also before it is served."""
+        """The events from now on, also before the line is served."""
         self._demanded: dict[tuple[str, Role], float] = {}
         """When a role's programs last had a group polled off its grid."""
         self._groups: dict[PollGroup, GroupBroadcast] = {}
@@ -45,19 +45,19 @@ class ServedLine:
         self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
 
     def broadcast_of(self, group: PollGroup) -> Broadcast:
-        """Return what tells the cycles of a poll group."""
+        """Return the source of a poll group's cycles."""
         if group not in self._groups:
             self._groups[group] = GroupBroadcast(group, partial(self._forget_group, group))
         return self._groups[group]
 
     def events(self) -> Broadcast:
-        """Return what tells of line and nodes."""
+        """Return the source of the events of line and nodes."""
         if self._events is None:
             self._events = EventBroadcast(self.bus, self._end_events)
         return self._events
 
     def overview(self) -> Broadcast:
-        """Return what tells what a person sees of the line."""
+        """Return the source of the line's overview."""
         if self._overview is None:
             self._overview = Overview(
                 self.bus, self.authorisation, self.journal, lambda: self.title, self._end_overview
@@ -65,13 +65,13 @@ class ServedLine:
         return self._overview
 
     def exchanges(self) -> Broadcast:
-        """Return what tells what passes on the line."""
+        """Return the source of the exchanges on the line."""
         if self._exchanges is None:
             self._exchanges = ExchangesBroadcast(self.bus, self._end_exchanges)
         return self._exchanges
 
     def group(self, name: str) -> PollGroup:
-        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
+        """Return a poll group. Raises InvalidCommand with the known names for an unknown one."""
         return self.bus.group(name)
 
     def point(self, group: str, key: str) -> tuple[PollGroup, Point[Any]]:
@@ -83,7 +83,7 @@ class ServedLine:
         raise InvalidCommand(f"poll group {group!r} has no point {key!r}")
 
     def demand(self, group: PollGroup, role: Role) -> None:
-        """Poll a group now, unless the programs of this role have had that lately: then the next cycle serves."""
+        """Poll a group now. If the programs of this role have demanded that recently, wait for the next cycle."""
         every, now = RIGHTS[role].demand_every, self.bus.now()
         if now < self._demanded.get((group.name, role), -inf) + every * group.period:
             return
@@ -95,7 +95,7 @@ class ServedLine:
         for node in self.bus.nodes:
             if (node.profile.name, node.address) == (protocol, address):
                 return node
-        raise InvalidCommand(f"there is no node {address} of {protocol} on this line")
+        raise InvalidCommand(f"node {address} of {protocol} is not on this line; check protocol and address")
 
     def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
         """Return the point of a poll group that reads these places of a node."""
@@ -113,7 +113,7 @@ class ServedLine:
     def stale_items(self, record: NodeRecord, when: float) -> list[str] | None:
         """Return the polled points of a node that the write that ended just now has made stale.
 
-        None stands for all of the node, also where they are too many to be named: to doubt a good value is safe.
+        None means all points of the node, also if the list would be too long. A stale mark on a good value is harmless.
         """
         before = nextafter(when, -inf)
         points = {point.item: point for group in self.bus.groups for point in group.points_of(record)}

@@ -1,4 +1,4 @@
-"""The client's end of a connection: questions and their answers, and what comes unexpected."""
+"""The client's end of a connection: requests and their replies, and notifications."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from busmaster.errors import (
 from busmaster.ext import Command, host_and_port
 
 GRACE = 0.25
-"""Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
+"""Seconds after `finish_within` in which the line's owner, which knows more, can send the result of a request."""
 CONNECT_WITHIN = 10.0
 ENDED = "the program that owns the line has ended"
 READ_AT_ONCE = 1 << 16
 TCP = "tcp://"
 GONE = "the connection to the program that owns the line was lost"
-NO_PLACE = "see busmaster status; where no place is free, end a program that uses the line"
-AGAIN = "see whether it runs, and connect again"
+NO_PLACE = "see busmaster status; if no place is free, stop a program that uses the line"
+AGAIN = "check whether it is running, and connect again"
 
 
 class Asked:
-    """One question on its way. `writes`: of what it asks for, it must be said whether it may have been sent."""
+    """One request in progress. `writes`: its error must state whether the write may have been sent."""
 
     __slots__ = ("command", "future", "handed", "node", "number", "writes")
 
@@ -56,19 +56,19 @@ class Asked:
         self.node = node
         self.command = command
         self.handed = handed
-        """Whether it was handed to the connection: what was not has certainly not been sent."""
+        """Whether it was passed to the connection. Otherwise it has certainly not been sent."""
 
     def fail(self, kind: type[BusError], what: str, hint: str | None = None) -> None:
-        """End it with an error, unless it has ended."""
+        """End it with an error, unless it has already ended."""
         if not self.future.done():
             self.future.set_exception(kind(what, node=self.node, command=_text(self.command), hint=hint))
 
     def lost(self, kind: type[BusError], what: str, hint: str) -> None:
-        """End it truthfully, as no answer will come: `kind` is for what changes nothing."""
+        """End it with an error, because no reply will arrive. `kind`: the error of a request that writes nothing."""
         if not self.writes:
             self.fail(kind, what, hint)
         elif self.handed:
-            self.fail(WriteUnconfirmed, f"{what}, and the write may have been sent")
+            self.fail(WriteUnconfirmed, f"{what}; the write may have been sent")
         else:
             self.fail(NotStarted, what, hint)
 
@@ -78,7 +78,7 @@ def _text(command: Command[Any] | None) -> str | None:
 
 
 class Link:
-    """One connection to the owner of a line. `on_news` is told, in its order, what comes unexpected."""
+    """One connection to the owner of a line. `on_news` is called with the notifications, in their order."""
 
     def __init__(
         self,
@@ -96,14 +96,14 @@ class Link:
         self._on_lost = on_lost
         self._connection: AskingConnection | None = None
         self._waiting: deque[tuple[str, Asked | None]] = deque()
-        """What is said once the connection takes it, and with whose question."""
+        """Messages to send when the connection is ready, each with its request."""
         self._asked: dict[int, Asked] = {}
         self._count = 0
         self._over: tuple[type[BusError], str, str] | None = None
         self._is_open = False
 
     async def open(self, program: str) -> dict[str, Any]:
-        """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
+        """Connect, agree on a version, and return the owner's description of the line. Raises LineDown."""
         # A thread, since the host of a serial server may have to be found.
         where, place = (
             await asyncio.to_thread(_where, self.address) if is_a_name(self.address) else _where(self.address)
@@ -122,7 +122,7 @@ class Link:
                     await loop.create_connection(self._connect, *place)
                 said: dict[str, Any] = await hello.future
         except BaseException as error:
-            hello.future.cancel()  # nobody hears any more what becomes of it
+            hello.future.cancel()  # its result is not awaited any more
             shut = self._shut(where, error)
             await self.close()
             if shut is not None:
@@ -131,14 +131,14 @@ class Link:
         return said
 
     async def close(self) -> None:
-        """Let go: whoever still waits is told so."""
+        """Close the connection. Requests in progress end with BusClosed."""
         self._end(BusClosed, "the bus was closed", "make a new one: it is opened and closed once")
         if self._connection is not None:
             self._connection.close()
             await self._connection.closed()
 
     def tell(self, method: str, params: Mapping[str, Any]) -> None:
-        """Say something that is not answered; nothing once the connection is lost."""
+        """Send a notification, which has no reply. Does nothing if the connection is lost."""
         if self._over is None:
             text = written({"method": method, "params": params})
             if not self._passes(text):
@@ -153,7 +153,7 @@ class Link:
     def put(
         self, question: str, writes: bool, node: Addressed | None = None, command: Command[Any] | None = None
     ) -> Asked:
-        """Ask something in `words`, after all that was said before; its future has the answer.
+        """Send a request in the form of `words`, after all earlier messages. Its future gets the reply.
 
         Raises LineDown or BusClosed.
         """
@@ -161,7 +161,7 @@ class Link:
             self.check(node, command)
         self._count = number = self._count + 1
         text = numbered(question, number)
-        handed = self._passes(text)  # what is kept of it is made while the other end is at it already
+        handed = self._passes(text)  # first: the other end begins while this end creates the objects for it
         asked = Asked(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
         self._asked[number] = asked
         if not handed:
@@ -169,13 +169,13 @@ class Link:
         return asked
 
     def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
-        """Raise LineDown or BusClosed, saying why, once the connection is over."""
+        """Raise LineDown or BusClosed with the reason if the connection is over."""
         if self._over is not None:
             kind, what, hint = self._over
             raise kind(what, node=node, command=_text(command), hint=hint)
 
     async def answer(self, asked: Asked, finish_within: float | None = None) -> Any:
-        """Wait for an answer. Cancelling it cancels the request at the line too."""
+        """Wait for a reply. A cancellation also cancels the request at the line."""
         timer = None
         if finish_within is not None:
             loop = asyncio.get_running_loop()
@@ -189,7 +189,7 @@ class Link:
             if timer is not None:
                 timer.cancel()
 
-    # what the connection tells
+    # called by the connection
 
     def _connect(self) -> AskingConnection:
         is_tcp = self.address.startswith(TCP)
@@ -199,34 +199,34 @@ class Link:
         return self._connection
 
     def opened(self) -> None:
-        """Say what has waited for that: hello comes first."""
+        """Send the waiting messages, `hello` first."""
         self._is_open = True
         self.writable()
 
     def heard(self, message: str | bytes) -> None:
-        """Give an answer to whom it was asked for, and news to whom they concern."""
+        """Pass a reply to its request, and a notification to `on_news`."""
         try:
             self._take(read(message))
-        except Exception as error:  # whatever is said wrongly
-            what = f"the program that owns the line said what is not understood: {type(error).__name__}: {error}"
+        except Exception as error:  # invalid messages of any kind
+            what = f"the program that owns the line sent an invalid message: {type(error).__name__}: {error}"
             self._end(LineDown, what, AGAIN)
             assert self._connection is not None
             self._connection.close()
 
     def writable(self) -> None:
-        """Say what waits, as far as the connection takes it."""
+        """Send the waiting messages until the connection is full."""
         connection = self._connection
         assert connection is not None
         while self._waiting and self._is_open and not connection.full:
             text, asked = self._waiting.popleft()
             if asked is not None:
                 if asked.future.done():
-                    continue  # nobody waits for it any more: it is not even said
+                    continue  # cancelled before it was sent
                 asked.handed = True
             connection.say(text)
 
     def lost(self) -> None:
-        """Tell whoever waits that the connection is over."""
+        """End all requests, because the connection is over."""
         if self._connection is not None and self._connection.owner_ended:
             self._end(LineDown, ENDED, "start it, and connect again")
         self._end(LineDown, GONE, AGAIN)
@@ -234,34 +234,34 @@ class Link:
     # inside
 
     def _shut(self, where: str, error: BaseException) -> LineDown | None:
-        """Return why nobody let us in, None where it is not the other end's doing."""
+        """Return why the owner did not admit this program, None if the error has another cause."""
         connection = self._connection
         status = None if connection is None else connection.status
         farewell = "" if connection is None else connection.farewell
         complaint = None if connection is None else connection.complaint
         if status == HTTPStatus.UNAUTHORIZED:
-            what = f"{where} {'wants a token' if self._token is None else 'does not know this token'}"
-            return LineDown(what, hint="its owner has the tokens in a file, see [service] of LINE.toml")
+            what = f"{where} {'requires a token' if self._token is None else 'does not accept this token'}"
+            return LineDown(what, hint="use a token from the token_file in [service] of its LINE.toml")
         if status == HTTPStatus.SERVICE_UNAVAILABLE:
-            what = f"{where} does not let this program in: {connection.refusal if connection else ''}"
+            what = f"{where} does not admit this program: {connection.refusal if connection else ''}"
             return LineDown(what, hint=NO_PLACE)
         if status == HTTPStatus.TOO_MANY_REQUESTS and connection is not None:
             return LineDown(
                 f"{where} does not check this token: {connection.refusal}", hint="correct the token, and wait"
             )
         if farewell:
-            return LineDown(f"{where} does not let this program in: {farewell}", hint=NO_PLACE)
+            return LineDown(f"{where} does not admit this program: {farewell}", hint=NO_PLACE)
         if connection is not None and isinstance(error, TimeoutError):
-            what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
-            return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
+            what = f"the program that serves {where} did not reply within {CONNECT_WITHIN:g} s"
+            return LineDown(what, hint="if it hangs, stop it, because it keeps the line for itself")
         if complaint is None and isinstance(error, OSError) and not isinstance(error, BusError):
-            complaint = os.strerror(error.errno) if error.errno else str(error) or "it does not answer"
+            complaint = os.strerror(error.errno) if error.errno else str(error) or "no reply"
         if complaint is None:
             return None
         return LineDown(f"no program serves {where}: {complaint}", hint="start busmaster run, or see busmaster status")
 
     def _passes(self, text: str) -> bool:
-        """Say it at once where nothing waits before it; return whether that was so."""
+        """Send it at once if nothing waits before it; return whether it was sent."""
         connection = self._connection
         if self._waiting or not self._is_open or connection is None or connection.full:
             return False
@@ -269,13 +269,13 @@ class Link:
         return True
 
     def _drop(self, asked: Asked) -> None:
-        """Wait for it no longer, and have it cancelled there."""
+        """Stop waiting for a request, and cancel it at the line."""
         if self._asked.pop(asked.number, None) is not None and asked.handed:
             self.tell("cancel", {"id": asked.number})
 
     def _overdue(self, asked: Asked) -> None:
-        what = "its time was over, and the program that owns the line says nothing"
-        asked.lost(NoReply, what, "see whether that program runs")
+        what = "the time of the request is over, and the program that owns the line did not reply"
+        asked.lost(NoReply, what, "check whether that program is running")
         self._drop(asked)
 
     def _end(self, kind: type[BusError], what: str, hint: str) -> None:
@@ -291,10 +291,10 @@ class Link:
         if "method" in said:
             self._on_news(said["method"], said["params"])
             return
-        asked = self._asked.get(said.get("id"))  # type: ignore[arg-type]  # whatever the other end says
+        asked = self._asked.get(said.get("id"))  # type: ignore[arg-type]  # the other end can send anything
         if asked is None:
             return
-        # Understood first: whoever asked for what is not understood is told so when the conversation ends for it.
+        # Decoded first: if that fails, the request is still registered, and ends with the connection.
         error = error_of(said["error"]) if "error" in said else None
         del self._asked[asked.number]
         if asked.future.done():

@@ -1,4 +1,4 @@
-"""What is said between a line's owner and its clients: JSON-RPC 2.0, and the bounds of all of it."""
+"""The messages between a line's owner and its clients: JSON-RPC 2.0, and their limits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VERSIONS = (3,)
 
 BEFORE_NUMBER = ',"id":'
 PLAIN = frozenset((int, float, bool, str, type(None)))
-"""Kinds of values that are said as they are."""
+"""Types of values that are encoded without change."""
 
 PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
     -32700,
@@ -32,7 +32,7 @@ PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
 
 
 class Malformed(Exception):
-    """This is no message: `code` says of JSON-RPC's errors which."""
+    """An invalid message. `code`: the error code of JSON-RPC."""
 
     def __init__(self, what: str, code: int = INVALID_REQUEST) -> None:
         super().__init__(what)
@@ -40,12 +40,12 @@ class Malformed(Exception):
 
 
 def written(message: Mapping[str, Any]) -> str:
-    """Return a message as text. Raises TypeError for what cannot be said in it."""
+    """Return a message as text. Raises TypeError for a value that JSON does not support."""
     return f'{{"jsonrpc":"2.0",{encoded(message)[1:]}'
 
 
 def words(method: str, params: Mapping[str, Any]) -> str:
-    """Return a question as text, up to its number. Raises TypeError for what cannot be said in it."""
+    """Return a request as text, up to its number. Raises TypeError for a value that JSON does not support."""
     return written({"method": method, "params": params})[:-1]
 
 
@@ -55,12 +55,12 @@ def numbered(words: str, number: int) -> str:
 
 
 def answered(number: int, result: Any) -> str:
-    """Return the answer to a question as text. Raises TypeError for a result that cannot be said in it."""
+    """Return the reply to a request as text. Raises TypeError for a result that JSON does not support."""
     return f'{{"jsonrpc":"2.0","id":{number},"result":{encoded(result)}}}'
 
 
 def encoded(value: Any) -> str:
-    """Return a value as JSON. Raises TypeError for what it cannot say."""
+    """Return a value as JSON. Raises TypeError for a value that JSON does not support."""
     try:
         return "".join(_encode(value, 0))
     except ValueError:  # a number that JSON does not have
@@ -68,32 +68,32 @@ def encoded(value: Any) -> str:
 
 
 def read(text: str | bytes) -> dict[str, Any]:
-    """Return a message. Raises Malformed for what is none."""
+    """Return a message. Raises Malformed for an invalid one."""
     if not isinstance(text, str):
         raise Malformed("a message is text")
     text = text.strip()
     try:
         said, end = _decode(text, 0)
     except StopIteration as error:
-        raise Malformed(f"this is no JSON: no value begins at {error.value}", PARSE_ERROR) from None
+        raise Malformed(f"not valid JSON: no value begins at {error.value}", PARSE_ERROR) from None
     except (ValueError, RecursionError) as error:
-        raise Malformed(f"this is no JSON: {error}", PARSE_ERROR) from None
+        raise Malformed(f"not valid JSON: {error}", PARSE_ERROR) from None
     if end < len(text):
-        raise Malformed("this is no JSON: there is more behind it", PARSE_ERROR)
+        raise Malformed("not valid JSON: there is more text after the value", PARSE_ERROR)
     if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
-        raise Malformed("this is no message of JSON-RPC 2.0")
+        raise Malformed("not a message of JSON-RPC 2.0")
     return said
 
 
 def read_request(text: str | bytes) -> dict[str, Any]:
-    """Return a message of a client. Raises Malformed for what is none, or has too many parts."""
+    """Return a message of a client. Raises Malformed for an invalid one, or one with too many parts."""
     if isinstance(text, str) and len(text) > MOST_PARTS and sum(map(text.count, ",[{")) > MOST_PARTS:
-        raise Malformed(f"a message has {MOST_PARTS} values at most")
+        raise Malformed(f"a message must have at most {MOST_PARTS} values")
     return read(text)
 
 
 def value_of(said: Any) -> Any:
-    """Return a value as it was before it was said: a list was a tuple, {"members": [...]} a frozenset."""
+    """Return the original of a decoded value: a list was a tuple, {"members": [...]} a frozenset."""
     if isinstance(said, list):
         return tuple(said) if PLAIN.issuperset(map(type, said)) else tuple(map(value_of, said))
     if isinstance(said, dict):
@@ -106,7 +106,7 @@ def value_of(said: Any) -> Any:
 
 
 def said_timings(timings: Timings | Learned | None) -> Any:
-    """Return the reply times of a node as they are said."""
+    """Return the reply times of a node in the form of a message."""
     if isinstance(timings, Learned):
         return {"learned": said_timings(timings.document)}
     if timings is None:
@@ -115,7 +115,7 @@ def said_timings(timings: Timings | Learned | None) -> Any:
 
 
 def timings_of(said: Any) -> Timings | Learned | None:
-    """Return the reply times that were said. Raises InvalidCommand for what are none."""
+    """Return the reply times in a message. Raises InvalidCommand for invalid ones."""
     if said is None:
         return None
     try:
@@ -127,7 +127,7 @@ def timings_of(said: Any) -> Timings | Learned | None:
         steps = {step: ReplyTiming(**timing) for step, timing in said.items()}
         times = Timings(**steps)
     except (TypeError, KeyError) as error:
-        raise InvalidCommand(f"these are no reply times: {error}") from None
+        raise InvalidCommand(f"invalid reply times: {error}") from None
     for step in steps.values():
         if (
             max(step.max_reply_delay, step.inter_byte_timeout, step.driver_release_time, step.silence or 0.0)
@@ -168,10 +168,10 @@ def _finite(value: Any) -> Any:
 
 
 def _said_set(value: Any) -> dict[str, list[Any]]:
-    """Return a set (flags that are on) as it is said: JSON has none. Raises TypeError for anything else."""
+    """Return a set (flags that are on) in the form of a message. Raises TypeError for any other type."""
     if isinstance(value, AbstractSet):
         return {"members": sorted(value)}
-    raise TypeError(f"a {type(value).__name__} cannot be said")
+    raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
 def _encoder() -> Callable[..., Iterable[str]]:

@@ -1,4 +1,4 @@
-"""What is to be said to one client, in its order: bounded, so that one that does not read loses its own messages."""
+"""The unsent messages of one client, in their order and bounded: a client that does not read loses its own messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Way(Protocol):
 
     @property
     def full(self) -> bool:
-        """Return whether what was said last has not left yet."""
+        """Return whether earlier messages are still unsent."""
         ...
 
     def say(self, text: str, /) -> None: ...
@@ -29,10 +29,10 @@ class _Letter:
 
 
 class Outbox:
-    """Says what is put in at once, while the way is not full; what comes then waits here until `flush`.
+    """Sends messages at once while the connection is not full. Later ones wait here until `flush`.
 
-    Answers are never dropped, but where it is `crowded` a client is not to ask more; of news, which come unexpected,
-    the oldest are dropped beyond MOST_UNREAD. `on_drop` is told whose that was.
+    Replies are never dropped. If it is `crowded`, no further requests of the client must be read. Of the notifications,
+    the oldest beyond MOST_UNREAD are dropped. `on_drop` is called with their stream.
     """
 
     def __init__(self, way: Way, on_drop: Callable[[Hashable], None]) -> None:
@@ -49,18 +49,18 @@ class Outbox:
 
     @property
     def crowded(self) -> bool:
-        """Return whether so much waits that a client, which does not read the answers, is not to be read either."""
+        """Return whether so many replies wait that no further requests of this client must be read."""
         return len(self._letters) >= MOST_WAITING
 
     def put(self, text: str) -> None:
-        """Say this: it is never dropped."""
+        """Send a message that is never dropped."""
         if self._letters or self._way.full:
             self._letters[_Letter(text)] = None
         else:
             self._way.say(text)
 
     def put_latest(self, key: Hashable, text: str) -> None:
-        """Say this in place of what was to be said of the same thing, if that still waits."""
+        """Send a message that replaces an earlier unsent one with the same key."""
         letter = self._latest.get(key)
         if letter is not None:
             letter.text = text
@@ -71,7 +71,7 @@ class Outbox:
             self._way.say(text)
 
     def put_news(self, key: Hashable, text: str) -> None:
-        """Say this of one of its streams, unless it does not keep up."""
+        """Send a notification of a stream, unless the client does not keep up."""
         if not self._letters and not self._way.full:
             self._way.say(text)
             return
@@ -84,7 +84,7 @@ class Outbox:
         self._letters[letter] = None
 
     def flush(self, *, last: bool = False) -> None:
-        """Say what waits, as far as the way takes it; with `last` all of it, as nothing comes after."""
+        """Send waiting messages until the connection is full; with `last` all of them, because nothing follows."""
         while self._letters and (last or not self._way.full):
             letter, _ = self._letters.popitem(last=False)
             if self._news and self._news[0] is letter:

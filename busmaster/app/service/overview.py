@@ -1,7 +1,7 @@
-"""What a person sees of a line, told a few times a second to whoever looks: its points, groups, nodes and last events.
+"""The overview of a line for screens: its points, groups, nodes and last events, sent a few times a second.
 
-All of it is worked out once for all who look, in slices between which the line goes on, and what is said replaces
-what was said before: one that is slow sees fewer pictures, and delays nobody.
+It is made once for all clients, in slices, so that the line is not delayed. A message replaces the unsent one before
+it: a slow client gets fewer pictures, and delays no other client.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ INTERVAL = 0.2
 COUNTED_EVERY = 0.5
 """Seconds between two looks at the counts of nodes and groups."""
 PART = 50
-"""Points that are said in one message, and worked out in one turn of the line's loop."""
+"""Points in one message, which is made in one turn of the line's loop."""
 COUNTED_AT_ONCE = 5
 """Nodes, or groups, that are."""
 MOST_POINTS = 10_000
-"""Points of a picture; of those beyond it, it is said how many there are."""
+"""Points of a picture. The number of further points is sent."""
 MOST_COUNTED = 2_000
 """Nodes, and groups, of a picture."""
 KEPT_EVENTS = 20
 UTILISATION_WINDOW = 1.0
 """Seconds."""
 STATES = {LineState.OFFLINE: "offline", LineState.RESYNCHRONISING: "resynchronising"}
-"""What is worth a word: a line in use is ready."""
+"""States with a text of their own; in every other state the line is ready."""
 
 
 class Journal:
-    """The last that happened to a line, in sentences, for whoever looks later."""
+    """The last events of a line, as sentences, for clients that connect later."""
 
     def __init__(self, bus: Bus) -> None:
         self.entries: deque[tuple[float, str]] = deque(maxlen=KEPT_EVENTS)
@@ -51,7 +51,7 @@ class Journal:
         self._task: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
-        """Take in what has happened since it was made, and what will."""
+        """Record the events since this object was made, and from now on."""
         self._task = asyncio.ensure_future(self._listen())
 
     def note(self, text: str) -> None:
@@ -59,7 +59,7 @@ class Journal:
         self.entries.append((self._bus.now(), text))
 
     async def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._stream.close()
         if self._task is not None:
             await self._task
@@ -71,7 +71,7 @@ class Journal:
 
 
 class Part:
-    """Some points of a group, as they are said. `first` is the place of the first of them in the picture."""
+    """Some points of a group, in the form of messages. `first`: the place of the first of them in the picture."""
 
     def __init__(self, group: PollGroup, points: Sequence[Point[Any]], first: int) -> None:
         self.group = group
@@ -107,7 +107,7 @@ class Part:
 
 
 class Overview(Broadcast):
-    """The pictures of one line. `title` says what is written over them."""
+    """The pictures of one line. `title` returns the title above them."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class Overview(Broadcast):
         self._utilisation = RecentUtilisation(UTILISATION_WINDOW)
 
     def join(self, reader: Any, stream: int) -> None:
-        """Have this client told all, and from then on what changes."""
+        """Send everything to this client, and from then on the changes."""
         self._fresh.append((reader, stream))
         super().join(reader, stream)
 
@@ -268,9 +268,9 @@ def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
 def _said_value(
     bus: Bus, point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None
 ) -> list[Any] | None:
-    """Return value, quality, when it was asked for, what went wrong, and its alarm ("" for none).
+    """Return value, quality, time of the request, error, and alarm ("" for none).
 
-    All is as it is now, not as it was when it was read. None where the cycle did not have the point.
+    All are present values, not those at the time of the read. None if the cycle did not read the point.
     """
     if sample is None:
         return None
@@ -286,7 +286,7 @@ def shown(point: Point[Any], value: Any) -> Any:
 
 
 def said_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any]:
-    """Return what there is to know of one point of a group: its last exchange, its limits, and what its value means."""
+    """Return the details of one point of a group: its last exchange, its limits, and the meaning of its value."""
     sample = None if group.latest is None else group.latest.samples.get(point)
     if sample is not None:
         sample = bus.as_of_now(point, sample)

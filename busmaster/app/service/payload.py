@@ -1,4 +1,4 @@
-"""What a command says that comes as text: a value, or several, and perhaps its id and until when it is meant."""
+"""A command that arrives as text: one or several values, and optionally an id and an expiry time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from busmaster.bounds import LARGEST_VALUE, LONGEST_COMMAND, LONGEST_ID
 from busmaster.errors import InvalidCommand
 
 LATEST = 1e11
-"""Seconds since 1970: what is said to be later, some thousand years from now, is in milliseconds."""
+"""Seconds since 1970. A later time, some thousand years from now, is in milliseconds."""
 
 
 class Payload(NamedTuple):
-    """`expires` is in seconds since 1970; None where it is not said."""
+    """`expires` is in seconds since 1970; None if it is not given."""
 
     value: Any
     id: str = ""
@@ -21,7 +21,7 @@ class Payload(NamedTuple):
 
 
 class NoCommand(InvalidCommand):
-    """A text is no command. `id` is the one that it has all the same, "" for none."""
+    """A text is not a command. `id` is the one that it contains nevertheless, "" for none."""
 
     def __init__(self, fault: str, mark: str) -> None:
         self.id = mark
@@ -32,7 +32,7 @@ def read_payload(payload: object) -> Payload:
     """Read `12.5`, `[1, 2]`, or `{"value": 12.5, "id": "a1", "expires": 1767225600}`. Raises NoCommand."""
     raw = payload if isinstance(payload, bytes | bytearray) else str(payload).encode()
     if len(raw) > LONGEST_COMMAND:
-        raise NoCommand(f"{len(raw)} bytes: a command has {LONGEST_COMMAND} at most", "")
+        raise NoCommand(f"a command must have at most {LONGEST_COMMAND} bytes, not {len(raw)}", "")
     text = bytes(raw).decode(errors="replace")
     try:
         said = json.loads(text, parse_constant=lambda name: name)
@@ -41,7 +41,7 @@ def read_payload(payload: object) -> Payload:
     mark = said.get("id", "") if isinstance(said, dict) else ""
     shown = str(mark)
     if not isinstance(mark, str | int) or isinstance(mark, bool) or len(shown) > LONGEST_ID or not shown.isprintable():
-        raise NoCommand(f"an id is a text of {LONGEST_ID} characters at most on one line, or a whole number", "")
+        raise NoCommand(f"an id must be a whole number, or a text of one line with at most {LONGEST_ID} characters", "")
     try:
         value, expires = _read(said, text)
     except InvalidCommand as error:
@@ -50,16 +50,16 @@ def read_payload(payload: object) -> Payload:
 
 
 def _read(said: Any, text: str) -> tuple[Any, float | None]:
-    """Return the value, and until when it is meant."""
+    """Return the value and the expiry time."""
     if not isinstance(said, dict):
         return _numbers(said, text), None
     if not set(said) <= {"value", "id", "expires"} or "value" not in said:
-        raise InvalidCommand(f'{text[:40]!r} is not {{"value": ..., "id": ..., "expires": ...}}')
+        raise InvalidCommand(f'{text[:40]!r} is not a command; use {{"value": ..., "id": ..., "expires": ...}}')
     expires = said.get("expires")
     if expires is not None and not _is_number(expires):
-        raise InvalidCommand("expires is a time in seconds since 1970")
+        raise InvalidCommand("expires must be a time in seconds since 1970")
     if expires is not None and expires > LATEST:
-        raise InvalidCommand("expires is a time in seconds since 1970, not in milliseconds")
+        raise InvalidCommand("expires must be a time in seconds since 1970, not in milliseconds")
     return _numbers(said["value"], text), expires
 
 

@@ -1,4 +1,4 @@
-"""Who is at the other end of a connection: as the kernel says of a Unix socket, as a token says on TCP."""
+"""The other end of a connection: identified by the kernel on a Unix socket, and by a token on TCP."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ CREDENTIALS = struct.Struct("3i")
 PEER_GROUPS = 59
 """SO_PEERGROUPS, which Python does not name."""
 MOST_GROUPS = 256
-"""What Python has room for; of a user with more only the first group counts."""
+"""Space that Python provides; of a user with more groups, only the first counts."""
 
 
 class Peer(Protocol):
-    """Whoever has connected; `str` of it is what is on record of him."""
+    """A connected program or user. `str` returns its name in the audit log."""
 
     @property
     def short(self) -> str:
-        """What his poll groups are called after."""
+        """The first part of the names of its poll groups."""
         ...
 
     @property
     def account(self) -> Hashable:
-        """What is equal for all connections of one user or token, which have one part of the line together."""
+        """A key that is equal for all connections of one user or token, which share one part of the line's time."""
         ...
 
     def may_stay(self, access: Access, /) -> bool:
-        """Return whether he may still be here, now that other tokens may hold."""
+        """Return whether it may stay connected with the present tokens."""
         ...
 
     def permission(self, access: Access, /) -> Permission:
-        """Return what he may do."""
+        """Return its permission."""
         ...
 
 
 _names: dict[int, str] = {}
-"""What users are called, by their numbers: whom to ask may be a server on a network, which a line does not wait for."""
+"""Names of users by number. They may come from a server on a network, for which a line does not wait."""
 _asked: dict[int, asyncio.Task[None]] = {}
 
 
@@ -57,7 +57,7 @@ class Process:
 
     @property
     def user(self) -> str:
-        """Return the user's name; the number of one without a name, and until the name is found."""
+        """Return the user's name; the number if it has no name, or the name is not yet known."""
         return _names.get(self.uid, str(self.uid))
 
     @property
@@ -69,11 +69,11 @@ class Process:
         return self.uid
 
     def may_stay(self, _: Access) -> bool:
-        """Return True: the socket's mode says which processes come."""
+        """Return True: the socket's mode decides which processes can connect."""
         return True
 
     def permission(self, access: Access) -> Permission:
-        """Return what its user and groups may do."""
+        """Return the permission of its user and groups."""
         return access.of_process(self.uid, self.gids)
 
     def __str__(self) -> str:
@@ -82,12 +82,12 @@ class Process:
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Whoever has connected by TCP, and showed a token; `token` is its name, "" for none."""
+    """A client that has connected by TCP with a token; `token` is its name, "" for none."""
 
     token: str
     address: str
     digest: bytes | None = field(default=None, repr=False)
-    """Of the token that was shown: another of the same name does not stand for it."""
+    """Digest of the token. Another token with the same name does not count."""
 
     @property
     def short(self) -> str:
@@ -102,7 +102,7 @@ class Holder:
         return access.secrets.get(self.token) == self.digest if self.token else not access.secrets
 
     def permission(self, access: Access) -> Permission:
-        """Return what whoever has the token may do."""
+        """Return the permission of the token."""
         return access.of_token(self.token)
 
     def __str__(self) -> str:
@@ -110,14 +110,14 @@ class Holder:
 
 
 def process_of(connected: Any) -> Process:
-    """Return who has connected a Unix socket, and have the user's name found."""
+    """Return the process that has connected a Unix socket, and start to look up the user's name."""
     pid, uid, gid = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
     find_name(uid)
     return Process(pid, uid, (gid, *_more_groups(connected)), program_name(pid))
 
 
 def holder_of(connected: Any, token: str, digest: bytes | None) -> Holder:
-    """Return who has connected by TCP with a token of this name and digest."""
+    """Return the client that has connected by TCP with a token of this name and digest."""
     host, port, *_ = connected.getpeername()
     return Holder(token, f"{host}:{port}", digest)
 
@@ -132,7 +132,7 @@ def _more_groups(connected: Any) -> tuple[int, ...]:
 
 
 def find_name(uid: int) -> asyncio.Future[None] | None:
-    """Have the name of a user found, in a thread; return what ends then, or None if it is known."""
+    """Look up the name of a user in a thread. Return the running lookup, or None if the name is known."""
     if uid in _names:
         return None
     if uid not in _asked:
@@ -156,7 +156,7 @@ def user_name(uid: int) -> str:
 
 
 def program_name(pid: int) -> str:
-    """Return what the kernel calls a process's program."""
+    """Return the kernel's name of a process's program."""
     try:
         with open(f"/proc/{pid}/comm", encoding="utf-8", errors="replace") as file:
             return file.read().strip()

@@ -1,4 +1,4 @@
-"""Who may do what to a line: what its file says of users, groups and tokens."""
+"""The permissions for a line, defined in its file for users, groups and tokens."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from busmaster.app.service.rights import ADMIN, READ, RIGHTS, Rights, Role
 from busmaster.ext import Changing, Command, Requester
 
 Allowed: TypeAlias = Mapping[tuple[str, int], frozenset[Hashable] | None]
-"""By protocol and address of a node, the places there that may be written; None stands for all that the node has."""
+"""By protocol and address of a node, the places there that may be written; None for all of the node."""
 
 
 @dataclass(frozen=True, slots=True)
 class Permission:
-    """What a program may do, by its role. `who` names the program in messages: "token hmi".
+    """The permission of a program, by its role. `who` names the program in messages: "token hmi".
 
-    `only` says where a writer may write, whatever names it and however it is written; None stands for everywhere.
+    `only`: the places that a writer may write, independent of their names and the form of the write; None for all.
     """
 
     who: str
@@ -29,7 +29,7 @@ class Permission:
 
     @property
     def rights(self) -> Rights:
-        """Return what its role may have of the line."""
+        """Return the rights of its role."""
         return RIGHTS[self.role]
 
     @property
@@ -46,9 +46,9 @@ class Permission:
         return self.writes and (self.only is None or self.only.get(_key(node), frozenset()) is None)
 
     def refusal(self, node: Requester, command: Command[Any]) -> str:
-        """Return why a write is not let through, "" if it is."""
+        """Return why a write is not permitted, "" if it is."""
         if not self.writes:
-            return f"{self.who} may read this line and not write: [service] in the line's file says who may"
+            return f"{self.who} may read this line, but not write; see [service] in the line's file"
         if self.only is None:
             return ""
         places = self.only.get(_key(node), frozenset())
@@ -57,7 +57,7 @@ class Permission:
         changed = command.changes(node.profile).keys() if isinstance(command, Changing) else ()
         if changed and places.issuperset(changed):
             return ""
-        return f"{self.who} may not write this: see allow_writes in the line's file"
+        return f"{self.who} may not write this; see allow_writes in the line's file"
 
 
 EVERYTHING = Permission("the owner", ADMIN)
@@ -65,7 +65,7 @@ EVERYTHING = Permission("the owner", ADMIN)
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may use a line: by the numbers of users and groups, and by the names of tokens.
+    """The permissions of a line, by the numbers of users and groups, and by the names of tokens.
 
     A user's own entry goes before the groups', and those in their order. Without an entry the user
     whose process owns the line, and root, are ADMIN, and others READ.
@@ -75,10 +75,10 @@ class Access:
     groups: Mapping[int, Permission] = field(default_factory=dict)
     tokens: Mapping[str, Permission] = field(default_factory=dict)
     secrets: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    """Of each token the digest: the tokens themselves are not kept."""
+    """The digest of each token. The tokens themselves are not stored."""
 
     def of_process(self, uid: int, gids: Collection[int]) -> Permission:
-        """Return what a process of this machine may do."""
+        """Return the permission of a process of this machine."""
         if uid in self.users:
             return self.users[uid]
         if uid in (0, os.getuid()):
@@ -89,11 +89,11 @@ class Access:
         return Permission("this user", READ)
 
     def of_token(self, name: str) -> Permission:
-        """Return what whoever has a token may do; "" is the name of none."""
+        """Return the permission of a token; "" for a client without one."""
         return self.tokens.get(name) or Permission(f"token {name}" if name else "a program without a token", READ)
 
     def token_name(self, secret: str) -> str | None:
-        """Return the name of a token, None for what is none: in the same time, whichever it is."""
+        """Return the name of a token, None for an unknown one. The duration does not depend on the token."""
         found, digest = None, digest_of(secret)
         for name, known in self.secrets.items():
             if hmac.compare_digest(known, digest):
@@ -102,7 +102,7 @@ class Access:
 
 
 def digest_of(secret: str) -> bytes:
-    """Return what is kept of a token."""
+    """Return the digest of a token, which is stored instead of it."""
     return hashlib.sha256(secret.encode(errors="surrogateescape")).digest()
 
 

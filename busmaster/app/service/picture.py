@@ -1,4 +1,4 @@
-"""What is known of a line that is watched: its points with what they held of late, groups, nodes and last events."""
+"""The state of a watched line: its points with their recent values, groups, nodes and last events."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from busmaster.app.service.touches import Touches
 KEPT_VALUES = 120
 """Of each point, for its trend."""
 OLD_AFTER = 3
-"""Periods after which a value's age is worth a look."""
+"""Periods after which the age of a value is highlighted."""
 Identity: TypeAlias = tuple[str, str, int]
 """Group and key of a point, and how many like it the group has before it."""
 
 
 @dataclass(slots=True)
 class Row:
-    """One point of one poll group. `value` is the last good one: a number, or a text; `asked` when it was asked for.
+    """One point of one poll group. `value` is the last good one, a number or a text; `asked` the time of its request.
 
-    `quality` is of now: "bad" beside an `error`, "stale" after a write to what it reads, else as it was read.
+    `quality` is the present one: "bad" with an `error`, "stale" after a write to its place, else that of the read.
     """
 
     group: str
@@ -37,20 +37,20 @@ class Row:
     writable: bool = False
     value: float | str | None = None
     kind: str = ""
-    """What LINE.toml calls its protocol: a "microflex" speaks hcp2. "" where an older owner does not say."""
+    """Its protocol in LINE.toml: a "microflex" uses hcp2. "" if an older owner does not send it."""
     quality: str = ""
     asked: float | None = None
     error: str = ""
-    """What went wrong in the last cycle."""
+    """The error of the last cycle."""
     alarm: str = ""
     """The limit that it has left, low or high; of a bit that is an alarm set or clear."""
     past: deque[tuple[float, float | None]] = field(default_factory=lambda: deque(maxlen=KEPT_VALUES))
-    """When it was asked for, and the number; None for no value."""
+    """Time of the request, and the number; None for no value."""
     number: int = 0
 
     @property
     def identity(self) -> Identity:
-        """What it is called, whatever else changes."""
+        """Its key, which never changes."""
         return self.group, self.key, self.number
 
     @property
@@ -59,7 +59,7 @@ class Row:
         return f"{self.node} {self.item}"
 
     def take(self, value: Any, quality: str, asked: float, error: str, alarm: str, *_: Any) -> None:
-        """Take the outcome of a cycle, or what has become of it since: a write, or a loss of the line."""
+        """Store the result of a cycle, or a later change of it by a write or a loss of the line."""
         self.error, self.alarm, self.quality = error, alarm, quality
         if not error:
             self.value, self.asked = value, asked
@@ -67,17 +67,17 @@ class Row:
             self.past.append((asked, value if isinstance(value, int | float) and not error else None))
 
     def lose(self, why: str) -> None:
-        """Note that nothing is known of it any more: its last value stays, and is not good."""
+        """Note that the present value is unknown. The last value is kept, but is not good."""
         self.error, self.quality = why, Quality.BAD.value
 
     def doubt(self, touches: Touches) -> None:
-        """Make a good value stale that was asked for before a write to what it reads had ended."""
+        """Mark a good value as stale if it was requested before the end of a write to its place."""
         fine = self.quality in (Quality.GOOD.value, Quality.LATE.value)
         if fine and self.asked is not None and touches.is_stale(self.protocol, self.address, self.item, self.asked):
             self.quality = Quality.STALE.value
 
     def go_on(self, before: Row) -> None:
-        """Go on from what was known of the same point."""
+        """Continue with the data of the same point."""
         if (self.protocol, self.address, self.unit) == (before.protocol, before.address, before.unit):
             self.value, self.quality, self.asked = before.value, before.quality, before.asked
             self.error, self.alarm, self.past = before.error, before.alarm, before.past
@@ -139,9 +139,9 @@ class Frame:
 
 
 class Picture:
-    """What the line's owner has said, put together. `hear` takes it.
+    """The state of a line, built from the messages of its owner. `hear` takes them.
 
-    `clean` makes what was said fit for where it is shown: values as they were, or also texts without what obeys.
+    `clean` prepares received values for the display: it restores them, and can also remove control characters.
     """
 
     def __init__(self, clean: Callable[[Any], Any] = value_of) -> None:
@@ -156,7 +156,7 @@ class Picture:
         self._touches = Touches()
 
     def hear(self, method: str, said: Mapping[str, Any]) -> None:
-        """Take one thing that the line's owner says. What a later version says besides is passed over."""
+        """Handle one message of the line's owner. Additions of later versions are ignored."""
         body = self._clean(said)
         match method:
             case "frame":

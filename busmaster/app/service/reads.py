@@ -1,5 +1,5 @@
-"""A plain read, which is most of what is asked: said again and again in the same words, but for its number. They are
-worked out once at either end.
+"""Plain reads, which are the most frequent requests. Their text is the same each time except for the number, so it is
+encoded once and decoded once.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from busmaster.app.service.telling import protocol_of
 from busmaster.ext import Command
 
 KEPT = 1024
-"""Reads whose words are kept, the last that were asked, whoever asked."""
+"""Number of the latest reads, of all clients, whose texts are stored."""
 SHORT = 256
-"""Characters of a message whose words are kept: no read takes more."""
+"""Longest message whose text is stored, in characters: no read is longer."""
 
 END = f"}}}}{BEFORE_NUMBER}"
-"""With what the words of a plain read end, before its number: nothing is behind its command."""
+"""End of a plain read's text, before its number. Nothing follows its command."""
 
 
 class PlainRead(NamedTuple):
-    """A read of which nothing is said but what it reads, and where. Its command is built, and so checked."""
+    """A read without any options. Its command is built, and so checked."""
 
     protocol: str
     address: int
@@ -31,7 +31,7 @@ class PlainRead(NamedTuple):
 
 @lru_cache(KEPT)
 def words_of(protocol: str, address: int, command: Command[Any]) -> str:
-    """Return how a plain read is said, up to its number.
+    """Return the text of a plain read, up to its number.
 
     Raises InvalidCommand for a command that the protocol does not have.
     """
@@ -54,7 +54,7 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
 
 @lru_cache(KEPT)
 def _asked_in(said: str) -> PlainRead | None:
-    """Return the plain read that is asked in these words, up to END, whatever its number; None if none is."""
+    """Return the plain read in this text, up to END, without its number; None if it is not a plain read."""
     try:
         message = read(f"{said}}}}}}}")
         params = message["params"]
@@ -63,7 +63,7 @@ def _asked_in(said: str) -> PlainRead | None:
         if params.keys() != {"protocol", "address", "command"}:
             return None
         command = protocol_of(params["protocol"]).read_back(params["command"])
-    except REFUSED:  # what is wrong with it is said where every message is understood
+    except REFUSED:  # the error is reported where all other messages are decoded
         return None
     return None if command.writes else PlainRead(params["protocol"], params["address"], command)
 

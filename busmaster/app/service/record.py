@@ -1,4 +1,4 @@
-"""What is kept of a write: who wanted it, and what became of it."""
+"""The audit entry of a write: its source and its outcome."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 LONGEST_SHOWN = 200
-"""Characters of each part, such as a value or an error, that are kept of a write."""
+"""Maximum number of characters of each part of an audit entry, such as a value or an error."""
 
 RAW_COMMAND = "raw command"
 """What the record of a write names in place of a point, where there is none: its value says the rest."""
 
 
 class Outcome(Enum):
-    """What became of a write."""
+    """The outcome of a write."""
 
     WRITTEN = "written"
     """The node confirmed it."""
     REFUSED = "refused"
-    """Nothing was sent, or the node said no."""
+    """Nothing was sent, or the node refused it."""
     NOT_STARTED = "not started"
     """Nothing was sent: it was too old, or the line could not take it."""
     UNCONFIRMED = "unconfirmed"
-    """It was sent, and nobody knows what became of it."""
+    """It was sent, and the result is unknown."""
 
 
 class WriteRecord(NamedTuple):
-    """One write. `time` is in seconds since 1970 and `took` in seconds; `before` is None where it was not known.
+    """One write. `time` is in seconds since 1970 and `took` in seconds; `before` is None if it was unknown.
 
-    `interface` is the way that it came ("mqtt", "screen"), `by` who came: an MQTT topic, a key; `user` and `process`
-    are those of the program that writes. `id` is the command's own, "" if it has none.
+    `interface` is the way of the request ("mqtt", "screen"), `by` its sender: an MQTT topic, a key. `user` and
+    `process` are those of the program that writes. `id` is the command's own, "" if it has none.
     """
 
     time: float
@@ -53,7 +53,7 @@ class WriteRecord(NamedTuple):
 
     @property
     def text(self) -> str:
-        """It in one line, for a log."""
+        """The entry in one line, for a log."""
         before = "" if self.before is None else f" (before: {self.before!r})"
         what = f"{self.point} = {self.value!r}{before} {self.outcome.value}"
         why = f": {self.error}" if self.error else ""
@@ -62,7 +62,7 @@ class WriteRecord(NamedTuple):
 
 
 def cut(text: str) -> str:
-    """Return a text as it is kept: of a long one its beginning, and how long it was."""
+    """Return a text for an audit entry: of a long one only the beginning, and its length."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}... ({len(text)} characters)"
 
 

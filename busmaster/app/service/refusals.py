@@ -1,7 +1,7 @@
 """Connections and logins that a line or one of its interfaces refuses: counted, reported, and slowed down.
 
-A refusal can come a thousand times a second. So each kind is reported at once, then at most once a minute with a count,
-and what is remembered of each peer is bounded.
+A refusal can occur a thousand times a second. So each kind is reported at once, then at most once a minute with a
+count, and the history of each peer is bounded.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ class LimitedReport:
 
 
 class Refusals:
-    """What one line and its interfaces have refused, for its log, its metrics and `status`.
+    """The refusals of one line and its interfaces, for its log, its metrics and `status`.
 
-    Those of `on_report` are told a sentence. The interfaces are not listed here: each reports its own name.
+    The functions in `on_report` are called with a sentence. Interfaces are not listed here: each reports its own name.
     """
 
     def __init__(self) -> None:
@@ -180,7 +180,7 @@ def failed_text(interface: str, counts: Counter[str]) -> str:
 
 @dataclass(slots=True)
 class _Peer:
-    """What is remembered of one peer: `until` is when its next login is checked."""
+    """The history of one peer. `until` is the time from which its next login is checked."""
 
     failures: int = 0
     last: float = -inf
@@ -191,11 +191,11 @@ class _Peer:
 
 
 class Logins:
-    """Judges logins by token or password, and slows down a peer that guesses.
+    """Checks logins by token or password, and slows down a peer that guesses.
 
-    After FREE_LOGINS failures a peer has to wait after each further one: SHORTEST_LOGIN_PAUSE at first, then twice as
-    long each time, up to LONGEST_LOGIN_PAUSE. A login that comes sooner is refused, whatever it shows. Other peers
-    never wait. `failed` is told the peer of each login that failed.
+    After FREE_LOGINS failures a peer must wait after each further one: SHORTEST_LOGIN_PAUSE at first, then twice as
+    long each time, up to LONGEST_LOGIN_PAUSE. An earlier login is refused, even with the right token, unless the peer
+    has logged in with that name before. Other peers never wait. `failed` is called with the peer of each failed login.
     """
 
     def __init__(self, failed: Callable[[str], None], now: Callable[[], float]) -> None:
@@ -205,7 +205,7 @@ class Logins:
         """The one that logged in, or failed to, longest ago first."""
 
     def judge(self, host: str, name: str | None) -> float | None:
-        """Judge a login of the peer at `host` as `name`, None if what it shows is wrong.
+        """Check a login of the peer at `host` as `name`, None if its token or password is wrong.
 
         Return None if it succeeds, else the seconds after which this peer can try again.
         """
@@ -235,7 +235,7 @@ def pause_after(failures: int) -> float:
 
 
 def peer_of(host: str) -> str:
-    """Return what stands for a peer: its address; of IPv6 the network of 64 bits, which one machine has for itself."""
+    """Return the key of a peer: its address; of IPv6 the network of 64 bits, which can be one machine's."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -248,5 +248,5 @@ def peer_of(host: str) -> str:
 
 
 def wait_text(seconds: float) -> str:
-    """Return what a peer is told whose login is not checked."""
-    return f"too many failed logins from this address: try again in {max(1, round(seconds))} s"
+    """Return the text for a peer whose login is not checked."""
+    return f"too many failed logins from this address; try again in {max(1, round(seconds))} s"

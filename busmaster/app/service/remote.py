@@ -1,4 +1,4 @@
-"""A line that another program owns: what a client of it holds in its hands."""
+"""A line that another program owns: the bus of a client."""
 
 from __future__ import annotations
 
@@ -39,53 +39,53 @@ T = TypeVar("T")
 EVENT_BUFFER = 256
 POINTS_IN_A_MESSAGE = 50
 CLOCK_IS_HEARD = 3
-"""How often, as this program, which is beginning, may be busy elsewhere when it is: its writes would seem old."""
+"""Number of clock readings. If this program is busy during one, the offset is wrong, and its writes seem old."""
 
 
 def connect(address: str, *, token: str | None = None, safe_only: bool = False) -> RemoteBus:
     """Return the bus that another program owns, for `async with`, which connects.
 
-    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them; or
-    `tcp://HOST:PORT`, where a `token` that the line's owner knows may be needed. The token goes over the network as it
-    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes. `safe_only`: the program does
-    nothing but `enter_safe_state`, and is admitted also where no other place is free.
+    `address` is `unix:PATH`, or the name of a line or of its port in `busmaster status`, or `tcp://HOST:PORT`, for
+    which the line's owner may require a `token`. The token is sent without encryption. Raises InvalidCommand for a
+    token with any other address, where the kernel identifies the program. `safe_only`: the program only calls
+    `enter_safe_state`, and is admitted even if no other place is free.
     """
     return RemoteBus(address, token=token, safe_only=safe_only)
 
 
 class RemoteBus:
-    """A line that another program owns. Use it in `async with`: entering connects, leaving lets go.
+    """A line that another program owns. Use it in `async with`: entering connects, leaving disconnects.
 
-    Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
-    program counts for all, limits and the audit log are the owner's. A node that the owner does not have is
-    asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, or none
-    of that name: it may be served later; and InvalidCommand for a write that was prepared before and that the line
-    would not take. A lost connection is not made again: enter a new RemoteBus.
+    Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. Safety is the line's: a stop of any program counts
+    for all, and limits and the audit log are the owner's. A node that the owner does not have gets the settings of this
+    program, and leaves the line with it. Entering raises LineDown if no program serves the line, which may change
+    later. It raises InvalidCommand for a write that was prepared before and that the line would not accept. A lost
+    connection is not restored: enter a new RemoteBus.
     """
 
     def __init__(self, address: str, *, token: str | None = None, safe_only: bool = False) -> None:
         if token is not None and not address.startswith(TCP):
-            raise InvalidCommand(f"{address} takes no token: it is for tcp://HOST:PORT")
+            raise InvalidCommand(f"a token needs tcp://HOST:PORT, not {address}; leave out the token")
         if token is not None and not (token.isascii() and token.isprintable() and token.split() == [token]):
-            raise InvalidCommand("a token is of letters, digits and signs, without spaces")
+            raise InvalidCommand("a token must consist of letters, digits and signs, without spaces")
         self.address = address
         self._token = token
         self._safe_only = safe_only
         self.line = ""
         """The name of the line's port, once it is entered."""
         self.about: Mapping[str, Any] = {}
-        """What the owner says of the line: its name, settings and process, and whether this program may only read."""
+        """The owner's description of the line: name, settings, process, and whether this program is read-only."""
         self.on_access: list[Callable[[], None]] = []
-        """Called when `about` says otherwise what this program may do. They must not block, nor raise."""
+        """Called when the permission of this program in `about` changes. The functions must not block, nor raise."""
         self.on_touched: list[Callable[[Mapping[str, Any]], None]] = []
-        """Told, before a write is confirmed, which values it has made stale: what `touched` says in docs/service.md."""
+        """Called before a write is confirmed, with the values that it makes stale: `touched` in docs/service.md."""
         self._link: Link | None = None
         self._ahead = 0.0
-        """Seconds by which the clock of the owner's machine is ahead of this one, less what it took to hear that."""
+        """Seconds by which the clock of the owner's machine is ahead, less the time of the message."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
-        """Those of them of which the owner knows."""
+        """Nodes that the owner knows."""
         self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
         self._listed: dict[str, float] = {}
         """The poll groups that the owner has, with their periods."""
@@ -98,17 +98,17 @@ class RemoteBus:
         self._count = 0
         self._sequences = 0
         self.room = Room(self.now)
-        """For what is asked: so much of it is under way at a time."""
+        """Limits the number of requests in progress."""
         self._touched: dict[tuple[str, int], float] = {}
         """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
         self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
-        """Writes that are to be checked before the first of them is sent."""
+        """Writes to check before the first of them is sent."""
 
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
-            raise InvalidCommand(f"the bus of {self.address} was entered already: enter it once, and share it")
+            raise InvalidCommand(f"the bus of {self.address} was already entered; enter it once, and share it")
         link = Link(self.address, self._token, self._hear, self._lost, safe_only=self._safe_only)
         self._link = link
         said = await link.open(sys.argv[0])
@@ -135,7 +135,7 @@ class RemoteBus:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Let go: what this program asked for ends, and the line goes on."""
+        """Disconnect: the requests of this program end, and the line continues."""
         await self.link.close()
 
     @property
@@ -151,13 +151,13 @@ class RemoteBus:
         return self._sequences
 
     def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
-        """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
+        """Return the connection for a request. Raises BusClosed with the request before the bus is entered."""
         if self._link is None:
             raise BusClosed("the bus is not open", node=node, command=str(command))
         return self._link
 
     def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
-        """Have these writes checked when the bus is entered, if it is not yet."""
+        """Check these writes when the bus is entered, if it is not yet."""
         if self._link is None:
             self._prepared.append((node, commands, stop))
 
@@ -173,15 +173,15 @@ class RemoteBus:
         """Return the node at this address, as `Bus.node` does.
 
         Raises InvalidCommand for an address that the protocol does not have, and for other timings or retries than this
-        program named first. What the line's owner has against them, the node's requests raise.
+        program named first. The node's requests raise the objections of the line's owner.
         """
         profile.check_address(address)
         node = self._find(profile, address)
         said = self._named.setdefault(node, (timings, retries))
         if timings not in (None, said[0]) or retries not in (None, said[1]):
             raise InvalidCommand(
-                f"{node.label} is already in use, and was requested again with other timings or retries: "
-                "give all handles of an address the same options, or leave them out in all but the first"
+                f"{node.label} is already in use with other timings or retries; "
+                "give all handles of an address the same options, or set them only in the first"
             )
         if self._link is not None:
             self._name(node)
@@ -199,17 +199,17 @@ class RemoteBus:
         return tuple({**found, **dict.fromkeys(self._named)})
 
     def find(self, protocol: str, address: int) -> RemoteNode:
-        """Return a node that the owner speaks of, by the name of its protocol. It is not named for that."""
+        """Return a node in a message of the owner, by the name of its protocol. This does not name it to the owner."""
         return self._find(protocol_of(protocol).profile, address)
 
     def _find(self, profile: Profile, address: int) -> RemoteNode:
         if profile != protocol_of(profile.name).profile:
-            raise InvalidCommand(f"{profile.label(address)}: only the usual {profile.name} is spoken on another's line")
+            raise InvalidCommand(f"{profile.label(address)}: another's line only supports the standard {profile.name}")
         key = profile.name, address
         return self._nodes.get(key) or self._nodes.setdefault(key, RemoteNode(self, profile, address))
 
     def _name(self, node: RemoteNode) -> None:
-        """Tell the owner that this program uses a node, and how: once."""
+        """Inform the owner once that this program uses a node, with its settings."""
         if node in self._told:
             return
         self._told.add(node)
@@ -242,7 +242,7 @@ class RemoteBus:
         """
         question = words("plan", {"groups": said_groups(more)})
         if len(question) > LONGEST_REQUEST // 2:
-            raise InvalidCommand("these groups are too long for one message: plan fewer of them at once")
+            raise InvalidCommand("these groups are too long for one message; plan fewer of them at once")
         async with self._planning:  # the owner calculates one at a time for each program
             return plan_of(await self.link.answer(self.link.put(question, False)))
 
@@ -250,8 +250,8 @@ class RemoteBus:
     def groups(self) -> tuple[RemoteGroup, ...]:
         """Return the poll groups of the line: those of its owner and of other programs, then this program's own.
 
-        A group that was added or closed there is so here a moment later. The owner sends the cycles of one that is
-        iterated, subscribed to, or asked for by `group`.
+        A group that was added or closed there appears or disappears here a moment later. The owner sends the cycles of
+        a group that is iterated, subscribed to, or returned by `group`.
         """
         own = tuple(group for group in self._own.values() if not group.over)
         listed = {name: period for name, period in self._listed.items() if name not in self._own_names}
@@ -281,8 +281,8 @@ class RemoteBus:
     ) -> RemoteGroup:
         """Have `points` read every `period` seconds, as `Bus.poll_group`; the group ends with this program.
 
-        Raises InvalidCommand for arguments that `Bus.poll_group` rejects. What only the line's owner can reject, such
-        as one group too many, raises where the group is iterated, or by `await group.ready()`.
+        Raises InvalidCommand for arguments that `Bus.poll_group` rejects. If only the line's owner rejects it, such as
+        one group too many, iterating the group or `await group.ready()` raises that.
         """
         self.link.check()
         period = seconds(period, f"poll group {name!r}: a period")
@@ -319,8 +319,8 @@ class RemoteBus:
     async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
         """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
 
-        `values` is what the caller takes that to be, by the names of the file's points. Raises InvalidCommand, and
-        nothing is sent, if it is something else, or this program may not write all of it.
+        `values`: the safe state that the caller expects, by the names of the file's points. Raises InvalidCommand, and
+        nothing is sent, if it is another one, or this program may not write all of it.
         """
         return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
 
@@ -340,21 +340,21 @@ class RemoteBus:
         return stream
 
     async def overview(self, hear: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
-        """Have `hear` told what a person sees of the line, some times a second, as docs/service.md has it."""
+        """Call `hear` with the overview of the line, a few times a second, as described in docs/service.md."""
         self._count += 1
         overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
         await self._ask("overview", {"stream": self._count})
         return overview
 
     async def exchanges(self, hear: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
-        """Have `hear` told what passes on the line, exchange by exchange, as docs/service.md has it."""
+        """Call `hear` with the exchanges on the line, as described in docs/service.md."""
         self._count += 1
         exchanges = self._streams[self._count] = RemoteExchanges(hear, partial(self.end_stream, self._count))
         await self._ask("exchanges", {"stream": self._count})
         return exchanges
 
     def end_stream(self, number: int) -> None:
-        """Have a stream told no more."""
+        """End a stream."""
         stream = self._streams.pop(number, None)
         if stream is not None:
             self.link.tell("end", {"stream": number})
@@ -363,7 +363,7 @@ class RemoteBus:
     # inside
 
     async def _hear_clock(self) -> float:
-        """Return by how much the owner's clock is ahead: less by what it took to hear it, never more."""
+        """Return the offset of the owner's clock, less the time of the message: never more than the real offset."""
         now: float = await self._ask("now", {})
         return now - time.monotonic()
 
@@ -374,7 +374,7 @@ class RemoteBus:
     def _new_group(
         self, name: str, points: tuple[Point[Any], ...], period: float, method: str, params: Mapping[str, Any]
     ) -> RemoteGroup:
-        """Return a poll group that asks for its cycles by this method once it begins."""
+        """Return a poll group that requests its cycles by this method once it begins."""
 
         def begin(group: RemoteGroup) -> tuple[int, asyncio.Task[None]]:
             self._count += 1
@@ -440,6 +440,6 @@ class RemoteBus:
             # One that is not accepted yet ends with the error of that.
             if not (isinstance(listener, RemoteGroup) and listener.is_opening):
                 listener.end()
-        self._streams.clear()  # what is written from now on is not heard of any more
+        self._streams.clear()  # the results of later writes do not arrive here
         for stream in list(self._events):
             stream.close()

@@ -7,20 +7,20 @@ from typing import Any
 
 
 class RemoteExchanges:
-    """The exchanges of a line: they are told until `close`, or until the connection ends."""
+    """The exchanges of a line, received until `close`, or until the connection ends."""
 
     def __init__(self, hear: Callable[[Mapping[str, Any]], None], end: Callable[[], None]) -> None:
         self._hear = hear
         self._end = end
 
     def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says."""
+        """Handle a message of the line's owner."""
         if method == "exchanges":
             self._hear(params["body"])
 
     def end(self) -> None:
-        """Note that no more will come, of which its reader is told by what ends the connection."""
+        """Do nothing: the end of the connection is reported elsewhere."""
 
     def close(self) -> None:
-        """Be told nothing more."""
+        """End the stream."""
         self._end()

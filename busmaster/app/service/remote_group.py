@@ -16,8 +16,8 @@ from busmaster.ext import Cycles
 class RemoteGroup(Cycles):
     """A poll group of a line that another program owns, of `RemoteBus.poll_group`, `group` or `groups`.
 
-    Iterate it, or look at `latest`; close it when it is not read any more. The owner is asked for it without waiting:
-    what the owner has against it, such as a limit on the groups of one program, iterating it raises, and `ready`.
+    Iterate it, or look at `latest`; close it when it is not read any more. The request to the owner is sent without
+    waiting: if the owner refuses it, for example because of too many groups, iterating it raises that, and `ready`.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ from busmaster.ext import (
 
 T = TypeVar("T")
 LEFT_OUT = ("verify", "safe")
-"""Options that are of no use on another's line: where they are said, they are false."""
+"""Options without use on another's line. If they are given, they are false."""
 
 
 class Home(HoldsLine, Protocol):
@@ -62,7 +62,7 @@ class RemoteNode:
 
     def __init__(self, bus: Home, profile: Profile, address: int) -> None:
         self.stops = 0
-        """How often it was told to stop, by whatever program, since this one named it."""
+        """Number of stops by any program since this one named the node."""
         self.label = profile.label(address)
         self._bus = bus
         self._profile = profile.with_default_merge()
@@ -86,7 +86,7 @@ class RemoteNode:
         return f"<RemoteNode {self.profile.name} {self.address} of {self._bus.address}>"
 
     def note_stop(self) -> None:
-        """Tell the line that this node is being told to stop, ahead of whatever is asked of it from now on."""
+        """Inform the line that this node is being stopped, before all later requests."""
         self.stops += 1
         self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
 
@@ -95,12 +95,12 @@ class RemoteNode:
         return self._bus.now()
 
     def latest(self, point: Any, /) -> Sample[Any] | None:
-        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
-        program, has made it stale: any write to the node does."""
+        """Return the youngest good sample of a point in this program's poll groups, unless a write to the node, by
+        any program, has made it stale."""
         return self._bus.latest(point)
 
     def merge_reads(self, merge: Merge, /) -> None:
-        """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
+        """Let the profile propose `merge`. The line's owner decides which reads are merged."""
         self._profile = replace(self._profile, merge=merge)
 
     def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
@@ -151,7 +151,7 @@ class RemoteNode:
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
         link, room = self._bus.opened(self, command), self._bus.room
-        # What is of a sequence waits for nothing else of this program, which waits for the sequence.
+        # A request of a sequence does not wait for the other requests of this program, which wait for the sequence.
         waits = sequence is None and chosen.priority is not URGENT
         waited = await room.wait(chosen, self, command) if waits and not room.take() else 0.0
         try:
@@ -184,7 +184,7 @@ class RemoteNode:
         stop: bool,
         sequence: int | None,
     ) -> str:
-        """Return how a request is said that is no plain read."""
+        """Return the text of a request that is not a plain read."""
         params: dict[str, Any] = {
             "protocol": self._profile.name,
             "address": self._address,
@@ -205,6 +205,6 @@ class RemoteNode:
         return words("request", params)
 
     def said_sync_read(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
-        """Return writes of this node as the line is asked whether it would take them."""
+        """Return writes of this node in the form of the message with which the line checks them."""
         said = [self._protocol.write_down(command) for command in commands]
         return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}

@@ -10,11 +10,11 @@ from busmaster.app.service.link import Link
 from busmaster.errors import BusError
 
 SOON = 1.0
-"""Seconds within which a write that a person has asked for is to begin: later, it may not be meant any more."""
+"""Seconds within which a user's write must begin. Later it may not be wanted any more."""
 
 
 class RemoteOverview:
-    """The pictures of a line: `hear` is given what the line's owner says of it, until `over` says why it ends."""
+    """The pictures of a line: `hear` is called with the owner's messages, until the stream or the connection ends."""
 
     def __init__(self, link: Link, now: Callable[[], float], hear: Callable[[str, Mapping[str, Any]], None]) -> None:
         self._link = link
@@ -23,14 +23,14 @@ class RemoteOverview:
         self._ended = asyncio.Event()
 
     def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says."""
+        """Handle a message of the line's owner."""
         if method == "ended":
             self.end()
         else:
             self._hear(method, params["body"])
 
     def end(self) -> None:
-        """Wake whoever waits for the end."""
+        """Wake the functions that wait for the end."""
         self._ended.set()
 
     async def over(self) -> None:

@@ -1,4 +1,4 @@
-"""What one program has asked of the line that is not answered yet."""
+"""The requests of one program that have no reply yet."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, W
 
 
 class Requests:
-    """Has it done, and told by `answer` or `refuse`, with the number that the program gave it."""
+    """Runs requests, and calls `answer` or `refuse` with the number that the program gave."""
 
     def __init__(
         self,
@@ -33,17 +33,17 @@ class Requests:
         self._answer = answer
         self._refuse = refuse
         self._under_way: dict[int, Errand | None] = {}
-        """What is not answered yet, by its number: None is the safe state, which is being sent."""
+        """Requests without a reply, by number. None is the safe state, which is being sent."""
         self._log = logging.getLogger("busmaster.app.service")
 
     def check_number(self, number: int) -> None:
-        """Raise Malformed for the number of something that is not answered yet."""
+        """Raise Malformed if the number belongs to a request without a reply."""
         if number in self._under_way:
-            raise Malformed(f"request {number} is under way already")
+            raise Malformed(f"request {number} is already in progress; use another number")
 
     @property
     def errands(self) -> tuple[Errand, ...]:
-        """Return what is to be done at its nodes."""
+        """Return the requests at its nodes."""
         return tuple(errand for errand in self._under_way.values() if errand is not None)
 
     @property
@@ -52,7 +52,7 @@ class Requests:
         return None in self._under_way.values()
 
     def begin(self, number: int, said: Mapping[str, Any] | PlainRead) -> None:
-        """Have a command carried out. Raises Malformed for the number of something that is not answered yet."""
+        """Start a command. Raises Malformed if the number belongs to a request without a reply."""
         under_way = self._under_way
         if number in under_way:  # as check_number does: this is done for every request
             self.check_number(number)
@@ -66,7 +66,7 @@ class Requests:
             self._refuse(number, refusal_of("request", error))
 
     def begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
-        """Have the safe state sent. Raises Malformed for the number of something that is not answered yet."""
+        """Start to send the safe state. Raises Malformed if the number belongs to a request without a reply."""
         self.check_number(number)
         try:
             self._check_room({})
@@ -78,20 +78,20 @@ class Requests:
             sending.add_done_callback(partial(self._safe_sent, number))
 
     def cancel(self, number: object) -> None:
-        """Give up a command: it is not answered. What is no number of one means nothing."""
-        errand = self._under_way.get(number)  # type: ignore[call-overload]  # whatever a program says
+        """Cancel a command; it gets no reply. An unknown number is ignored."""
+        errand = self._under_way.get(number)  # type: ignore[call-overload]  # a program can send anything
         if errand is not None:
             errand.cancel()
 
     def end(self) -> None:
-        """Tell it truthfully what becomes of all that: the service ends, and the bus perhaps with it."""
+        """Send the result of all requests, because the service ends, and perhaps the bus too."""
         for number, errand in list(self._under_way.items()):
             if errand is not None:
                 errand.cancel()
                 self._refuse(number, _untold(errand, BusClosed, "the program that owns the line ends"))
 
     async def give_up(self) -> None:
-        """Give up all of it, and return when nothing of it is under way. The safe state goes on."""
+        """Cancel all requests, and return when they have ended. The safe state continues."""
         for errand in self.errands:
             errand.cancel()
         while doing := [
@@ -104,7 +104,7 @@ class Requests:
     def _check_room(self, said: Mapping[str, Any] | PlainRead) -> None:
         waiting = len(self._under_way)
         if waiting >= MOST_REQUESTS and not (_is_urgent(said) and waiting < MOST_REQUESTS + MOST_URGENT):
-            raise BacklogFull(f"{waiting} requests of this program are not answered yet")
+            raise BacklogFull(f"{waiting} requests of this program have no reply yet")
 
     def _ended(self, number: int, errand: Errand, value: Any, error: BaseException | None) -> None:
         del self._under_way[number]
@@ -116,7 +116,7 @@ class Requests:
             self._answer(number, value)
         except (BusError, InvalidCommand) as refusal:
             self._refuse(number, refusal)
-        except Exception as bug:  # of a protocol: the client is told, and the line goes on
+        except Exception as bug:  # an error of a protocol: the client gets it, and the line continues
             self._log.exception("a request of %s failed", self._asker.peer)
             what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
             self._refuse(number, _untold(errand, BusError, what))
@@ -131,7 +131,7 @@ class Requests:
 
 
 def _untold(errand: Errand, kind: type[BusError], what: str) -> BusError:
-    """Return the error for one whose end nobody will tell: `kind`, unless it may have written."""
+    """Return the error for a request whose result is unknown: `kind`, unless it may have written."""
     if errand.command.writes and errand.sent:
         kind = WriteUnconfirmed
     return kind(what, node=errand.node, command=str(errand.command))

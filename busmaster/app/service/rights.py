@@ -1,4 +1,4 @@
-"""What each role may have of a line: the one table, from which the service, the documentation and the tests derive.
+"""The rights of each role: one table, from which the service, the documentation and the tests are derived.
 
 Line time is a right as writing is. A program that may only read could otherwise keep the line busy with reads, and the
 owner's polls, its writes and its safe state would wait.
@@ -28,17 +28,17 @@ READ, WRITE, ADMIN = Role
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rights:
-    """What a program of one role may do.
+    """The rights of a program with this role.
 
-    `reads`, `polls`: the highest class of its reads and of its own poll groups; what asks for a higher one gets this.
-    `owner_time`: seconds of the line that the owner may use for each second of all programs of the role together, while
-    the owner waits; 0: the program takes turns with the owner. `new_nodes`: how many nodes a program may name that the
-    file does not have. `budgeted`: a node that only such programs name, and that has never replied, is asked within the
-    budget of probes (R11). `own_times`: reply times may exceed those of the protocol's document.
-    `demand_every`: periods of a group between two cycles that programs of the role demand; 0: no limit.
-    `groups`: how many poll groups it may have. `reserved`: connections that only programs of the role can have, beyond
-    those that all roles share. `writes`: it may write, pause a group, suspend a node and hold the line
-    for a sequence, where `allow_writes` lets it write.
+    `reads`, `polls`: the highest priority of its reads and of its own poll groups; a higher one is reduced to this.
+    `owner_time`: while the owner waits, the owner may use the line for this many seconds for each second of all
+    programs of the role together. With 0, the program takes turns with the owner. `new_nodes`: number of nodes that a
+    program may name and that the file does not have. `budgeted`: a node that only such programs name, and that has
+    never replied, is polled within the budget of probes (R11). `own_times`: reply times may exceed those of the
+    protocol's document. `demand_every`: periods of a group between two cycles that programs of the role demand; 0: no
+    limit. `groups`: number of its poll groups. `reserved`: connections that only programs of the role can have, in
+    addition to those that all roles share. `writes`: it may write, pause a group, suspend a node and hold the line for
+    a sequence, where `allow_writes` permits its writes.
     """
 
     reads: Priority

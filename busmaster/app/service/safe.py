@@ -1,4 +1,4 @@
-"""The safe state of a line, sent because another program asks for it."""
+"""Sends the safe state of a line on request of another program."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from busmaster.errors import BusError, InvalidCommand
 
 
 class SafeWishes:
-    """Sends it: once begun it goes on, also when whoever asked for it has gone."""
+    """Sends the safe state. Once begun, it continues, even if the requesting program disconnects."""
 
     def __init__(self, authorisation: Authorisation) -> None:
         self._authorisation = authorisation
@@ -25,18 +25,18 @@ class SafeWishes:
         return self._sending is not None and not self._sending.done()
 
     def begin(self, wanted: Mapping[str, Any], peer: Peer) -> asyncio.Task[dict[str, Any]]:
-        """Send the safe state, if that is what somebody expects; the task returns what is said of each point.
+        """Send the safe state, if it is the expected one; the task returns the result of each point.
 
-        Whoever asks while it is being sent has a part in that. Raises InvalidCommand where he may not, and where he
-        expects something else.
+        A request while it is being sent joins that transmission. Raises InvalidCommand if the program may not do this,
+        or expects another safe state.
         """
         state = self._authorisation.safe_state
         if state is None or not state.values:
-            raise InvalidCommand("the program that owns this line knows no safe state: end it, then send yours")
+            raise InvalidCommand("the program that owns this line has no safe state; stop it, then send yours")
         if dict(wanted) != dict(state.values):
             raise InvalidCommand(
-                f"the program that owns this line has the safe state {_text(state.values)}, and not {_text(wanted)}: "
-                "have it read the file again"
+                f"the program that owns this line has the safe state {_text(state.values)}, not {_text(wanted)}; "
+                "reload its file (SIGHUP)"
             )
         refusal = (
             "this line is read-only"
@@ -50,7 +50,7 @@ class SafeWishes:
         return self._sending
 
     async def close(self) -> None:
-        """End what is being sent: the program that ends sends its own."""
+        """Cancel the transmission, because the program ends and sends the safe state itself."""
         if self._sending is not None:
             self._sending.cancel()
             await asyncio.wait([self._sending])
@@ -61,7 +61,7 @@ class SafeWishes:
 
 
 def outcomes_of(said: Mapping[str, Any]) -> dict[str, BusError | None]:
-    """Return what became of each point, as it was said."""
+    """Return the result of each point in a message."""
     return {name: None if error is None else bus_error_of(error) for name, error in said.items()}
 
 

@@ -1,4 +1,4 @@
-"""What a program asks of a line that it does not own: so many requests at a time, some of them in a sequence."""
+"""The requests of a program on another's line: a limited number at a time, some of them in a sequence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class Room:
-    """Lets so many requests of a program be under way; the others wait here, in their order, as long as they may."""
+    """Limits the number of a program's requests in progress. Others wait here in their order, within their limits."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._free = MOST_UNDER_WAY
@@ -25,14 +25,14 @@ class Room:
         self._now = now
 
     def take(self) -> bool:
-        """Take room, which is to be given back, if there is some; return whether there was."""
+        """Take a place, which must be given back, if there is one; return whether there was."""
         if not self._free:
             return False
         self._free -= 1
         return True
 
     async def wait(self, options: RequestOptions, node: Requester, command: Command[Any]) -> float:
-        """Wait for room, which is to be given back, and return how many seconds that took.
+        """Wait for a place, which must be given back, and return the seconds that it took.
 
         Raises NotStarted if the time of the request is over before.
         """
@@ -42,12 +42,12 @@ class Room:
             async with asyncio.timeout(min(limits, default=None)):
                 await self._given()
         except TimeoutError:
-            what = f"{MOST_UNDER_WAY} requests of this program are not answered yet, and its time was over"
+            what = f"the time of the request is over, and {MOST_UNDER_WAY} requests of this program have no reply yet"
             raise NotStarted(what, node=node, command=str(command)) from None
         return self._now() - began
 
     def give_back(self) -> None:
-        """Make room for another: for whoever waits longest."""
+        """Give back a place, to the request that has waited longest."""
         while self._waiting:
             given = self._waiting.popleft()
             if not given.done():
@@ -61,13 +61,13 @@ class Room:
         try:
             await given
         except asyncio.CancelledError:
-            if given.done() and not given.cancelled():  # it was given in the turn in which nobody wanted it any more
+            if given.done() and not given.cancelled():  # the place was given in the turn of the cancellation
                 self.give_back()
             raise
 
 
 def shortened(options: RequestOptions, by: float) -> dict[str, float]:
-    """Return what is left of the times of a request that has waited for so many seconds."""
+    """Return the times of a request that has waited, reduced by that."""
     times = {"start_within": options.start_within, "finish_within": options.finish_within}
     return {name: max(0.0, limit - by) for name, limit in times.items() if limit is not None}
 

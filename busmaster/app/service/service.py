@@ -1,4 +1,4 @@
-"""The socket of one line, at which other programs ask its nodes."""
+"""The socket of one line, through which other programs use its nodes."""
 
 from __future__ import annotations
 
@@ -40,25 +40,25 @@ if TYPE_CHECKING:
     from websockets.http11 import Request
 
 HOSTS = ("localhost", "busmaster")
-"""What a client calls us: a page that was tricked into asking here would say another name."""
+"""Host names of this server. A web page that was tricked into a request here would use another one."""
 MOST_WAITING_TO_CONNECT = 100
 NAME_WITHIN = 1.0
-"""Seconds that the first client waits at most for this user's name: records then have his number."""
+"""Seconds that the first client waits at most for this user's name. Audit entries then have the number."""
 GROUPS_EVERY = 0.1
-"""Seconds between two lists of the poll groups, however often a client begins and ends its own."""
+"""Seconds between two lists of the poll groups, however often clients open and close groups."""
 
 
 class Service:
     """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
 
-    `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the line,
-    by default its port's: letters, digits, and _.- between them. Every write passes `authorisation`, which says who may
-    do what: without one, its own, which keeps a record in the log "busmaster.audit", and lets this user write and
-    others read. `mode` and `group`, a number, are the socket's. `listen` is a host and a port where programs may come
-    by TCP too: off this machine only where authorisation knows tokens. Each program takes turns with the others and
-    with this one; `share`, 0.1 to 10, weighs its line time: with 0.5, half as much as this one has, as long as both
-    wait. `title` is written over what a person sees of the line. Raises InvalidCommand for what cannot be; so does
-    entering where the socket is served by another process, which it names, or cannot be made.
+    `path` is the socket's. Without it, the socket is NAME.sock in this user's runtime folder. `name` is that of the
+    line, by default its port's: letters, digits, and _.- between them. `authorisation` checks every write. By default
+    it stores audit entries in the log "busmaster.audit", and permits this user to write and others to read. `mode` and
+    `group`, a number, are the socket's. `listen` is a host and a port for connections by TCP; other machines can
+    connect only if authorisation has tokens. Each program takes turns with the others and with this one. `share`, 0.1
+    to 10, weighs its line time: with 0.5, it gets half as much as this one while both wait. `title` is shown above the
+    views of the line. Raises InvalidCommand for invalid arguments. Entering raises it if the socket cannot be created,
+    or is served by another process, which the error names.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Service:
         title: str = "",
     ) -> None:
         if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
-            raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
+            raise InvalidCommand(f"a share must be a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
         self.bus = bus
         self.authorisation = authorisation or Authorisation(bus)
         if listen is not None:
@@ -83,7 +83,7 @@ class Service:
         self.name = line_name(bus.endpoint.name) if name is None else checked_name(name)
         self.line = ServedLine(bus, self.authorisation, share, title or self.name)
         self.refused = 0
-        """Connections that were one too many, or that began with what no client says."""
+        """Connections that were one too many, or began with an invalid message."""
         self._path = None if path is None else Path(path).absolute()
         self._mode = mode
         self._group = group
@@ -92,7 +92,7 @@ class Service:
         self._servers: list[asyncio.Server] = []
         self._clients: dict[Client, Visit] = {}
         self._strangers: dict[Visit, None] = {}
-        """Connections of which no first message has come, the oldest first."""
+        """Connections without a first message, the oldest first."""
         self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
         self._admission = Admission(self.authorisation.refusals)
@@ -100,19 +100,19 @@ class Service:
         self._logins = Logins(partial(self.authorisation.refusals.note_login, SERVICE), time.monotonic)
         self._log = logging.getLogger("busmaster.app.service")
         self.tell: Callable[[str], None] = self._log.warning
-        """Told, at most once a minute, of connections and logins that were refused."""
+        """Called, at most once a minute, with a text about refused connections and logins."""
         self.reception = Reception()
         self._groups_sent = -inf
         self._groups_timer: asyncio.TimerHandle | None = None
 
     @property
     def address(self) -> str:
-        """Return what `connect` takes."""
+        """Return the argument for `connect`."""
         return self._served.owner.address
 
     @property
     def tcp_address(self) -> str | None:
-        """Return what `connect` takes of a program that comes by TCP; None where none can."""
+        """Return the argument for `connect` by TCP; None if that is not possible."""
         if self._listen is None:
             return None
         host, port = self._servers[-1].sockets[0].getsockname()[:2]
@@ -125,12 +125,12 @@ class Service:
 
     @property
     def strangers(self) -> int:
-        """Return how many connections there are of which no first message has come."""
+        """Return the number of connections without a first message."""
         return len(self._strangers)
 
     async def __aenter__(self) -> Service:
         check_installed()
-        await asyncio.to_thread(protocols)  # they are imported for this: not when the first client asks
+        await asyncio.to_thread(protocols)  # they are imported now, and not at the first request of a client
         if finding := find_name(os.getuid()):
             await asyncio.wait([finding], timeout=NAME_WITHIN)
         path = self._path or runtime_folder() / f"{self.name}.sock"
@@ -169,7 +169,7 @@ class Service:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Let nobody in any more, tell all clients what became of their requests, and let them go."""
+        """Stop listening, send all clients the results of their requests, and disconnect them."""
         ext.line_of(self.bus).on_stop.remove(self._tell_stop)
         ext.line_of(self.bus).on_touched.remove(self._tell_touched)
         ext.line_of(self.bus).on_groups.remove(self._note_groups)
@@ -199,7 +199,7 @@ class Service:
                 await self.line.journal.close()
 
     def _report(self, text: str) -> None:
-        """Report what was refused, and show it among the events of the line."""
+        """Report a refusal, and show it in the events of the line."""
         self.line.journal.note(text)
         self.tell(text)
 
@@ -219,7 +219,7 @@ class Service:
             client.tell_touched(params, key)
 
     def _note_groups(self) -> None:
-        """Have all clients sent the list of the poll groups: it has changed."""
+        """Send the changed list of poll groups to all clients."""
         if self._groups_timer is None:
             loop = asyncio.get_running_loop()
             due = max(loop.time(), self._groups_sent + GROUPS_EVERY)
@@ -231,10 +231,10 @@ class Service:
         for client in self._clients:
             client.outbox.put_latest("poll_groups", text)
 
-    # those who come
+    # connections
 
     async def _serve_at(self, opened: socket.socket) -> asyncio.Server:
-        """Serve a socket. One connection is taken in a turn of the loop; that others wait is the kernel's affair."""
+        """Serve a socket. One connection is accepted in a turn of the loop; the kernel queues the others."""
         loop = asyncio.get_running_loop()
         serve: Any = loop.create_unix_server if opened.family == socket.AF_UNIX else loop.create_server
         server: asyncio.Server = await serve(self._visited, sock=opened, backlog=1)
@@ -242,7 +242,7 @@ class Service:
         return server
 
     def _visited(self) -> asyncio.BaseProtocol:
-        """Return the end of a connection that was made just now, and close one that is one too many for it."""
+        """Return the end of a new connection, and close the oldest one if there are too many."""
         if (one_too_many := stranger_to_close(self._strangers)) is not None:
             self.refused += 1
             one_too_many.connection.abort()
@@ -251,7 +251,7 @@ class Service:
         return visit.connection
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
-        """Return after how many seconds a connection from there is read; None if it is closed, and counted."""
+        """Return after how many seconds the connection is read; None if it is closed, which is counted."""
         delay = self._rate.delay(connecting_peer(origin, process))
         if delay is None:
             self.refused += 1
@@ -259,7 +259,7 @@ class Service:
         return delay
 
     def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
-        """Note who has come. Refuse what may be a page's, whoever shows no token, and one too many.
+        """Store the peer. Refuse possible requests of web pages, missing or wrong tokens, and one connection too many.
 
         An Origin is refused by the library.
         """
@@ -278,9 +278,9 @@ class Service:
             if wait:
                 return HTTPStatus.TOO_MANY_REQUESTS, f"{wait_text(wait)}\n"
         if peer is None:
-            return HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n"
+            return HTTPStatus.UNAUTHORIZED, "a known token is required\n"
         permission = peer.permission(self.authorisation.access)
-        # One that may write says in `hello` whether it only sends the safe state, which has places of its own.
+        # A program that may write declares in `hello` whether it only sends the safe state, which has reserved places.
         if not permission.writes and (refusal := self._admission.refusal(permission, self._clients)):
             return HTTPStatus.SERVICE_UNAVAILABLE, f"{refusal}\n"
         visit.peer = peer
@@ -290,13 +290,13 @@ class Service:
         return host.partition(":")[0] in HOSTS or (self._listen is not None and is_our_name(host, self._listen))
 
     def _peer(self, connected: socket.socket, shown: Sequence[str]) -> Peer | None:
-        """Return who has connected; None for whoever shows no token where one is needed."""
+        """Return the peer that has connected; None if it shows no token and one is required."""
         if connected.family == socket.AF_UNIX:
             return process_of(connected)
         return holder(connected, shown, self.authorisation.access)
 
     def _tell_access(self) -> None:
-        """Let those go whose token holds no more, and tell the others what they may do now."""
+        """Disconnect clients whose token is not valid any more, and send the others their permission."""
         for client, visit in self._clients.items():
             if client.peer.may_stay(self.authorisation.access):
                 client.tell_access()
@@ -304,20 +304,20 @@ class Service:
                 visit.connection.abort()
 
     def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
-        """Let a program in by its first message, and answer that. Raises Malformed."""
+        """Admit a program by its first message, and reply to that. Raises Malformed."""
         params = said.get("params", {})
         wanted = params.get("versions") if isinstance(params, dict) else None
         if said.get("method") != "hello" or not isinstance(wanted, list):
-            raise Malformed("the first message is hello, with the versions that its client knows")
+            raise Malformed("the first message must be hello, with the supported versions")
         common = [version for version in VERSIONS if version in wanted]
         if not common:
             raise Malformed(
-                f"the service protocol has version {VERSIONS[-1]} here, not {wanted}: "
+                f"the service protocol has version {VERSIONS[-1]} here, not {wanted}; "
                 "update the older of the two programs",
                 INVALID_PARAMS,
             )
         if not visit.peer.may_stay(self.authorisation.access):
-            raise Malformed("this token is known no more")
+            raise Malformed("this token is not valid any more")
         permission, safe_only = visit.peer.permission(self.authorisation.access), params.get("safe_only") is True
         in_safe_place = self._admission.admit(permission, self._clients, safe_only=safe_only)
 
@@ -333,11 +333,11 @@ class Service:
         return client
 
     def send_away(self, visit: Visit, /) -> None:
-        """Count one whose conversation is ended for what it said, or did not say."""
+        """Count a connection that was closed because of an invalid or missing message."""
         self.refused += 1
 
     def over(self, visit: Visit, /) -> None:
-        """Have a program leave whose connection is over, with all that it asked for."""
+        """End the requests of a program whose connection is over."""
         self._strangers.pop(visit, None)
         if visit.client is not None:
             leaving = asyncio.ensure_future(self._see_off(visit.client))
@@ -351,7 +351,7 @@ class Service:
             del self._clients[client]
 
     def _about(self, client: Client, version: int) -> dict[str, Any]:
-        """Return what a program is told of the line."""
+        """Return the description of the line for a program."""
         owner = self._served.owner
         nodes = [
             {

@@ -1,4 +1,4 @@
-"""What happens on the line, told to those clients that asked for it: said once, whoever and how many they are."""
+"""The events of a line for the clients that follow them. Each message is encoded once for all clients."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Reader(Protocol):
     """A client with a stream."""
 
     def tell(self, stream: int, method: str, body: str) -> None:
-        """Say something of a stream; it is dropped where the client does not keep up."""
+        """Send a message of a stream; it is dropped if the client does not keep up."""
         ...
 
     def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
-        """Say something of a part of a stream that replaces what was said of it before."""
+        """Send a message about a part of a stream, which replaces an earlier unsent one."""
         ...
 
 
@@ -35,7 +35,7 @@ Place = tuple[Reader, int]
 
 
 class Broadcast:
-    """One source and those who read it. It runs while there is one, and then tells its owner by `on_end`."""
+    """One source and its readers. It runs while there are readers, and then calls `on_end`."""
 
     def __init__(self, on_end: Callable[[], None]) -> None:
         self.readers: list[Place] = []
@@ -43,13 +43,13 @@ class Broadcast:
         self._task: asyncio.Task[None] | None = None
 
     def join(self, reader: Reader, stream: int) -> None:
-        """Have this client told, from now on."""
+        """Add a client."""
         self.readers.append((reader, stream))
         if self._task is None:
             self._task = asyncio.ensure_future(self._run())
 
     def leave(self, reader: Reader, stream: int) -> None:
-        """Tell this client no more."""
+        """Remove a client."""
         if (reader, stream) in self.readers:
             self.readers.remove((reader, stream))
         if not self.readers and self._task is not None:
@@ -59,7 +59,7 @@ class Broadcast:
     async def _run(self) -> None:
         try:
             await self._tell()
-        except Exception:  # a value that cannot be said, a mistake in an encoder: those who read it are told it ended
+        except Exception:  # a value that cannot be encoded, an error of an encoder: the readers get "ended"
             logging.getLogger("busmaster.app.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:
@@ -88,7 +88,7 @@ class GroupBroadcast(Broadcast):
         self._set = 0
 
     def join(self, reader: Reader, stream: int) -> None:
-        """Have this client told which points there are, and then of each cycle."""
+        """Send the list of points to this client, and then each cycle."""
         self._tell_points((reader, stream))
         super().join(reader, stream)
 
@@ -102,7 +102,7 @@ class GroupBroadcast(Broadcast):
         try:
             async for snapshot in stream:
                 if isinstance(snapshot, Outdated):
-                    continue  # `touched` says so, sooner
+                    continue  # `touched` reports it, and sooner
                 if isinstance(snapshot, ReadAfterWrite) and self.group.latest is not None:
                     snapshot = self.group.latest  # the wire has whole cycles: the last one, with the new value
                 points = tuple(snapshot)

@@ -1,4 +1,4 @@
-"""Programs that come by TCP: where they are listened for, and what they show."""
+"""Connections by TCP: listening sockets, and tokens."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def is_loopback(host: str) -> bool:
 
 
 def check_listening(listen: HostPort, *, tokens: bool) -> None:
-    """Raise InvalidCommand where whoever is on the network could come without a token."""
+    """Raise InvalidCommand if any machine of the network could connect without a token."""
     if not (tokens or is_loopback(listen[0])):
         raise InvalidCommand(
-            f"{listen[0]} is open to the network: give each program a token, in the file that token_file names, "
-            "or listen at 127.0.0.1"
+            f"{listen[0]} is reachable from the network; give each program a token in the token_file, "
+            "or listen on 127.0.0.1"
         )
 
 
@@ -54,8 +54,8 @@ def is_our_name(host: str, listen: HostPort) -> bool:
 
 
 def holder(connected: socket.socket, shown: Sequence[str], access: Access) -> Holder | None:
-    """Return who has connected, by the Authorization headers that he shows; None where a token that is known is needed,
-    and he shows none, or something else. None is needed where there are none."""
+    """Return the client that has connected, by its Authorization headers; None if a known token is required and they do
+    not contain one. If there are no tokens, none is required."""
     if not shown and not access.secrets:
         return holder_of(connected, "", None)
     if len(shown) != 1:

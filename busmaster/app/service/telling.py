@@ -1,4 +1,4 @@
-"""How snapshots, events and statistics are said, and what a client makes of them."""
+"""Encodes snapshots, events and statistics for messages, and decodes them at the client."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FindNode(Protocol):
     def __call__(self, protocol: str, address: int, /) -> Requester: ...
 
 
-@cache  # each request of a client asks
+@cache  # it is called for each request of a client
 def protocol_of(name: str) -> BusProtocol:
     """Return the protocol of a name. Raises InvalidCommand if there is none."""
     for protocol in protocols():
@@ -60,7 +60,7 @@ def said_sync_reads(profile: Profile) -> dict[str, Any]:
 def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
     """Return the profile with the probe and the sync reads that a client has sent; None: the protocol's.
 
-    Raises InvalidCommand for what is no read of the protocol.
+    Raises InvalidCommand for a command that is not a read of the protocol.
     """
     if probe is None and sync_reads is None:
         return protocol.profile
@@ -85,7 +85,7 @@ def listed_groups(bus: Bus) -> list[dict[str, Any]]:
 
 
 def said_points(points: Iterable[Point[Any]]) -> list[dict[str, Any]]:
-    """Return points as they are said: what they are called, and what they read."""
+    """Return points in the form of messages: their names and their commands."""
     return [
         {
             "key": point.key,
@@ -119,7 +119,7 @@ class OwnersPoint(Point[Any]):
 
 
 def point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
-    """Return a point that was said. It takes values as they come: they were decoded where they were read."""
+    """Return the point in a message. It does not change values, because they were decoded by the owner."""
     protocol = protocol_of(said.get("protocol"))
     node = find(protocol.name, said["address"])
     command = protocol.read_back(said["command"])
@@ -127,25 +127,25 @@ def point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
 
 
 def owners_point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
-    """Return a point of the owner's that was said, with the owner's name for it."""
+    """Return the owner's point in a message, with the owner's name for it."""
     point = point_of(said, find)
     return OwnersPoint(point.node, point.item, point.command, point.unit, owners_key=str(said["key"]))
 
 
 def said_snapshot(snapshot: Snapshot) -> dict[str, Any]:
-    """Return a cycle as it is said, without its samples."""
+    """Return a cycle in the form of a message, without its samples."""
     return {name: getattr(snapshot, name) for name in ("cycle", "due", "started", "finished", "missed", "wall")}
 
 
 def snapshot_of(said: Mapping[str, Any], group: str, points: Sequence[Point[Any]]) -> Snapshot:
-    """Return the cycle that was said; its samples are in the order of its points."""
+    """Return the cycle in a message; its samples are in the order of its points."""
     names = ("cycle", "due", "started", "finished", "missed", "wall")
     samples = {point: _sample_of(one, point) for point, one in zip(points, said["samples"], strict=True)}
     return Snapshot(group=group, samples=samples, **{name: said[name] for name in names})
 
 
 def said_sample(sample: Sample[Any]) -> list[Any]:
-    """Return a sample as it is said."""
+    """Return a sample in the form of a message."""
     error = None if sample.error is None else error_data(sample.error)
     times = (sample.due, sample.started, sample.finished, sample.wall)
     return [sample.value, error, *times, sample.quality.value, sample.timeline]
@@ -168,7 +168,7 @@ def _sample_of(said: Sequence[Any], point: Point[Any]) -> Sample[Any]:
 
 
 def said_event(event: BusEvent) -> dict[str, Any] | None:
-    """Return an event as it is said; None for one that no client hears."""
+    """Return an event in the form of a message; None for one that clients do not get."""
     said: dict[str, Any] = {"event": type(event).__name__}
     match event:
         case NodeChanged():
@@ -195,7 +195,7 @@ def said_event(event: BusEvent) -> dict[str, Any] | None:
 
 
 def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
-    """Return the event that was said; its `node` is the client's own. None for one of a later version."""
+    """Return the event in a message; its `node` is the client's own. None for one of a later version."""
     name = said["event"]
     if name == "LineChanged":
         return LineChanged(LineChange(said["change"]), said["cause"])
@@ -206,7 +206,7 @@ def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
         return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
     if name not in ("NodeChanged", "MaxReplyDelayRaised", "MaxReplyDelayLowered", "RepliesLate"):
         return None
-    # It has all that an event's reader asks of a node: label, address, profile, line.
+    # It has all attributes of a node that events need: label, address, profile, line.
     node = cast("NodeRecord", find(said["protocol"], said["address"]))
     if name == "NodeChanged":
         return NodeChanged(node, Health(said["before"]), Health(said["after"]), said["returning"])
@@ -221,12 +221,12 @@ def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
 
 
 def said_statistics(statistics: LineStatistics) -> dict[str, Any]:
-    """Return the counts of a line as they are said."""
+    """Return the counters of a line in the form of a message."""
     return {**dataclasses.asdict(statistics), "utilisation": statistics.utilisation}
 
 
 def statistics_of(said: Mapping[str, Any]) -> LineStatistics:
-    """Return the counts that were said."""
+    """Return the counters in a message."""
     known = {part.name for part in dataclasses.fields(LineStatistics)}
     counts: dict[str, Any] = {name: value for name, value in said.items() if name in known}
     counts["waits"] = tuple(Quantiles(**wait) for wait in said["waits"])

@@ -28,6 +28,6 @@ class Touches:
             self._when[said["protocol"], said["address"], item] = when
 
     def is_stale(self, protocol: str, address: int, item: str, asked: float) -> bool:
-        """Return whether a write to what a point reads has ended since its value was asked for."""
+        """Return whether a write to the point's place has ended since its value was requested."""
         keys = (protocol, address, item), (protocol, address, None), (None, None, None)
         return max(self._when.get(key, -inf) for key in keys) > asked

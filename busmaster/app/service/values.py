@@ -65,7 +65,7 @@ def set_bits(word: enum.Flag) -> list[str]:
 def value_text(value: Any, precision: int | None = None) -> str:
     """Return one value on one line, a number with so many decimals, all if `precision` is None.
 
-    A set of numbers (flags that are on) becomes `0,5,31`, or `none`; what has names is followed by them.
+    A set of numbers (flags that are on) becomes `0,5,31`, or `none`. Names follow the numbers of words and labels.
     """
     match value:
         case None:
@@ -99,7 +99,7 @@ def json_value(value: Any) -> Any:
         case float():
             if not math.isfinite(value):
                 return None
-            # Above 2**53 a float no longer tells one whole number from the next.
+            # Above 2**53 a float does not distinguish adjacent whole numbers.
             return int(value) if value.is_integer() and abs(value) < 2**53 else value
         case AbstractSet():
             return sorted(value)
@@ -115,7 +115,7 @@ def json_line(**fields: Any) -> str:
 
 
 def micros(moment: float) -> float:
-    """Round a time in seconds to the microsecond: what is behind that is noise."""
+    """Round a time in seconds to the microsecond; further digits are noise."""
     return round(moment, 6)
 
 
@@ -142,9 +142,9 @@ def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[
 
 
 def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
-    """Return a value, or what went wrong, with its quality and whether it is late.
+    """Return a value, or its error, with its quality and whether it is late.
 
-    With it are what the value is called and what to try, where there is something to say.
+    Where they exist, the name of the value and a hint are added.
     """
     fields: dict[str, Any] = {
         "quality": sample.quality.value,
@@ -158,7 +158,7 @@ def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
 
 
 def name_fields(value: Any) -> dict[str, Any]:
-    """Return what a number is called: the `label` of one that has one, of a word the `names` of the set bits."""
+    """Return the name of a number: its `label`, or the `names` of the set bits of a word."""
     match value:
         case Named():
             return {"label": value.label}
@@ -185,19 +185,19 @@ def write_fields(record: WriteRecord) -> dict[str, Any]:
 
 
 def event_text(event: BusEvent) -> str:
-    """Return what a person wants to know of an event, in a sentence; "" for the rest."""
+    """Return the text of an event for users, as a sentence; "" for other events."""
     match event:
         case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
             return f"{event.node.label} is {event.after.value}, was {event.before.value}"
         case MaxReplyDelayRaised():
             return (
-                f"{event.node.label} answered after {event.age * 1000:.0f} ms: "
-                f"its maximum reply delay is now {event.max_reply_delay * 1000:.0f} ms"
+                f"node {event.node.label} replied after {event.age * 1000:.0f} ms; "
+                f"maximum reply delay raised to {event.max_reply_delay * 1000:.0f} ms"
             )
         case RepliesLate():
             return (
-                f"{event.node.label} answers after {event.age * 1000:.0f} ms, later than its reply window of "
-                f"{event.window * 1000:g} ms: its values are late"
+                f"node {event.node.label} replies after {event.age * 1000:.0f} ms, later than its reply window of "
+                f"{event.window * 1000:g} ms; its values are marked late"
             )
         case LineChanged():
             return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")

@@ -1,4 +1,4 @@
-"""One connection of a program to the line's owner, from its first byte to its end, and whose turn it is to be heard."""
+"""One connection of a program to the line's owner, from its first byte to its end, and the order of its messages."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from websockets.http11 import Request
 
 READ_AT_ONCE = 512
-"""Bytes of a connection that are taken in one turn of the line's loop: two or three requests, eighty of the smallest
-frames that there are."""
+"""Bytes of a connection that are read in one turn of the line's loop: two or three requests, or eighty of the smallest
+frames."""
 
 
 class Reception:
-    """Whose message is taken next: one in a turn of the loop, whoever they are, so that the line goes between; and one
-    of each program before the second of any.
+    """The order of messages: one in a turn of the loop, from any program, so that the line can work in between. The
+    first message of each program is taken before the second of any.
     """
 
     def __init__(self) -> None:
@@ -34,14 +34,14 @@ class Reception:
         """Whether a message was taken in this turn of the loop."""
 
     def ask(self, visit: Visit) -> None:
-        """Have a message of this program taken: at once, or when it is its turn."""
+        """Take a message of this program: at once, or when it is its turn."""
         if self._taken:
             self._waiting.append(visit)
             return
         self._taken = True
         try:
             visit.take()
-        finally:  # and not before: what is asked for is not to wait for this
+        finally:  # after the message, which must not wait for this
             asyncio.get_running_loop().call_soon(self._next)
 
     def _next(self) -> None:
@@ -51,39 +51,39 @@ class Reception:
 
 
 class Host(Protocol):
-    """Who is visited."""
+    """The server of a connection."""
 
     @property
     def reception(self) -> Reception: ...
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
-        """Return after how many seconds a connection from there is read; None if it is closed."""
+        """Return after how many seconds the connection is read; None if it is closed."""
         ...
 
     def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
-        """Note who has come; return the HTTP status and words with which one is refused, None if it is not."""
+        """Store the peer; return the HTTP status and text of a refusal, None if it is admitted."""
         ...
 
     def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
-        """Let a program in by its first message, and answer that. Raises Malformed."""
+        """Admit a program by its first message, and reply to that. Raises Malformed."""
         ...
 
     def send_away(self, visit: Visit, /) -> None:
-        """Count one whose conversation is ended for what it said, or did not say."""
+        """Count a connection that is closed because of an invalid or missing message."""
         ...
 
     def over(self, visit: Visit, /) -> None:
-        """Do what is to be done when a connection is over."""
+        """Handle the end of a connection."""
         ...
 
 
 class Visit:
-    """One connection. It is a stranger's until its first message is taken, for which it has HELLO_WITHIN."""
+    """One connection. It is a stranger's until its first message is taken, which must arrive within HELLO_WITHIN."""
 
     def __init__(self, host: Host) -> None:
         self.client: Client | None = None
         self.peer: Peer
-        """Set before it is opened."""
+        """Set before the connection is opened."""
         self.connection = ServedConnection(self, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE)
         self._host = host
         self._messages: deque[str | bytes] = deque()
@@ -92,21 +92,21 @@ class Visit:
         self._log = logging.getLogger("busmaster.app.service")
         self._stranger = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
 
-    # what the connection tells
+    # called by the connection
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
-        """Return what its host says."""
+        """Return the result of its host."""
         return self._host.delay(origin, process)
 
     def refusal(self, request: Request, /) -> tuple[int, str] | None:
-        """Return what its host says."""
+        """Return the result of its host."""
         return self._host.refusal(self, request)
 
     def opened(self) -> None:
         """Wait for the first message."""
 
     def heard(self, message: str | bytes) -> None:
-        """Take a message when it is its turn; until then no more is read."""
+        """Take a message when it is its turn; until then nothing more is read."""
         if self._ended:
             return
         self._messages.append(message)
@@ -115,20 +115,20 @@ class Visit:
             self.connection.pause()
 
     def writable(self) -> None:
-        """Say what waits, and read on where that was waited for."""
+        """Send waiting messages, and continue to read if that was paused."""
         if self.client is not None:
             self.client.outbox.flush()
         self._go_on()
 
     def lost(self) -> None:
-        """Let go of it."""
+        """Handle the loss of the connection."""
         self._finish()
         self._host.over(self)
 
-    # what its host calls
+    # called by the host
 
     def take(self) -> None:
-        """Take the oldest of its messages: it is its turn."""
+        """Take its oldest message, because it is its turn."""
         self._queued = False
         if self._ended:
             return
@@ -143,23 +143,23 @@ class Visit:
                 self.client.take(read_request(message))
         except Malformed as error:
             self._send_away(error)
-        except Exception as bug:  # unheard, it would wait for ever to be read on, and keep its place
+        except Exception as bug:  # without this, the connection would stay paused for ever and keep its place
             self._log.exception("a message of %s could not be taken", self.peer)
             self._send_away(Malformed(f"the program that owns the line failed: {type(bug).__name__}: {bug}", INTERNAL))
         else:
             self._go_on()
 
     def bid_farewell(self) -> None:
-        """End the conversation, as the line's owner ends: behind all that is to be said."""
+        """Close the connection, because the line's owner ends, after all messages."""
         self._end(GOING_AWAY, "the program that owns the line ends")
 
     # inside
 
     def _go_on(self) -> None:
-        """Have the next message taken, or read more, unless it leaves too many answers unread."""
+        """Schedule the next message, or read more, unless too many replies are unread."""
         if self._queued or self._ended:
             return
-        # What waits for a client does so behind a full connection, and hardly one is.
+        # Messages for a client wait only behind a full connection, which is rare.
         if self.connection.full and self.client is not None and self.client.outbox.crowded:
             self.connection.pause()  # `writable` comes here again
         elif self._messages:
@@ -169,7 +169,7 @@ class Visit:
             self.connection.resume()
 
     def _wait_no_longer(self) -> None:
-        self._send_away(Malformed("no hello came", INVALID_PARAMS))
+        self._send_away(Malformed("no hello was received", INVALID_PARAMS))
 
     def _send_away(self, error: Malformed) -> None:
         self._host.send_away(self)
@@ -185,7 +185,7 @@ class Visit:
         if self.client is not None:
             self.client.outbox.flush(last=True)
         self.connection.close(code, reason)
-        self.connection.resume()  # it is to be heard that the other end agrees
+        self.connection.resume()  # the other end's agreement must be read
 
     def _finish(self) -> None:
         self._ended = True

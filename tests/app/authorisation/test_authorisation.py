@@ -62,7 +62,9 @@ def test_one_interface_cannot_fill_the_line_and_another_is_not_held_up_by_it() -
         *ended, other = await asyncio.gather(*writes, authorisation.write(wish(controller, 30, interface="screen")))
         refused = [record for record in ended if not record.ok]
         assert [record.point for record in refused] == ["5/17", "5/18", "5/19"]
-        assert {record.error for record in refused} == {f"{MOST_AT_ONCE} commands are being written already"}
+        assert {record.error for record in refused} == {
+            f"{MOST_AT_ONCE} commands are already being written; wait for them"
+        }
         assert other.ok
         assert (await authorisation.write(wish(controller, 1))).ok  # they are over
         assert len(records) == MOST_AT_ONCE + 5
@@ -78,7 +80,10 @@ def test_a_write_whose_writer_is_cancelled_is_on_record_as_unconfirmed() -> None
         with pytest.raises(asyncio.CancelledError):
             await writing
         [record] = records
-        assert (record.outcome, record.error) == (Outcome.UNCONFIRMED, "the program gave up before it was done")
+        assert (record.outcome, record.error) == (
+            Outcome.UNCONFIRMED,
+            "the program cancelled the write before it ended",
+        )
 
     at_the_authorisation(story)
 
@@ -234,7 +239,7 @@ def test_writes_whose_writers_are_cancelled_give_their_places_back() -> None:
 def test_a_line_that_is_left_or_read_only_lets_no_write_through() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         authorisation.leaving = True
-        assert (await authorisation.write(wish(controller, 1))).error == "the line is being left: nothing was sent"
+        assert (await authorisation.write(wish(controller, 1))).error == "the line is closing; nothing was sent"
         authorisation.leaving, authorisation.read_only = False, True
         assert (await authorisation.write(wish(controller, 1))).error == "this line is read-only"
         authorisation.read_only = False
@@ -258,7 +263,7 @@ def test_a_command_waits_for_the_line_as_long_as_it_is_fresh_and_its_age_counts(
             assert ended.result().took == pytest.approx(FRESH / 2, abs=0.001)
             assert ended.result().outcome is Outcome.NOT_STARTED
         too_old = await authorisation.write(replace(wish(controller, 1), arrived=authorisation.bus.now() - FRESH))
-        assert (too_old.outcome, too_old.error) == (Outcome.REFUSED, "it is too old: nothing was sent")
+        assert (too_old.outcome, too_old.error) == (Outcome.REFUSED, "the command has expired; nothing was sent")
         assert (await authorisation.write(replace(wish(controller, 1), arrived=authorisation.bus.now()))).ok
 
     at_the_authorisation(story)
@@ -271,7 +276,9 @@ def test_a_command_that_says_until_when_it_is_meant_is_held_to_that_alone(monkey
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         old = replace(wish(controller, 1), arrived=authorisation.bus.now() - 10 * FRESH)
         assert (await authorisation.write(replace(old, expires=today + FRESH))).ok
-        assert (await authorisation.write(replace(old, expires=today))).error == "it is too old: nothing was sent"
+        assert (
+            await authorisation.write(replace(old, expires=today))
+        ).error == "the command has expired; nothing was sent"
         async with busy(authorisation):
             [record] = await asyncio.gather(authorisation.write(replace(old, expires=today + 2 * FRESH)))
             assert record.outcome is Outcome.NOT_STARTED

@@ -355,7 +355,7 @@ async def page(address: str, _tcp: str, tokens: str) -> tuple[asyncio.subprocess
     url = ""
     while line := (await started.stderr.readline()).decode():
         url = line.partition("the page is at ")[2].strip() or url
-        if "is followed" in line:
+        if "connected to line" in line:
             break
     return started, url
 

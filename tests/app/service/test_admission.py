@@ -53,7 +53,7 @@ class Crowd:
             else:
                 count += 1
         assert f"places for role {role.value} are taken" in refusals[0]
-        assert "end a program that uses the line" in refusals[0]
+        assert "stop a program that uses the line" in refusals[0]
         return count
 
 
@@ -124,11 +124,11 @@ def test_one_that_only_sends_the_safe_state_is_admitted_when_all_places_are_take
             async with raw(line, hello=False) as client:
                 assert "result" in await client.ask("hello", versions=[3], safe_only=True)
                 await client.say(**said, **({} if said["method"] == "hold" else {"id": 2}))  # as a plain read is said
-                assert "can send the safe state, and nothing else" in (await client.hear())["error"]["message"]
+                assert "can only send the safe state" in (await client.hear())["error"]["message"]
         async with raw(line, hello=False) as client:
             await client.ask("hello", versions=[3], safe_only=True)
-            # It comes as far as authorisation, which knows no safe state of this line.
-            assert "knows no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
+            # It comes as far as authorisation, which has no safe state of this line.
+            assert "has no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
 
     among(tmp_path, story)
 

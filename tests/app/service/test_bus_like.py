@@ -286,7 +286,7 @@ def test_the_owner_refuses_such_a_plan_itself(tmp_path: Path) -> None:
             async with line.service.line.planner._turn:
                 await client.say(method="plan", params={}, id=2)
                 said = await client.ask("plan")
-                assert "one plan is calculated for a program at a time" in said["error"]["message"]
+                assert "a plan for this program is already being calculated" in said["error"]["message"]
             assert (await client.hear())["id"] == 2
 
     on_a_line(tmp_path, story)

@@ -69,9 +69,9 @@ def test_a_request_is_over_when_its_time_is_though_its_owner_says_nothing(tmp_pa
             controller = Hcp2Controller(remote, 5)
             assert await controller.read(1) == 0
             way.open.clear()
-            with pytest.raises(NoReply, match="the program that owns the line says nothing"):
+            with pytest.raises(NoReply, match="the program that owns the line did not reply"):
                 await controller.read(1, finish_within=0.05)
-            with pytest.raises(WriteUnconfirmed, match="the program that owns the line says nothing"):
+            with pytest.raises(WriteUnconfirmed, match="the program that owns the line did not reply"):
                 await controller.write(1, 5, finish_within=0.05)
             way.open.set()
             await until(lambda: line.records)

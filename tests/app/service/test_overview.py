@@ -153,8 +153,8 @@ def test_a_pause_and_a_suspension_are_for_all_and_say_whose_wish_they_were(tmp_p
             await view.suspend("hcp2", 5, 0.0)
             await until(lambda: not other.rows[0].error)
             assert other.frame is not None
-            said = [text.partition(", says ")[0] for _, text in other.frame.events if ", says " in text]
-        assert said == ["axes is paused", "axes goes on", "node 5 is suspended for 60 s", "node 5 goes on"]
+            said = [text.partition(" by ")[0] for _, text in other.frame.events if " by " in text]
+        assert said == ["axes is paused", "axes is resumed", "node 5 is suspended for 60 s", "node 5 is resumed"]
 
     on_a_watched_line(tmp_path, story)
 
@@ -197,7 +197,7 @@ def test_who_may_only_read_looks_and_neither_pauses_nor_suspends_nor_writes(tmp_
                 await wish
         await view.demand("axes")
         line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.WRITE, {("hcp2", 6): None})})
-        with pytest.raises(InvalidCommand, match="user me may not have this rest"):
+        with pytest.raises(InvalidCommand, match="user me may not pause or suspend this"):
             await view.pause("axes", True)
         await view.suspend("hcp2", 6, 60.0)
         assert [node.label for node in line.bus.nodes if node.suspended] == ["node 6"]

@@ -143,7 +143,7 @@ def test_of_plain_reads_too_so_many_may_be_unanswered_and_each_has_a_number_of_i
             read = PlainRead("hcp2", 5, READ)
             for number in range(MOST_REQUESTS):
                 owner.requests.begin(number, read)
-            with pytest.raises(Malformed, match="request 0 is under way already"):
+            with pytest.raises(Malformed, match="request 0 is already in progress"):
                 owner.requests.begin(0, read)
             owner.requests.begin(MOST_REQUESTS, read)
             assert len(owner.errands) == MOST_REQUESTS

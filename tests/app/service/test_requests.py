@@ -55,7 +55,7 @@ def test_what_writes_anything_but_zeros_is_no_stop_and_does_not_pass_the_limits(
             own.element(element).limit(minimum=0, maximum=10)
         async with raw(line) as client:
             said = await client.ask("request", **write(*values, stop=True))
-            assert "is no stop, which writes 0 and nothing else" in said["error"]["message"]
+            assert "is not a stop, which only writes 0" in said["error"]["message"]
         assert [await own.read(element) for element in (1, 2)] == [0, 0]
 
     on_a_line(tmp_path, story)

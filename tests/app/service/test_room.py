@@ -70,7 +70,9 @@ def test_room_that_is_given_to_one_who_gives_up_just_then_is_anothers(monkeypatc
 def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
         room = full(monkeypatch)
-        with pytest.raises(NotStarted, match="1 requests of this program are not answered yet, and its time was over"):
+        with pytest.raises(
+            NotStarted, match="the time of the request is over, and 1 requests of this program have no reply yet"
+        ):
             await room.wait(RequestOptions(start_within=0.5), NODE, COMMAND)
         gone = asyncio.ensure_future(room.wait(ORDINARY, NODE, COMMAND))
         await asyncio.sleep(0)

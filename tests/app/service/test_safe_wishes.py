@@ -135,7 +135,7 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
         monkeypatch.setattr(SafeWishes, "_send", hold)
         asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
         await until(lambda: service.line.safe_wishes.under_way)
-        with pytest.raises(BacklogFull, match="1 requests of this program are not answered yet"):
+        with pytest.raises(BacklogFull, match="1 requests of this program have no reply yet"):
             await Hcp2Controller(remote, 5).read(10)
         meant.set()
         assert await asking == {"winder/speed": None}
@@ -146,7 +146,7 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
 
 def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
-        with pytest.raises(InvalidCommand, match="has the safe state winder/speed = 0, and not winder/speed = 1"):
+        with pytest.raises(InvalidCommand, match="has the safe state winder/speed = 0, not winder/speed = 1"):
             await remote.enter_safe_state({"winder/speed": 1})
         for permission, complaint in (
             (Permission("user me", Role.READ), "user me may read this line"),
@@ -166,7 +166,7 @@ def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -
 
 def test_a_line_without_a_safe_state_says_so(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
-        with pytest.raises(InvalidCommand, match="knows no safe state: end it, then send yours"):
+        with pytest.raises(InvalidCommand, match="has no safe state; stop it, then send yours"):
             await remote.enter_safe_state({"winder/speed": 0})
 
     on_a_line(tmp_path, TEXT, story)

@@ -69,7 +69,7 @@ def test_what_a_program_says_is_one_of_its_messages(said: dict[str, Any], right:
     ("said", "right"),
     [
         ({"jsonrpc": "2.0", "id": 1, "result": [1, {"float": "nan"}]}, True),
-        ({"jsonrpc": "2.0", "id": None, "error": {"code": -32700, "message": "this is no JSON"}}, True),
+        ({"jsonrpc": "2.0", "id": None, "error": {"code": -32700, "message": "not valid JSON"}}, True),
         ({"jsonrpc": "2.0", "id": 1, "error": {"code": -1, "message": "no"}}, False),
         ({"jsonrpc": "2.0", "id": 1, "error": {"code": -32000, "message": "no", "data": {"error": "NoReply"}}}, False),
         ({"jsonrpc": "2.0", "method": "stops", "params": {"protocol": "hcp2", "address": 5, "stops": 1}}, True),

@@ -30,7 +30,7 @@ def test_what_is_no_number_comes_back_too() -> None:
 
 
 def test_what_cannot_be_said_is_refused() -> None:
-    with pytest.raises(TypeError, match="a complex cannot be said"):
+    with pytest.raises(TypeError, match="a complex cannot be sent"):
         encoded(1j)
 
 
