@@ -1,11 +1,11 @@
-"""What every output is: something that is offered what has passed on a line, and deals with it in its own thread.
+"""The base of all outputs: an output is offered the values and events of a line, and handles them in its own thread.
 
-Theory of operation. `offer` runs on the loop that owns the line: it appends to a queue and returns. The thread looks
-into the queue every TICK, so that it is never woken by the line, takes what is there piece by piece, and lets go of
-the interpreter after each piece. What it holds is bounded: when it cannot get rid of it, the oldest is dropped.
+Theory of operation. `offer` runs on the loop that owns the line: it appends to a queue and returns. The thread checks
+the queue every TICK, so that the line never wakes it. It takes the items piece by piece, and releases the interpreter
+after each piece. The queue is bounded: if the output does not work, the oldest items are dropped.
 
 Each count has one writer, the loop or the thread, so that they are exact without a lock:
-`offered` + `found` = `written` + `dropped` + `lost` + `spilled` + what waits in memory.
+`offered` + `found` = `written` + `dropped` + `lost` + `spilled` + number of values in memory.
 """
 
 from __future__ import annotations
@@ -83,23 +83,21 @@ def reason(error: BaseException) -> str:
 
 
 def check_folder(path: str) -> None:
-    """Raise InvalidCommand where no file can ever be made: that is better said before anything starts.
+    """Raise InvalidCommand if the folder of a file does not exist, so that the error is reported at the start.
 
-    Folders whose names hold fields of a date are made when their time comes.
+    Folders whose names contain fields of a date are created later.
     """
     folder = os.path.dirname(path)
     while "%" in folder:
         folder = os.path.dirname(folder)
     if folder and not os.path.isdir(folder):
-        raise InvalidCommand(f"{path}: there is no folder {folder}")
+        raise InvalidCommand(f"{path}: the folder {folder} does not exist; create it, or use another path")
 
 
 def check_extra(package: str, extra: str) -> None:
-    """Raise InvalidCommand, saying what to install, where the package of an extra is not there."""
+    """Raise InvalidCommand with the installation command if the package of an extra is missing."""
     if importlib.util.find_spec(package) is None:
-        raise InvalidCommand(
-            f"this output needs {package}, which the extra named {extra} brings: pip install 'busmaster[{extra}]'"
-        )
+        raise InvalidCommand(f"this output needs {package}, which is not installed; pip install 'busmaster[{extra}]'")
 
 
 class Output(ABC):
@@ -131,7 +129,7 @@ class Output(ABC):
         self._promised: dict[int, tuple[WriteRecord, Kept]] = {}
         """Audit entries whose durability is awaited, by their identity: loop and thread share it without a lock."""
         self._say = say
-        self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: what they do with it is atomic
+        self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: its operations are atomic
         self._stop = threading.Event()
         self._reopen = threading.Event()
         self._retry = FIRST_RETRY
@@ -155,31 +153,31 @@ class Output(ABC):
                 break  # the rest is in the thread's hands
             self.dropped += size_of(oldest)
             if isinstance(oldest, WriteRecord):
-                self.settle_entry(oldest, f"{self.kind} dropped it, for too much waits")
+                self.settle_entry(oldest, f"{self.kind} dropped it, because its queue was full")
 
     def offer_entry(self, entry: WriteRecord, kept: Kept) -> None:
-        """Hand it an audit entry. `kept` is called once, from any thread: with "" when the entry is durable, and with
+        """Offer an audit entry. `kept` is called once, from any thread: with "" when the entry is durable, and with
         the reason when it never will be."""
         self._promised[id(entry)] = entry, kept
         self.offer(entry)
 
     def settle_entry(self, entry: WriteRecord, why_not: str = "") -> None:
-        """Report to whom it concerns that an audit entry is durable, or why it never will be."""
+        """Call the `kept` of an audit entry: it is durable, or never will be for the given reason."""
         _, kept = self._promised.pop(id(entry), (None, None))
         if kept is not None:
             kept(why_not)
 
     def miss(self, values: int) -> None:
-        """Count so many values as lost before they could be offered."""
+        """Count values as lost before they could be offered."""
         self.offered += values
         self.dropped += values
 
     def suppress(self, values: int) -> None:
-        """Count so many values that are not offered, as they are no news."""
+        """Count values that are not offered because they are unchanged."""
         self.suppressed += values
 
     def reopen(self) -> None:
-        """Have it let go of the file that is open, if there is one, and open it anew: it may have been moved away."""
+        """Close the file that is open, if there is one, and open it again: it may have been moved away."""
         self._reopen.set()
 
     def succeed(self, before: Output) -> None:
@@ -207,12 +205,12 @@ class Output(ABC):
     # off the loop
 
     def close_interface(self) -> None:  # noqa: B027  nothing to do where there is no interface
-        """Take in nothing from outside any more, and answer what has come. Most take in nothing at all."""
+        """Stop accepting input, and reply to the input received so far. Most outputs have no input."""
 
     def close(self, within: float) -> None:
-        """Let it write what waits, for so many seconds; what is left, and not on disk, is dropped.
+        """Write the queue for at most `within` seconds, and drop the rest that is not on disk.
 
-        Nothing may be offered any more.
+        Nothing must be offered any more.
         """
         self._stop.set()
         if self._thread.ident is not None:
@@ -225,7 +223,7 @@ class Output(ABC):
 
     @abstractmethod
     def work(self) -> None:
-        """Take what is offered until it is stopped, then the rest. It is called again, later, if it raises."""
+        """Handle offered items until the output is stopped, then the rest. It is called again, later, if it raises."""
 
     def take(self) -> Item | None:
         """Take the oldest item that waits; None if none does."""
@@ -240,7 +238,7 @@ class Output(ABC):
         If `send` raises, the item waits again, in front of the others, and the error is raised on.
         """
         while True:
-            stopped = self._stop.is_set()  # before the queue is looked at: what was offered until then is sent
+            stopped = self._stop.is_set()  # before the queue is checked: everything offered until then is sent
             item = self.take()
             if item is None:
                 if stopped:
@@ -256,14 +254,14 @@ class Output(ABC):
             self.up()
 
     def up(self) -> None:
-        """Note that the output works, and say so if it was down."""
+        """Note that the output works, and report it if it was down."""
         self._retry = FIRST_RETRY
         if self.error:
             self.error = ""
             self._say(f"{self.kind} is up again")
 
     def down(self, error: BaseException) -> None:
-        """Note why the output does not work, and say so where that is new."""
+        """Note why the output does not work, and report the reason if it is a new one."""
         text = reason(error)
         if self._destination not in text:  # most errors of a library name neither a file nor a host
             text = f"{self._destination}: {text}"
@@ -276,7 +274,7 @@ class Output(ABC):
         self._stop.wait(seconds)
 
     def _run(self) -> None:
-        """Work until stopped. Whatever goes wrong is told and tried again: it must not end the thread."""
+        """Work until stopped. Every error is reported, and the work is tried again: it must not end the thread."""
         while True:
             last = self._stop.is_set()  # before the try: one that is stopped in the midst of a failing try gets another
             try:

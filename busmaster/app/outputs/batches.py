@@ -40,7 +40,7 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
 
     @abstractmethod
     def format(self, item: Item) -> Formatted | None:
-        """Return the item as it is written; None for what is not written here."""
+        """Return the item in the form in which it is written; None if it is not written here."""
 
     @abstractmethod
     def commit(self, batch: list[Formatted]) -> None:
@@ -48,7 +48,7 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
 
     @abstractmethod
     def pack(self, formatted: Formatted) -> str:
-        """Return what was formatted as text, as it is kept on disk."""
+        """Return a formatted item as text for the disk."""
 
     @abstractmethod
     def unpack(self, text: str) -> Formatted:
@@ -64,7 +64,7 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
         try:
             stopped = False
             while not stopped:
-                # before the queue is emptied, so that what was offered until then is written
+                # before the queue is emptied, so that everything offered until then is written
                 stopped = self._stop.wait(TICK)
                 if self._reopen.is_set():
                     self._reopen.clear()
@@ -92,7 +92,7 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
         while size < most and (item := self.take()) is not None:
             formatted = self.format(item)
             if formatted is None:
-                self.written += size_of(item)  # what is not written here, as events in CSV, is no loss
+                self.written += size_of(item)  # items that are not written here, such as events in CSV, are not lost
             else:
                 self._batch.append(formatted)
                 self._sizes.append(size_of(item))

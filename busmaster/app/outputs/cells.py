@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet takes for the beginning of a formula."""
+"""First characters of a formula in a spreadsheet."""
 KEPT = re.compile(r"0|[1-9]\d{0,14}|[^\d\s.,'].*", re.DOTALL)
 """Texts that a spreadsheet leaves alone, if they begin no formula: a plain number, or what does not begin like one."""
 
@@ -33,14 +33,14 @@ def no_formula(text: str) -> str:
 
 
 def text_cell(text: str) -> str:
-    """Return a text as `text_of` reads it back to the letter, behind an apostrophe where it is not safe by itself.
+    """Return a text that `text_of` restores exactly, with an apostrophe in front if it is not safe by itself.
 
-    That is what begins a formula, is empty, or might be taken for a number and written another way: 1.20 as 1.2, 01 as
+    These are formulas, empty texts, and texts that a spreadsheet converts to a number or date: 1.20 to 1.2, 01 to
     1, 4-8 as a date.
     """
     return text if KEPT.fullmatch(text) and no_formula(text) == text else f"'{text}"
 
 
 def text_of(cell: str) -> str:
-    """Return the text that a cell of `text_cell`, or one that somebody wrote, stands for."""
+    """Return the text of a cell that `text_cell` or a user has written."""
     return cell.removeprefix("'")

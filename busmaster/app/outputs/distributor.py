@@ -1,4 +1,4 @@
-"""All outputs of a line: what is polled and what happens is handed to each of them, and none can hold it up."""
+"""All outputs of a line: each gets the polled values and the events, and none can delay the line."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from busmaster.ext import Outdated
 WAITING = 256
 """Cycles of a group that may wait for a loop that is busy with other things."""
 FAREWELL = 5.0
-"""Seconds in which the outputs write what they still hold, when the line is closed."""
+"""Seconds in which the outputs write their queues when the line is closed."""
 
 
 class Source(Protocol):
-    """Where cycles come from: a poll group, or what is heard of one."""
+    """A source of cycles: a poll group, or the samples of one from another master."""
 
     @property
     def name(self) -> str: ...
@@ -40,7 +40,7 @@ class Source(Protocol):
 
 
 class Wanted(NamedTuple):
-    """What one output is told. `commands`: the points, by their key, that it lets others write."""
+    """The settings of one output. `commands`: the points, by their key, that it permits others to write."""
 
     settings: Settings
     commands: Mapping[str, Point[Any]]
@@ -56,11 +56,11 @@ class Wanted(NamedTuple):
 
 
 class Distributor:
-    """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
+    """The outputs of one bus. `tell` is called, on the loop, with their events.
 
-    `authorisation` is what the commands pass that they take in. One that is not `in_charge` of the line says nothing of
-    its state: another process may be. One that is not of a line that `asks` says only that it listens, and what it
-    hears.
+    `authorisation` checks the commands that they receive. Without `in_charge`, the state of the line is not reported,
+    because another process may own it. With `asks` False, the line only listens, and only that and its samples are
+    reported.
     """
 
     def __init__(
@@ -102,9 +102,8 @@ class Distributor:
     async def replace(self, wanted: Mapping[str, Wanted], groups: Iterable[Source]) -> None:
         """Run these outputs, and feed them from these groups, from now on.
 
-        One that is wanted as it was is reopened, and goes on with what it holds. Another is closed, within FAREWELL
-        seconds, and what comes meanwhile waits for its successor. Raises InvalidCommand, having changed nothing, if an
-        extra is missing.
+        An unchanged output is reopened, and continues with its queue. A changed one is closed, within FAREWELL seconds,
+        and new items wait for its successor. Raises InvalidCommand, before any change, if an extra is missing.
         """
         # Made before anything is changed: an extra may be missing.
         fresh = {kind: self._make(kind, *one) for kind, one in wanted.items() if not one.same(self._wanted.get(kind))}
@@ -116,7 +115,7 @@ class Distributor:
             output.reopen()
         self._take_in(groups)
         for news in self._news.values():
-            news.forget()  # what is made or opened anew knows nothing yet
+            news.forget()  # new and reopened outputs do not have the last values
         with anyio.CancelScope(shield=True):
             await close_all(leaving.values())
         for kind, output in fresh.items():
@@ -129,10 +128,10 @@ class Distributor:
             self.tell(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
 
     def record(self, write: WriteRecord) -> asyncio.Future[str] | None:
-        """Hand an audit entry to all of them.
+        """Offer an audit entry to all outputs.
 
-        For a write that succeeded, and outputs with `audit = "strict"`, return what becomes done when all of these have
-        the entry on the disk, or with the reason why one of them has not; else None.
+        For a write that succeeded, and outputs with `audit = "strict"`, return a future. It is done when all of these
+        have the entry on the disk, or with the reason why one of them has not. Otherwise return None.
         """
         waits = write.ok and any(output.is_strict for output in self._outputs)
         durable: asyncio.Future[str] | None = asyncio.get_running_loop().create_future() if waits else None
@@ -148,7 +147,7 @@ class Distributor:
         return durable
 
     def _kept(self, durable: asyncio.Future[str], missing: set[str], kind: str, why_not: str) -> None:
-        """Hear from any thread that an output has an entry on the disk, or why it will never have it."""
+        """Handle, on any thread, that an output has an entry on the disk, or why it never will."""
 
         def note() -> None:
             missing.discard(kind)
@@ -170,10 +169,10 @@ class Distributor:
     async def close(self) -> None:
         """Close the outputs, once the bus is closed.
 
-        What was polled is still handed on, and written within FAREWELL seconds.
+        The values polled so far are still offered, and written within FAREWELL seconds.
         """
         with anyio.CancelScope(shield=True):
-            # They end with the bus's streams. Cancelled, they would leave behind what was polled last.
+            # They end with the bus's streams. If they were cancelled, the values polled last would be missing.
             await asyncio.gather(*self._feeding.values(), return_exceptions=True)
             if self._watching is not None:
                 self._watching.cancel()
@@ -227,7 +226,7 @@ class Distributor:
                     output.offer(Happening(micros(self._bus.wall_time()), label_of(event), text))
 
     def _say(self, text: str) -> None:
-        """Hand a text from any thread to the loop; when that is gone nobody listens any more."""
+        """Pass a text from any thread to the loop; if the loop has ended, the text is discarded."""
         if self._loop is not None:
             try:
                 self._loop.call_soon_threadsafe(self.tell, text)
@@ -248,7 +247,7 @@ class Distributor:
 
 
 async def close_all(outputs: Collection[Output]) -> None:
-    """Close them, their interfaces first: what was answered there is on record in all of them."""
+    """Close them, their interfaces first, so that all of them have the audit entries of their replies."""
     # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
     await asyncio.gather(*(asyncio.to_thread(output.close_interface) for output in outputs))
     await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in outputs))

@@ -1,4 +1,4 @@
-"""Report by exception: of what is polled, outputs are told what is news by the meaning of its point."""
+"""Report by exception: outputs get only values that differ by the deadband, or are due by the heartbeat."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROUNDING = 1e-6
 
 
 class Told(NamedTuple):
-    """What was told last of a point, when it was due, and when it was asked for."""
+    """The last reported value of a point, its due time, and the time of its request."""
 
     value: Any
     quality: Quality
@@ -24,12 +24,12 @@ class Told(NamedTuple):
 
 
 class News:
-    """What outputs were told of one poll group, and so what is news to them.
+    """The last values that outputs got from one poll group, to find the values to report.
 
-    A value is news where it is further than the deadband from what was told last, where its quality is another one,
-    as when it could not be read and when it can be again, and where the heartbeat is over. A point whose meaning has
-    neither deadband nor heartbeat always is. `outdated` says whether what was asked for at that time has become stale
-    or bad since, which an output may have told: what is read then is news, though it be the same value.
+    A value is reported in three cases: it differs from the last one by more than the deadband, its quality has changed,
+    or the heartbeat time has passed. A point without deadband and heartbeat is always reported. `outdated` returns
+    whether a value that was requested at that time has since become stale or bad, which an output may have reported.
+    Then the next value is reported, even if it is the same.
     """
 
     def __init__(self, outdated: Callable[[Point[Any], float], bool] = lambda *_: False) -> None:
@@ -37,7 +37,7 @@ class News:
         self._told: dict[Point[Any], Told] = {}
 
     def of(self, snapshot: Snapshot) -> Snapshot:
-        """Return the cycle with what is news of it."""
+        """Return the cycle with only the values to report."""
         if not any(point.meaning.by_exception for point in snapshot.samples):
             return snapshot
         due = snapshot.due

@@ -53,7 +53,7 @@ class FileOutput(BatchOutput[bytes]):
 
 
 class CsvOutput(FileOutput):
-    """A line a value. Times are UTC, to the millisecond. No name is taken for a formula by a spreadsheet."""
+    """One line per value. Times are UTC, to the millisecond. Names are safe from interpretation as formulas."""
 
     head = ",".join(COLUMNS).encode() + b"\n"
 
@@ -95,7 +95,7 @@ class JsonlOutput(FileOutput):
 
 
 def value_cell(sample: Sample[Any]) -> str:
-    """Return a value as text. Only one that is a text itself could be taken for a formula."""
+    """Return a value as text. Only a text could be interpreted as a formula."""
     if sample.error:
         return ""
     text = value_text(sample.value)

@@ -1,9 +1,9 @@
-"""A file that grows by whole lines, whatever is done to it from outside.
+"""A file that grows by whole lines, independent of changes from outside.
 
-Who rotates it moves it away, who tidies up removes it, who empties it truncates it, and a crash leaves half a line
-behind: each is noticed at the next writing, and nothing goes where nobody looks for it.
+Another program can rotate the file, remove it or truncate it, and a crash can leave half a line. Each is noticed at the
+next write, and no data goes to a file that no program reads.
 
-What was written survives the end of this process at once, and the end of the machine's power from the next sync on.
+Written data survives the end of this process at once, and a loss of power from the next sync on.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from busmaster.ext import FOLDER_MODE, MODE, open_file
 
 
 class GrowingFile:
-    """`pattern` may hold fields of a date, in its folders too, which are then made. `mode` is narrowed by the umask.
+    """`pattern` may contain fields of a date, also in its folders, which are created. The umask narrows `mode`.
 
-    A file that is empty begins with `head`. `tell` is told what somebody else did to it, in a sentence.
+    An empty file begins with `head`. `tell` is called with a sentence about changes by other programs.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class GrowingFile:
             self._write(descriptor, lines)
             if os.fstat(descriptor).st_nlink:
                 break
-            self.close()  # it was removed while it was written: nobody will ever read that
+            self.close()  # it was removed while it was written: no program will ever read that
         if sync and not self._is_named:
             sync_folder(os.path.dirname(self._path) or ".")  # a new file is lost with the power if its name is
             self._is_named = True
@@ -66,7 +66,7 @@ class GrowingFile:
             try:
                 os.fsync(descriptor)
             except OSError:
-                pass  # a full or a lost disk has been told when it was written to
+                pass  # a full or a lost disk was reported when it was written to
             os.close(descriptor)
 
     def _current(self) -> int:
@@ -76,7 +76,7 @@ class GrowingFile:
             self.close()
             self._path = path
         if self._descriptor is not None and not is_at(path, self._descriptor):
-            self._tell(f"{path} was moved or removed: another is begun")
+            self._tell(f"{path} was moved or removed; a new file was started")
             self.close()
         if self._descriptor is None:
             self._descriptor = self._opened(path)
@@ -90,8 +90,8 @@ class GrowingFile:
         descriptor = open_file(path, os.O_WRONLY | os.O_APPEND, self._mode)
         self._is_named = False
         if ends_in_a_half_line(path):
-            os.write(descriptor, b"\n")  # else the first new line would be taken for the rest of the half one
-            self._tell(f"{path} ended in the middle of a line, which was closed off")
+            os.write(descriptor, b"\n")  # else the first new line would continue the half one
+            self._tell(f"{path} ended with an incomplete line, which was closed")
         return descriptor
 
     def _write(self, descriptor: int, lines: bytes) -> None:
@@ -127,7 +127,7 @@ def is_at(path: str, descriptor: int) -> bool:
 
 
 def ends_in_a_half_line(path: str) -> bool:
-    """Return whether the file's last byte ends no line. A file that may not be read is believed to be whole."""
+    """Return whether the file ends with an incomplete line. False if the file must not be read."""
     try:
         with open(path, "rb") as file:
             end = file.seek(0, os.SEEK_END)

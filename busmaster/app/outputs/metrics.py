@@ -1,4 +1,4 @@
-"""OpenMetrics: the counts of line, nodes, groups and outputs, for a Prometheus that comes and asks.
+"""OpenMetrics: the counters of line, nodes, groups and outputs, for scrapes by Prometheus.
 
 With `groups`, their values too. Scrapes are served by one thread, one after the other. Each number is read on the loop
 that owns the line, a node at a time, so that no scrape keeps it for more than some ten microseconds.
@@ -50,9 +50,9 @@ COUNTS = {
 LINE_COUNTS = {
     "exchanges": "Exchanges on the line",
     "cancelled": "Requests whose callers had gone",
-    "unexpected_bytes": "Bytes that no request asked for",
+    "unexpected_bytes": "Bytes without a request",
     "tainted": "Replies that came sooner than the baud rate allows",
-    "collisions": "Echoes that differ from what was sent",
+    "collisions": "Echoes that differ from the sent bytes",
     "sync_reads": "Reads that proved the line to be in sync",
     "ambiguous": "Replies that were discarded because they could belong to another request",
     "resyncs": "Times the line was resynchronised",
@@ -67,7 +67,7 @@ DRIVER_COUNTS = {
     "parity": "Parity errors, by the driver's count",
     "breaks": "Breaks, by the driver's count",
     "overruns": "Bytes lost in the UART, by the driver's count",
-    "buffer_overruns": "Bytes lost because nobody read in time, by the driver's count",
+    "buffer_overruns": "Bytes lost because they were not read in time, by the driver's count",
 }
 
 
@@ -88,7 +88,7 @@ class MetricsOutput(Output):
         check_extra("prometheus_client", "metrics")
         super().__init__(kind, settings, say)
         self.port = settings.port
-        """The one that is served, where 0 was asked for."""
+        """The port in use, if the configured one is 0."""
         self._host = settings.host
         self._bus = bus
         self._others = outputs
@@ -109,13 +109,13 @@ class MetricsOutput(Output):
             self._owner.call_later(NOTED_EVERY, self._note_utilisation)
 
     def offer(self, item: object) -> None:
-        """Ignore the item: nothing waits here, and what is asked for is read then."""
+        """Ignore the item: nothing is queued here, and each scrape reads the present values."""
 
     def miss(self, values: int) -> None:
         """Ignore the count: nothing waits here, so nothing is lost."""
 
     def suppress(self, values: int) -> None:
-        """Ignore the count: what is asked for is always the last value."""
+        """Ignore the count: a scrape always gets the last value."""
 
     # on threads
 
@@ -131,11 +131,11 @@ class MetricsOutput(Output):
             asyncio.run(serve(listener, partial(page, registry), self._stop))
 
     def describe(self) -> Iterable[Metric]:
-        """Return nothing, so that registering does not ask the line."""
+        """Return nothing, so that registering does not read the line."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every metric when a scrape asks, on its thread. Raises TimeoutError where the loop does not answer."""
+        """Yield every metric for a scrape, on its thread. Raises TimeoutError if the loop does not respond."""
         yield from self._of_line()
         yield from self._of_nodes()
         yield from self._of_groups()
@@ -233,7 +233,7 @@ class MetricsOutput(Output):
 
         cycles = CounterMetricFamily("busmaster_group_cycles", "Cycles that were polled", labels=["group"])
         missed = CounterMetricFamily("busmaster_group_missed", "Cycles that could not start", labels=["group"])
-        wanted = GaugeMetricFamily("busmaster_group_period_seconds", "Period as asked for", labels=["group"])
+        wanted = GaugeMetricFamily("busmaster_group_period_seconds", "Configured period", labels=["group"])
         achieved = GaugeMetricFamily("busmaster_group_achieved_period_seconds", "Period as seen", labels=["group"])
         for group in self._bus.groups:
             counts = self._ask(group.statistics)
@@ -244,9 +244,9 @@ class MetricsOutput(Output):
         yield from (cycles, missed, wanted, achieved)
 
     def _of_points(self) -> Iterator[Metric]:
-        """Yield the last values of the groups that are to be told. What is no number is left out.
+        """Yield the last values of the groups in the settings. Values that are not numbers are left out.
 
-        A point that cannot be read has no value, but the time of the last one: an alert on its age goes on.
+        A point that cannot be read has no value, but the time of the last one, so that an alert on its age continues.
         """
         from prometheus_client.core import GaugeMetricFamily
 
@@ -288,7 +288,7 @@ class MetricsOutput(Output):
         waiting = GaugeMetricFamily("busmaster_output_waiting", "Values and events that wait", labels=["output"])
         spilled = GaugeMetricFamily("busmaster_output_spilled", "Of those, on disk", labels=["output"])
         suppressed = CounterMetricFamily(
-            "busmaster_output_suppressed", "Values that were no news, by deadband and heartbeat", labels=["output"]
+            "busmaster_output_suppressed", "Unchanged values, by deadband and heartbeat", labels=["output"]
         )
         up = GaugeMetricFamily("busmaster_output_up", "1 while the output works", labels=["output"])
         for counts in self._others():
@@ -332,7 +332,7 @@ class MetricsOutput(Output):
 
 
 def number_of(value: object) -> float | None:
-    """Return a value as a gauge has it: words and flags by their number, None for what is not one number."""
+    """Return a value for a gauge: words and flags as their number, None for a value that is not one number."""
     number = value.value if isinstance(value, enum.Enum) else value
     return float(number) if isinstance(number, int | float) else None
 

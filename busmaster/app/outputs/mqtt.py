@@ -1,4 +1,4 @@
-"""MQTT: values and health out, and, where the file allows it, commands in.
+"""MQTT: values and health out and, if the file permits them, commands in.
 
     PREFIX/values/NODE/ITEM   {"time": ..., "value": 12.5, "unit": "mm", "quality": "good", "error": null,
                               "late": false}, and again, with "stale" or "bad", after a write, or when the line is lost
@@ -10,16 +10,16 @@
     PREFIX/status             online, or offline, which is also the last will; retained
     HOME/.../config           discovery messages of Home Assistant, with home_assistant = "HOME"; retained
 
-    PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to be written; or {"value": 12.5, "id": "a1",
-                              "expires": 1767225600}, of which value alone must be said
+    PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to write; or {"value": 12.5, "id": "a1",
+                              "expires": 1767225600}, in which only value is required
     PREFIX/result/NODE/ITEM   {"ok": true}, or {"ok": false, "error": "..."}, with the command's id if it has one
-    PREFIX/audit              each write, by whatever interface: who, what, when, what became of it
+    PREFIX/audit              each write, by any interface: source, value, time and outcome
 
 In names +, # and % are written %2B, %23 and %25. A command is written within a second of its arrival, or by `expires`
-or the message's own expiry where it has one; an older one is refused. What is not allowed comes on a connection of its
-own, so that no flood of it holds up what is. Times are seconds since 1970. What was not acknowledged when the broker
-went away is sent again when it is back. With `spill`, what waits for it does so on disk, and is sent by the next
-process if this one ends before.
+or the message's own expiry if it has one; an older one is refused. Commands that the file does not permit arrive on a
+connection of their own, so that a flood of them does not delay the permitted ones. Times are seconds since 1970.
+Messages without an acknowledgement when the broker is lost are sent again when it is back. With `spill`, unsent
+messages are stored on disk, and the next process sends them if this one ends before.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 AT_ONCE = 100
 """Messages on their way to the broker, not yet acknowledged."""
 UNREAD = 32_768
-"""Bytes that wait in our socket, some: what is more waits at the broker. Behind many commands in a socket of megabytes,
-the last would grow too old."""
+"""Approximate number of bytes in our socket; further commands wait at the broker. Behind many commands in a socket of
+megabytes, the last would expire."""
 AHEAD = 2_000
 """Commands that the broker may send before we have acknowledged the first; its own acknowledgements overtake the rest.
 More than fit in our socket: one that it held back while we stood still would look new when it comes."""
@@ -74,9 +74,9 @@ KEEP_ALIVE = 15
 ALARMS = "alarms/"
 COMMANDS = "set/#"
 UNSUPPORTED_VERSION = 132
-"""What a broker says that knows MQTT 3.1.1 alone, or what the client makes of what that says."""
+"""Reason code of a broker that only supports MQTT 3.1.1, or the client's replacement for it."""
 LAST_ANSWERS = 2.0
-"""Seconds in which the commands that have come are answered, when no more are to be taken in."""
+"""Seconds for replies to the commands received so far, when no more are accepted."""
 MARGIN = 1.0
 """Seconds, beyond those, for a thread that does not get on: who does not answer then never will."""
 HURRY = 2.0
@@ -90,10 +90,10 @@ class Outgoing(NamedTuple):
 
 
 class MqttOutput(SpillingOutput):
-    """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing.
+    """`commands`: the points, by their key, that may be written. Raises InvalidCommand if the extra is missing.
 
-    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there. Without `asks` it
-    says that it is there, and what it heard; how line and nodes are, nobody knows who does not ask them.
+    Without `in_charge`, it does not report the state of the line and its nodes, nor its own. Without `asks`, it reports
+    itself and its samples, but not the state of line and nodes, because that is unknown without requests.
     """
 
     finds_outdated: ClassVar[bool] = True
@@ -136,7 +136,7 @@ class MqttOutput(SpillingOutput):
         self._seen: object = None
         """The last write, and whether the line was there, when values were last looked at."""
         self._alarms: object = None
-        """Those that were told last."""
+        """The alarms that were reported last."""
         self._quiet = logging.getLogger("busmaster.mqtt")
         self._quiet.addHandler(logging.NullHandler())
         self._quiet.propagate = False
@@ -171,7 +171,7 @@ class MqttOutput(SpillingOutput):
         scope.cancel()
 
     def records(self) -> Iterator[Record]:
-        """Yield the messages of what is held, each as it is kept on disk."""
+        """Yield the messages of the queued items, each in its form on disk."""
         for item in self._held:
             by_cycle = isinstance(item, Snapshot) and self._settings.messages == "cycle"
             for message in self._messages(item):
@@ -190,7 +190,7 @@ class MqttOutput(SpillingOutput):
         while self._spool is not None and self.spilled and not self._stop.is_set():
             up_to, records = self._spool.oldest(AT_ONCE)
             await self._send(client, (Outgoing(*json.loads(record.content)) for record in records))
-            self.forwarded(up_to, records)  # only now: what is lost before it was acknowledged is sent again
+            self.forwarded(up_to, records)  # only now: messages that are lost before the acknowledgement are sent again
 
     async def _connected(self) -> None:
         async with self._connection() as client, anyio.create_task_group() as tasks:
@@ -206,7 +206,7 @@ class MqttOutput(SpillingOutput):
                 stopped = self._stop.is_set()  # looked at first, so that a last round sends what waits
                 await self._send(client, list(self._changes()))
                 await self._send_spilled(client)
-                # What is on disk is older: nothing in memory may overtake it.
+                # The values on disk are older: nothing in memory may overtake them.
                 while not self.spilled and self.hold(AT_ONCE):
                     await self._send(client, (message for item in self._held for message in self._messages(item)))
                     self.written += self.let_go()
@@ -229,11 +229,11 @@ class MqttOutput(SpillingOutput):
                 client = await stack.enter_async_context(unconnected)
             except aiomqtt.MqttCodeError as error:
                 if getattr(error.rc, "value", error.rc) == UNSUPPORTED_VERSION:
-                    raise ConnectionError(f"{broker} does not speak MQTT 5, which this output needs") from None
+                    raise ConnectionError(f"{broker} does not support MQTT 5, which this output needs") from None
                 raise
             except aiomqtt.MqttError as error:
                 if "timed out" in str(error):
-                    raise ConnectionError(f"{broker} did not answer in {TIMEOUT:g} s; does it speak MQTT 5?") from None
+                    raise ConnectionError(f"{broker} did not reply within {TIMEOUT:g} s; it needs MQTT 5") from None
                 raise
             yield client
 
@@ -297,11 +297,11 @@ class MqttOutput(SpillingOutput):
             done = bool((await asyncio.wait({publishing}, timeout=TIMEOUT))[0])
             if not done and self._arriving.bytes_read == heard:
                 publishing.cancel()
-                raise ConnectionError(f"{self._settings.host}:{self._settings.port} did not answer in {TIMEOUT:g} s")
+                raise ConnectionError(f"{self._settings.host}:{self._settings.port} did not reply within {TIMEOUT:g} s")
         await publishing
 
     def hold(self, most: int) -> bool:
-        """Hold up to `most` values, and return whether there are any. What was not acknowledged comes first."""
+        """Hold up to `most` values, and return whether there are any. Unacknowledged messages come first."""
         size = sum(map(size_of, self._held))
         while size < most and (item := self.take()) is not None:
             self._held.append(item)
@@ -371,7 +371,7 @@ class MqttOutput(SpillingOutput):
         return [Outgoing(self._topic("status"), state, True)] if self._in_charge else []
 
     def _farewell(self) -> Iterator[Outgoing]:
-        """Yield that no line and no node is known to be up any more: what is retained would say so for ever."""
+        """Yield messages that no line and no node is up any more, because retained messages would stay for ever."""
         for topic in self._published if self._in_charge else ():
             name = topic.partition("/")[0]
             if name in ("line", "health"):
@@ -379,7 +379,7 @@ class MqttOutput(SpillingOutput):
                 yield Outgoing(self._topic(topic), payload, True)
 
     def _changes(self) -> Iterator[Outgoing]:
-        """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
+        """Yield the changes since the last report. Only attributes that are replaced as a whole are compared."""
         if not self._in_charge:
             return
         now: dict[str, tuple[str, str | None]] = {}
@@ -424,8 +424,8 @@ class MqttOutput(SpillingOutput):
         return ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection")
 
     async def _serve(self, client: Client, *, task_status: TaskStatus[None]) -> None:
-        """Take in commands until the interface is to be closed; it has started when they are listened to."""
-        self._interface_is_closed.clear()  # before the look: whoever wants it closed looks in the other order
+        """Accept commands until the interface is to be closed; it has started when the subscription is active."""
+        self._interface_is_closed.clear()  # before the check: `close_interface` uses the opposite order
         try:
             if self._commands and not self._leaving.is_set():
                 await self._hear(client, task_status)
@@ -469,7 +469,7 @@ class MqttOutput(SpillingOutput):
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._authorisation.write(wish), self._owner))
 
     def _keep(self, wish: Wish, error: str) -> None:
-        """Put on record, on that loop too, what was refused."""
+        """Store the audit entry of a refused command, on the owner's loop."""
         assert self._owner is not None
         with suppress(RuntimeError):  # that loop has ended
             self._owner.call_soon_threadsafe(self._authorisation.refuse, wish, error)

@@ -1,4 +1,4 @@
-"""Commands that come by MQTT: each is judged as it arrives, so that those that are refused hold up nobody."""
+"""Commands by MQTT: each is checked when it arrives, so that refused ones do not delay others."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
     from paho.mqtt.client import MQTTMessage
 
 LOOK = 0.02
-"""Seconds between two looks at the clock, and at what has come and is not read yet."""
+"""Seconds between two readings of the clock and of the number of unread bytes."""
 LEAST = 5
 """Bytes of a message beside its topic and its payload, at least."""
 BREATH = 0.005
-"""Seconds between two refusals that are answered: a flood of them costs the line nothing."""
+"""Seconds between two replies to refused commands: a flood of them costs the line nothing."""
 TOLD_EVERY = 10.0
-"""Seconds, at least, between two lines that tell how many refusals were counted alone."""
+"""Minimum number of seconds between two messages about refusals that were only counted."""
 EXPIRY = "MessageExpiryInterval"
 PROPERTIES = "UserProperty"
 SENDER = "by"
-"""The user property in which a sender may say who it is: no broker tells a subscriber, and nobody checks it."""
+"""User property for the name of the sender, because brokers do not send it to subscribers. It is not verified."""
 BEGINNING = 100
-"""Bytes of a command that are kept where it is too long to be read."""
+"""Bytes of a command that are stored if it is too long to be read."""
 
 
 class Answer(NamedTuple):
-    """What is told of a command on PREFIX/result/NAME; without a name, on PREFIX/result."""
+    """The reply to a command on PREFIX/result/NAME; without a name, on PREFIX/result."""
 
     name: str
     ok: bool
@@ -58,9 +58,9 @@ Say: TypeAlias = Callable[[Answer], Awaitable[None]]
 
 
 class Commands:
-    """What may be written, by topic, and what waits to be. All of it is on the thread of the output.
+    """The permitted points, by topic, and the queue of commands. All of it is on the thread of the output.
 
-    `tell` is told how many commands were refused without an answer.
+    `tell` is called with the number of commands that were refused without a reply.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Commands:
         tell: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.refused = 0
-        """Commands that were refused, those that nobody was told of included."""
+        """Refused commands, including those without a reply."""
         self.unanswered = 0
         self.queued: deque[Wish] = deque()
         self._tell = tell
@@ -81,7 +81,7 @@ class Commands:
         self._points = points
         self._now = now
         self._looked = now()
-        """What is read next came after this look."""
+        """Messages that are read from now on have arrived after this time."""
         self.bytes_read = 0
         """Bytes that were read, at least."""
         self._looks: deque[tuple[float, int]] = deque()
@@ -94,7 +94,7 @@ class Commands:
         self._something = asyncio.Event()
 
     def arrive(self, message: Message) -> None:
-        """Take in one message that came in the order of what is unread. Never waits, never raises."""
+        """Accept one message in the order of the unread bytes. Never waits, never raises."""
         self.bytes_read += LEAST + len(str(message.topic)) + len(message.payload)
         self.take(message)
 
@@ -107,7 +107,7 @@ class Commands:
         name = topic.removeprefix(self._asked)
         point = self._points.get(name)
         if point is None and len(self._answers) >= MOST_COMMANDS:
-            self._count_alone()  # before anything is made of it: what is in a flood is to cost nothing
+            self._count_alone()  # before it is decoded: a flood of commands must cost nothing
             return
         shown = name if len(name) <= LONGEST_NAME else ""
         wish = Wish(
@@ -119,13 +119,13 @@ class Commands:
             arrived=self._looked,
         )
         try:
-            wish = self._read(wish, message)  # first: whatever becomes of it, its value and its id are told
+            wish = self._read(wish, message)  # first: the reply to every command contains its value and its id
             if point is None:
                 raise InvalidCommand(self._authorisation.refusal(wish))
             if message.retain:
-                raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
+                raise InvalidCommand("a retained command is not accepted, because its age is unknown")
             if len(self.queued) >= MOST_COMMANDS:
-                raise InvalidCommand(f"{MOST_COMMANDS} commands are waiting already")
+                raise InvalidCommand(f"{MOST_COMMANDS} commands are already waiting; send fewer at a time")
         except NoCommand as error:
             self._refuse(replace(wish, id=error.id), shown, str(error))
         except InvalidCommand as error:
@@ -156,9 +156,9 @@ class Commands:
     async def serve(
         self, write: Write, keep: Callable[[Wish, str], object], say: Say, unread: Callable[[], int]
     ) -> None:
-        """Write what is allowed and answer everything, until cancelled.
+        """Write the permitted commands and reply to all, until cancelled.
 
-        `keep` is told of what was refused, and why. `unread` returns how many bytes have come and are not read yet.
+        `keep` is called with refused commands and the reason. `unread` returns the number of unread bytes.
         """
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._keep_looking, unread)
@@ -168,9 +168,9 @@ class Commands:
                 tasks.start_soon(self._obey, write, say)
 
     def look(self, unread: int) -> None:
-        """Note when so many bytes had come and were not read yet: what is read behind them came later.
+        """Store the present time for the unread bytes: messages after them arrive later.
 
-        What lies there after a standstill, ours or the machine's, is as old as the last look before it.
+        Messages that waited during a standstill of the process or machine count as old as the last reading before it.
         """
         if not unread:
             self._looks.clear()
@@ -218,7 +218,7 @@ class Commands:
             await anyio.sleep(LOOK)
 
     def close(self, keep: Callable[[Wish, str], object]) -> None:
-        """Take in nothing any more. `keep` is told of what was not answered; what still comes is counted alone."""
+        """Stop accepting commands. `keep` is called with those without a reply; later ones are only counted."""
         self._closed = True
         for wish, answer in self._answers:
             keep(wish, answer.error)
@@ -233,9 +233,9 @@ class Commands:
             self.tell_unanswered()
 
     def tell_unanswered(self) -> None:
-        """Tell how many refusals were counted alone, if there are any that were not told."""
+        """Report the number of refusals that were only counted, if there are new ones."""
         if self.unanswered > self._told:
-            self._tell(f"{self.unanswered - self._told} refused commands were neither answered nor put on record")
+            self._tell(f"{self.unanswered - self._told} refused commands got neither a reply nor an audit entry")
             self._told = self.unanswered
 
     async def _wait(self) -> None:
@@ -244,16 +244,16 @@ class Commands:
 
 
 def _as_it_came(payload: bytes | bytearray) -> str:
-    """Return a command as it is kept until it is read; of one that is too long to be read its beginning."""
+    """Return a command in the form that is stored until it is read. Of one that is too long, only the beginning."""
     if len(payload) <= LONGEST_COMMAND:
         return bytes(payload).decode(errors="replace")
     return f"{bytes(payload[:BEGINNING]).decode(errors='replace')}... ({len(payload)} bytes)"
 
 
 def _sender(topic: str, message: Message | MQTTMessage) -> str:
-    """Return by whom a command is: all that is known is its topic, and what its sender says of itself."""
+    """Return the source of a command: its topic, and the name in its user property, which is not verified."""
     said = dict(getattr(message.properties, PROPERTIES, ())).get(SENDER, "")[:LONGEST_SENDER]
-    return f"{topic}, says {said!r}" if said else topic
+    return f"{topic}, sender {said!r} (not verified)" if said else topic
 
 
 class Inbox(asyncio.Queue["Message"]):

@@ -24,7 +24,7 @@ def secrets(settings: MqttSettings) -> Secrets:
 
 
 def taking_in(most: int) -> Properties:
-    """Return what tells a broker to send no more than so many messages ahead of our acknowledgements."""
+    """Return the properties that limit the messages that a broker sends before our acknowledgements."""
     from paho.mqtt.packettypes import PacketTypes
     from paho.mqtt.properties import Properties
 
@@ -43,5 +43,5 @@ def unread(client: Client) -> int:
 
 
 def topic_part(name: str) -> str:
-    """Return the name without what has a meaning in topics. Two names stay two."""
+    """Return the name without the special characters of topics. Different names stay different."""
     return name.replace("%", "%25").replace("+", "%2B").replace("#", "%23")

@@ -1,9 +1,9 @@
-"""Commands that no file allows: they come on a connection of their own, which is read slowly.
+"""Commands that the file does not permit. They arrive on a connection of their own, which is read slowly.
 
-Theory of operation. A broker has one queue for each connection, and keeps its order: what is allowed would wait behind
-whatever flood somebody sends to points that are not, and to read that flood fast would take the interpreter from the
-line. So the connection for what is allowed asks for just that, and this one for all there is; here a message is
-acknowledged only after a rest, and what is more waits at the broker, or is dropped by it.
+Theory of operation. A broker has one queue for each connection, and keeps its order. On one connection, permitted
+commands would wait behind a flood of others, and reading that flood fast would take the interpreter from the line. So
+the main connection subscribes to the permitted topics, and this one to all topics. Here a message is acknowledged only
+after a pause. Further messages wait at the broker, or are dropped by it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ AHEAD = 20
 
 
 class Forbidden:
-    """Hears, in a thread of its own, all commands but those to `allowed` topics; `take` gets each on the caller's loop.
+    """Receive, in a thread of its own, all commands except to `allowed` topics; `take` gets each on the caller's loop.
 
     `lost` is done when the connection has ended.
     """
@@ -70,22 +70,22 @@ class Forbidden:
         self._client.on_disconnect = lambda *_: self._tell(partial(_done, self.lost))
 
     async def begin(self, keep_alive: int, within: float) -> None:
-        """Return when commands are heard. Raises OSError, ConnectionError among them, where that cannot be."""
+        """Return when the subscription is active. Raises OSError, including ConnectionError, if that fails."""
         connect = partial(self._client.connect, self._settings.host, self._settings.port, keep_alive)
         await anyio.to_thread.run_sync(partial(connect, properties=taking_in(AHEAD)), abandon_on_cancel=True)
         self._client.loop_start()
         await asyncio.wait({self._subscribed, self.lost}, timeout=within, return_when=asyncio.FIRST_COMPLETED)
         if not self._subscribed.done():
             broker = f"{self._settings.host}:{self._settings.port}"
-            raise ConnectionError(f"{broker} took no subscription to {self._topic} on a connection of its own")
+            raise ConnectionError(f"{broker} did not accept a second connection with a subscription to {self._topic}")
 
     async def end(self) -> None:
-        """Hear nothing more than what the broker has sent by now, and return when that is taken."""
+        """Unsubscribe, and return when the messages sent so far have been handled."""
         self._client.unsubscribe(self._topic)
         await asyncio.wait({self._unsubscribed, self.lost}, return_when=asyncio.FIRST_COMPLETED)
 
     def close(self) -> None:
-        """End the connection. Nobody waits for its thread."""
+        """End the connection, without waiting for its thread."""
         self._over.set()
         self._client.disconnect()
 

@@ -1,4 +1,4 @@
-"""What a database forgets: the oldest, a piece at a time, and never because somebody set the clock."""
+"""Deletes the oldest rows of a database, in pieces, and never because the clock was set."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from collections.abc import Callable
 
 DAY = 86_400.0
 EVERY = 60.0
-"""Seconds between two looks at what is too old, while nothing is."""
+"""Seconds between two checks for old rows, while there are none."""
 AT_ONCE = 20_000
 """Rows; so that no deletion holds the file for long. Ten times what one batch brings: it keeps up with any rate."""
 STEADY = DAY
 """Seconds for which a clock that was set must have run evenly before anything is deleted by it."""
 WAS_SET = 60.0
-"""Seconds by which a clock does not drift from another between two looks: more, and somebody has set it."""
+"""Largest drift between two clocks from one check to the next, in seconds. A larger one means that a clock was set."""
 MEGABYTE = 1_000_000
 
 
 class Retention:
-    """Forgets what is older than `days`, and the oldest of what is more than `megabytes`; None for no such limit.
+    """Deletes rows older than `days`, and the oldest above `megabytes`; None for no such limit.
 
-    A clock that was set is not believed for a day: one that jumps a year ahead must not delete a year of values. Nor is
-    one by which all that there is would be too old, as at a start with a wrong clock.
+    A clock that was set is not trusted for a day: a clock that jumps a year ahead must not delete a year of values.
+    Neither is a clock by which all rows would be too old, as at a start with a wrong clock.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Retention:
         Each table has a `time`.
         """
         clock, now = time.time(), time.monotonic()
-        # The size needs no clock: it is held while the clock is not believed, too.
+        # The size needs no clock: this limit applies while the clock is not trusted, too.
         if self._bytes is not None and used(database) > self._bytes:
             forget_oldest(database, tables)
         if self._days is None:
@@ -54,7 +54,7 @@ class Retention:
         self._next = now if deleted >= AT_ONCE else now + EVERY
 
     def _trusts(self, database: sqlite3.Connection, tables: tuple[str, ...], clock: float, now: float) -> bool:
-        """Return whether the clock may be believed. It is looked at with every batch, so that no jump is missed."""
+        """Return whether the clock can be trusted. It is checked with every batch, so that no jump is missed."""
         offset = clock - now
         if self._offset is None:
             newest = max((newest_of(database, table) for table in tables), default=None, key=lambda t: t or 0.0)
@@ -67,11 +67,11 @@ class Retention:
 
     def _doubt(self, why: str, now: float) -> None:
         self._believed_from = now + STEADY
-        self._tell(f"{why}: nothing is deleted for a day")
+        self._tell(f"{why}; nothing is deleted for a day")
 
 
 def delete_older(database: sqlite3.Connection, table: str, moment: float) -> int:
-    """Delete a piece of what is older than a moment, the oldest first, and return how many rows that was."""
+    """Delete a piece of the rows older than a moment, the oldest first, and return the number of rows."""
     return database.execute(
         f"delete from {table} where rowid in (select rowid from {table} where time < ? order by time limit ?)",
         (moment, AT_ONCE),
@@ -79,7 +79,7 @@ def delete_older(database: sqlite3.Connection, table: str, moment: float) -> int
 
 
 def forget_oldest(database: sqlite3.Connection, tables: tuple[str, ...]) -> None:
-    """Delete the oldest tenth of the largest table, and what is older than its rest of the others: a piece of each."""
+    """Delete a piece of the oldest tenth of the largest table, and of the rows of other tables older than its rest."""
     spans = {table: span_of(database, table) for table in tables}
     largest = max(spans, key=lambda table: len(spans[table]))
     piece = min(AT_ONCE, (len(spans[largest]) + 9) // 10)
@@ -91,7 +91,7 @@ def forget_oldest(database: sqlite3.Connection, tables: tuple[str, ...]) -> None
 
 
 def span_of(database: sqlite3.Connection, table: str) -> range:
-    """Return the numbers of a table's rows: as the oldest go first, hardly one of them is missing."""
+    """Return the numbers of a table's rows. Few are missing, because the oldest are deleted first."""
     first, last = database.execute(f"select min(rowid), max(rowid) from {table}").fetchone()
     return range(0) if first is None else range(first, last + 1)
 
@@ -103,7 +103,7 @@ def newest_of(database: sqlite3.Connection, table: str) -> float | None:
 
 
 def used(database: sqlite3.Connection) -> int:
-    """Return how many bytes of the file hold anything. What was deleted is used again before the file grows."""
+    """Return the number of used bytes of the file. Free pages are used again before the file grows."""
     [[pages], [free], [size]] = (
         database.execute(f"pragma {name}").fetchone() for name in ("page_count", "freelist_count", "page_size")
     )

@@ -1,8 +1,8 @@
-"""A server of one page for those that come and ask over HTTP: few threads, few connections, little patience.
+"""A server of one page for HTTP scrapers: few threads, few connections, short time limits.
 
-Connections are held by an asyncio loop, which costs no thread each; the page is made in one thread of its own, one
-scrape after the other, and one that was just made is given to all that wait. Half-open connections are closed when
-their time is over, or when there are too many.
+An asyncio loop holds the connections, which needs no thread for each. The page is made in one thread of its own, one
+scrape after the other, and a new page is sent to all that wait. Half-open connections are closed when their time is
+over, or when there are too many.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _Server:
             async with asyncio.timeout(PATIENCE):
                 await writer.drain()
         except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError):
-            pass  # whoever it was is no scraper, or has gone
+            pass  # the client is not a scraper, or has disconnected
         finally:
             self._drop(writer)
 
@@ -117,7 +117,7 @@ class _Server:
         return answer if words[0] == "GET" else answer[: answer.index(b"\r\n\r\n") + 4]
 
     async def _page(self, accept: str) -> Page:
-        """Return the metrics; all that ask while a page is being made wait for the same one."""
+        """Return the metrics; all requests while a page is being made wait for the same one."""
         making = self._making.get(accept)
         if making is None:
             making = asyncio.get_running_loop().run_in_executor(self._maker, self._make, accept)
@@ -127,7 +127,7 @@ class _Server:
 
 
 def response(status: str, content_type: str, body: bytes, **headers: str) -> bytes:
-    """Return an HTTP response, which says that the connection ends with it."""
+    """Return an HTTP message after which the connection ends."""
     said = {"Content-Type": content_type, "Content-Length": str(len(body)), "Connection": "close", **headers}
     lines = [f"HTTP/1.1 {status}", *(f"{name}: {text}" for name, text in said.items())]
     return "\r\n".join([*lines, "", ""]).encode() + body

@@ -28,7 +28,7 @@ AuditMode: TypeAlias = Literal["batched", "strict"]
 def file_mode(text: str) -> int:
     """Return the mode of a file that chmod takes in octal. Raises InvalidCommand."""
     if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
-        raise InvalidCommand('a mode is octal, as chmod takes it: mode = "0640"')
+        raise InvalidCommand('a mode must be octal, as for chmod: mode = "0640"')
     return int(text, 8)
 
 
@@ -43,7 +43,7 @@ def _limit(value: float) -> float:
 
 def _topic(topic: str) -> str:
     if not topic or set(topic) & set("+#") or topic.startswith("/") or topic.endswith("/") or not topic.isprintable():
-        raise InvalidCommand("a topic has neither + nor # nor control characters, nor a slash at an end")
+        raise InvalidCommand("a topic must not contain +, # or control characters, nor a slash at an end")
     return topic
 
 
@@ -60,11 +60,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.buffer < 1:
-            raise InvalidCommand(f"a buffer holds at least one value, not {self.buffer}")
+            raise InvalidCommand(f"a buffer must hold at least one value, not {self.buffer}")
 
     @property
     def destination(self) -> str:
-        """Return where values go, as messages name it: a file, or host and port; "" for what has no name."""
+        """Return the destination of the values for messages: a file, or host and port; "" if it has no name."""
         return ""
 
     @property
@@ -77,7 +77,7 @@ class Settings:
         return self
 
     def check_files(self, at: Callable[[str], AbstractContextManager[object]]) -> None:
-        """Read the files that the settings name, each within `at(key)`, and raise InvalidCommand for a bad one."""
+        """Read the files of the settings, each within `at(key)`, and raise InvalidCommand for a bad one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +113,7 @@ class FileSettings(SpillingSettings):
         for field in DATE_FIELD.findall(self.path):
             if field != "%" and field.removeprefix("-") not in DATE_FIELDS:
                 raise InvalidCommand(
-                    f"{self.path}: %{field} is no field of a date: use those of strftime (%Y %m %d %H), and %% for a %"
+                    f"{self.path}: %{field} is not a field of a date; use strftime's (%Y %m %d %H), and %% for a %"
                 )
 
 
@@ -139,7 +139,7 @@ class SqliteSettings(SpillingSettings):
         for name in ("keep_days", "keep_mb"):
             value = getattr(self, name)
             if value is not None and not 0 < value < inf:
-                raise InvalidCommand(f"{name} is more than 0, not {value}")
+                raise InvalidCommand(f"{name} must be more than 0, not {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,8 +1,8 @@
-"""Store and forward: what waits while an output is down may go to disk, and is there again after a restart.
+"""Store and forward: while an output is down, its queue can go to disk, from which a restarted process continues.
 
-Theory of operation. While it is down, and when it is to end, the thread moves what waits in memory to its spool. What
-is on disk is older than all that is in memory, so it is delivered first, and what comes meanwhile goes behind it. It
-is forgotten on disk once it was delivered: after a crash in between it is delivered twice, never not at all.
+Theory of operation. While the output is down, and when it ends, the thread moves the queue from memory to its spool.
+Items on disk are older than all items in memory, so they are delivered first, and new items are appended to them. They
+are deleted from disk after delivery: after a crash in between they are delivered twice, but never lost.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class SpillingOutput(Output):
 
     @abstractmethod
     def records(self) -> Iterable[Record]:
-        """Return what is in hand, as it is kept on disk."""
+        """Return the items in hand, in their form on disk."""
 
     @abstractmethod
     def let_go(self) -> int:
@@ -53,13 +53,13 @@ class SpillingOutput(Output):
     def succeed(self, before: Output) -> None:
         super().succeed(before)
         if isinstance(before, SpillingOutput) and before.spilled and before._spill != self._spill:
-            self._say(f"{self.kind}: {before.spilled} values stay in {before._spill}, which it does not use any more")
+            self._say(f"{self.kind}: {before.spilled} values stay in {before._spill}, which is not used any more")
 
     def open_spool(self) -> None:
-        """Open the spool, and count what it holds. An output begins its work with this.
+        """Open the spool, and count its items. An output begins its work with this.
 
-        A spool that cannot be opened is told. Raises InvalidCommand where there may be something in it: newer values
-        must not overtake that.
+        A spool that cannot be opened is reported. Raises InvalidCommand if it may contain items, because newer values
+        must not overtake them.
         """
         if self._spill is None or self._spool is not None:
             return
@@ -81,13 +81,13 @@ class SpillingOutput(Output):
             self.found += self._spool.values
 
     def put_by(self) -> None:
-        """Move what waits from memory to disk. What the disk does not take stays where it is, which is told once."""
+        """Move the queue from memory to disk. Items that the disk does not accept stay in memory, reported once."""
         if self._spill is None:
             return
         try:
             self.open_spool()
         except InvalidCommand:
-            return  # which keeps the output down, and is told as that
+            return  # the output stays down, and reports this as the reason
         while self._spool is not None and self.hold(BATCH):
             try:
                 lost = self._spool.put(self.records())
@@ -99,7 +99,7 @@ class SpillingOutput(Output):
             self._spool_error = ""
 
     def forwarded(self, up_to: int, records: Iterable[Record]) -> None:
-        """Forget on disk what was delivered from there, and put what came meanwhile behind the rest."""
+        """Delete delivered items from disk, and append new items to the rest."""
         assert self._spool is not None
         values = sum(record.values for record in records)
         self._spool.remove(up_to, values)
@@ -109,14 +109,14 @@ class SpillingOutput(Output):
             self.put_by()
 
     def rest(self, seconds: float) -> None:
-        """Wait so many seconds, or until it is stopped. What comes while the output is down goes to disk, if it may."""
+        """Wait, or until the output is stopped. New items of an output that is down go to disk, if permitted."""
         over = time.monotonic() + seconds
         while not self._stop.is_set() and time.monotonic() < over:
             self.put_by()
             self._stop.wait(min(SPILL_EVERY, seconds))
 
     def _run(self) -> None:
-        """Work until stopped. What is left in memory then goes to disk, if it may."""
+        """Work until stopped. The rest in memory then goes to disk, if permitted."""
         try:
             super()._run()
         finally:

@@ -1,7 +1,7 @@
-"""What waits on disk for whoever is away: the oldest first, bounded, and there again after a restart.
+"""Items on disk for a destination that is down: the oldest first, bounded, and kept over a restart.
 
-One SQLite file, held by one process, opened and used by one thread of it. What was put in survives the end of the
-process at once; a loss of power may take the last seconds of it, and nothing else.
+One SQLite file, held by one process, opened and used by one thread of it. Items survive the end of the process at once.
+A loss of power can lose the last seconds, and nothing else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PIECE = 1_000
 
 
 class Record(NamedTuple):
-    """What is sent or written as one, as text, and how many values it holds."""
+    """The text of one message or batch, and the number of its values."""
 
     content: str
     values: int
@@ -29,9 +29,9 @@ class Record(NamedTuple):
 class Spool:
     """Holds at most `most` values for one kind of output.
 
-    Raises InvalidCommand where it cannot be made, where another process has it, and for a file that holds something
-    else. `say` is told when a file was there that is damaged: it is moved aside, not deleted. With `strict`
-    what was put in survives a loss of power at once.
+    Raises InvalidCommand if it cannot be created, if another process has it, and for a file with other contents. `say`
+    is called if an existing file is damaged, which is moved aside and not deleted. With `strict`, items survive a loss
+    of power at once.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Spool:
             try:
                 self._database = _opened(path, kind, mode, strict)
             except sqlite3.DatabaseError as error:
-                if not is_damaged(error):  # but held by another process, say
+                if not is_damaged(error):  # for example held by another process
                     raise
                 aside = move_aside(path)
                 say(f"{path}: {error}: it is kept as {aside}, and begun anew")
@@ -81,13 +81,13 @@ class Spool:
         return (rows[-1][2] if rows else 0), [Record(content, count) for content, count, _ in rows]
 
     def remove(self, up_to: int, values: int) -> None:
-        """Forget what has arrived. Raises sqlite3.Error."""
+        """Delete delivered items. Raises sqlite3.Error."""
         with self._database as database:
             database.execute("delete from waiting where id <= ?", (up_to,))
         self.values -= values
 
     def close(self) -> None:
-        """Close the file; what it holds stays there."""
+        """Close the file; its items stay there."""
         self._database.close()
 
     def _forget(self, values: int) -> int:
@@ -126,7 +126,7 @@ def _check_kind(path: str, database: sqlite3.Connection, kind: str) -> None:
     """Raise InvalidCommand for a file that is not empty and no spool of this kind of output."""
     tables = {name for [name] in database.execute("select name from sqlite_master where type = 'table'")}
     if tables and "spool" not in tables:
-        raise InvalidCommand(f"{path} is a database of something else: name a file of its own for what waits")
+        raise InvalidCommand(f"{path} is a database of another program; use a separate file for stored values")
     row = database.execute("select kind from spool").fetchone() if tables else None
     if row is not None and row[0] != kind:
-        raise InvalidCommand(f"{path} holds what waits for {row[0]}: name another file for {kind}")
+        raise InvalidCommand(f"{path} contains the stored values of {row[0]}; use another file for {kind}")

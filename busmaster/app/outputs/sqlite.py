@@ -23,7 +23,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.ext import Named, open_file
 
 VERSION = 2
-"""The layout of a database, as it says itself (`user_version`). In 1, of 0.2, the column `interface` was `door`."""
+"""The layout of a database, which is stored in it (`user_version`). In 1, of 0.2, `interface` was `door`."""
 SCHEMA = """
 create table if not exists points (
     id integer primary key, node text not null, item text not null, unit text not null, unique (node, item, unit)
@@ -63,7 +63,7 @@ create view if not exists history as
     left join labels on labels.point = samples.point and labels.value = samples.value;
 """
 ONE_ROW_A_POINT = "unique (node, item)"
-"""What the points of a database say in which the unit of now was that of all that had been read before, too."""
+"""Constraint of older databases, in which the present unit of a point applied to all earlier values too."""
 REMADE = """
 begin immediate;
 drop view if exists history;
@@ -76,7 +76,7 @@ alter table points_of_units rename to points;
 commit;
 """
 BUSY = 1.0
-"""Seconds for which a lock of another program is waited for, before the batch is kept for later."""
+"""Seconds to wait for a lock of another program, before the batch is kept for later."""
 DATED = ("samples", "events", "audit")
 """Tables whose rows are forgotten when they are too old."""
 
@@ -143,12 +143,12 @@ class SqliteOutput(BatchOutput[Rows]):
                 raise
             self.shut()
             aside = move_aside(self._path)
-            self._tell(f"{self._path} is damaged ({error}): it was moved to {aside}, and a new one is begun")
+            self._tell(f"{self._path} is damaged ({error}); it was moved to {aside}, and a new file was started")
             self._write(batch)
 
     def _write(self, batch: list[Rows]) -> None:
         if self._file is not None and not is_at(self._path, self._file):
-            self._tell(f"{self._path} was moved or removed: another is begun")
+            self._tell(f"{self._path} was moved or removed; a new file was started")
             self._leave()
         database = self._open()
         # With "full" the log is on the disk when a transaction ends; with "normal", some time after that.
@@ -184,7 +184,7 @@ class SqliteOutput(BatchOutput[Rows]):
             if self._database is not None:
                 self._database.execute("pragma wal_checkpoint(truncate)").fetchall()
         except sqlite3.Error:
-            pass  # the disk is full: what was to go there stays in its log
+            pass  # the disk is full: the rest stays in its log
         self.shut()
 
     def _samples(self, database: sqlite3.Connection, batch: list[Rows]) -> Iterator[SampleRow]:
@@ -208,11 +208,11 @@ class SqliteOutput(BatchOutput[Rows]):
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()
             if tables and version > VERSION:
                 raise InvalidCommand(
-                    f"{self._path} has the layout {version}, and this version of busmaster writes {VERSION}: "
-                    "it is of a newer version, or of something else; upgrade, or give another path"
+                    f"{self._path} has the layout {version}, but this version of busmaster writes {VERSION}; "
+                    "upgrade if it is of a newer version, or use another path"
                 )
             if tables and version < 1:  # an empty file has version 0 as well, and may be filled
-                raise InvalidCommand(f"{self._path} is a database of something else; give another path")
+                raise InvalidCommand(f"{self._path} is a database of another program; use another path")
             database.execute("pragma journal_mode = wal")  # others may read while it grows
             history = database.execute("select sql from sqlite_master where name = 'history'").fetchone()
             if history is not None and "label" not in history[0]:

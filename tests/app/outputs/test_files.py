@@ -57,7 +57,7 @@ def test_csv_has_a_line_a_value_under_a_head_and_grows(tmp_path: Path) -> None:
 def test_what_is_no_field_of_a_date_is_refused(path: str, field: str) -> None:
     with pytest.raises(InvalidCommand) as refused:
         FileSettings(path=path)
-    assert str(refused.value).startswith(f"{path}: {field} is no field of a date")
+    assert str(refused.value).startswith(f"{path}: {field} is not a field of a date")
 
 
 def test_each_field_that_is_taken_is_one_of_this_machines_dates() -> None:
@@ -121,7 +121,7 @@ def test_a_batch_that_the_disk_has_no_room_for_leaves_no_half_line(
 
 
 def test_a_folder_that_is_not_there_is_said_before_anything_starts(tmp_path: Path) -> None:
-    with pytest.raises(InvalidCommand, match="there is no folder"):
+    with pytest.raises(InvalidCommand, match=r"the folder .* does not exist"):
         CsvOutput("csv", FileSettings(path=str(tmp_path / "none" / "x.csv")))
 
 
@@ -137,7 +137,7 @@ def test_a_file_that_was_moved_away_or_removed_is_begun_anew_and_that_is_told(tm
     output.shut()
     assert written(tmp_path / "x.jsonl.1") == ["first"]
     assert written(path) == ["third"]
-    assert told == [f"jsonl: {path} was moved or removed: another is begun"] * 2
+    assert told == [f"jsonl: {path} was moved or removed; a new file was started"] * 2
 
 
 def test_a_file_that_is_removed_while_it_is_written_loses_nothing(
@@ -178,7 +178,7 @@ def test_a_half_line_that_a_crash_left_is_closed_off_and_that_is_told(tmp_path: 
     output.commit([b"{}\n"])
     output.shut()
     assert written(path) == ['{"whole": 1}', '{"half', "{}"]
-    assert told == [f"jsonl: {path} ended in the middle of a line, which was closed off"]
+    assert told == [f"jsonl: {path} ended with an incomplete line, which was closed"]
 
 
 def test_folders_of_dated_paths_are_made_when_their_time_comes(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_folders_of_dated_paths_are_made_when_their_time_comes(tmp_path: Path) -
     output.shut()
     [path] = tmp_path.rglob("*.csv")
     assert path.parent.parent.parent == tmp_path
-    with pytest.raises(InvalidCommand, match="there is no folder"):
+    with pytest.raises(InvalidCommand, match=r"the folder .* does not exist"):
         CsvOutput("csv", FileSettings(path=str(tmp_path / "none" / "%Y" / "x.csv")))
 
 

@@ -224,10 +224,10 @@ def answering(answer: bytes) -> Iterator[int]:
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        (b"\x20\x02\x00\x01", "does not speak MQTT 5, which this output needs"),  # by 3.1.1
-        (b"\x20\x03\x00\x84\x00", "does not speak MQTT 5, which this output needs"),
+        (b"\x20\x02\x00\x01", "does not support MQTT 5, which this output needs"),  # by 3.1.1
+        (b"\x20\x03\x00\x84\x00", "does not support MQTT 5, which this output needs"),
         (b"\x20\x03\x00\x87\x00", "Not authorized"),
-        (b"", "did not answer in 0.1 s; does it speak MQTT 5?"),
+        (b"", "did not reply within 0.1 s; it needs MQTT 5"),
     ],
 )
 async def test_a_broker_that_will_not_do_is_told_in_one_sentence(

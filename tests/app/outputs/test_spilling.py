@@ -189,14 +189,14 @@ def test_a_file_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     output = csv(tmp_path, said.append)
     output.start()
     output.close(PATIENCE)
-    assert "holds what waits for mqtt: name another file for csv" in said[0]
+    assert "contains the stored values of mqtt; use another file for csv" in said[0]
     database = sqlite3.connect(tmp_path / "other")
     database.execute("create table mine (number)")
     database.close()
     output = CsvOutput("csv", FileSettings(path=str(tmp_path / "y"), spill=str(tmp_path / "other")), said.append)
     output.start()
     output.close(PATIENCE)
-    assert "is a database of something else" in said[-1]
+    assert "is a database of another program" in said[-1]
 
 
 def test_two_outputs_with_one_file_are_refused(tmp_path: Path) -> None:

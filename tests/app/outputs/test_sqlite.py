@@ -115,7 +115,7 @@ def test_a_database_of_a_newer_version_is_left_alone_and_the_error_says_what_to_
     with recording(path) as output:
         output.offer(cycle(1, 1.0))
         until(lambda: "has the layout 99" in output.statistics().error)
-        assert "upgrade, or give another path" in output.statistics().error
+        assert "upgrade if it is of a newer version, or use another path" in output.statistics().error
     with closing(sqlite3.connect(path)) as database:
         assert list(database.iterdump()) == before
     assert output.dropped == 1
@@ -132,7 +132,7 @@ def test_it_goes_on_with_a_file_of_its_own_and_leaves_another_alone(tmp_path: Pa
         database.execute("create table points (mine)")
     with recording(other) as output:
         output.offer(cycle(1, 1.0))
-        until(lambda: "is a database of something else" in output.statistics().error)
+        until(lambda: "is a database of another program" in output.statistics().error)
     assert query(other, "select count(*) from sqlite_master") == [(1,)]
     assert output.dropped == 1
 
@@ -236,7 +236,7 @@ def test_a_clock_that_was_set_ahead_deletes_nothing_for_a_day(monkeypatch: pytes
         clocks.run(3600)
         keeping.apply(database, DATED)
         assert left_in(database) == 10
-    assert told == ["the clock was set by +31536000 s: nothing is deleted for a day"]
+    assert told == ["the clock was set by +31536000 s; nothing is deleted for a day"]
     clocks.wall -= 365 * DAY  # and back again, before anything was lost
     for _ in range(48):
         clocks.run(3600)
@@ -253,7 +253,7 @@ def test_a_start_with_a_wrong_clock_deletes_nothing_for_a_day(monkeypatch: pytes
     keeping = Retention(30, None, told.append)
     keeping.apply(database, DATED)
     assert left_in(database) == 1
-    assert told == ["by the clock all values are older than 30 days: nothing is deleted for a day"]
+    assert told == ["by the clock all values are older than 30 days; nothing is deleted for a day"]
     clocks.run(DAY + 1)
     keeping.apply(database, DATED)
     assert left_in(database) == 0
@@ -371,7 +371,7 @@ def test_a_database_that_was_moved_keeps_what_it_has_and_another_is_begun(
         until(lambda: settled(output))
     assert query(aside, "select value from samples") == [(1.0,)]
     assert query(path, "select value from samples") == [(2.0,)]
-    assert said == [f"{path} was moved or removed: another is begun"]
+    assert said == [f"{path} was moved or removed; a new file was started"]
 
 
 def test_a_database_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
@@ -432,6 +432,6 @@ def test_a_damaged_database_is_moved_aside_and_a_new_one_begun(tmp_path: Path) -
         output.close(PATIENCE)
     assert output.statistics().dropped == 0
     assert [value for (value,) in query(path, "select value from samples order by rowid")] == [3.0, 4.0]
-    assert said[0].endswith(f"it was moved to {path}.damaged, and a new one is begun")
-    assert said[1].endswith(f"it was moved to {path}.damaged-2, and a new one is begun")
+    assert said[0].endswith(f"it was moved to {path}.damaged, and a new file was started")
+    assert said[1].endswith(f"it was moved to {path}.damaged-2, and a new file was started")
     assert (tmp_path / "x.db.damaged").read_bytes().startswith(bytes(4096))

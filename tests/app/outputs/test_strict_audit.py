@@ -90,7 +90,7 @@ def test_what_is_dropped_or_left_at_the_end_is_reported_as_that(tmp_path: Path) 
     found: list[str] = []
     output.offer_entry(entry(1), found.append)  # its thread is not started: nothing is written
     output.offer_entry(entry(2), found.append)
-    assert found == ["jsonl dropped it, for too much waits"]
+    assert found == ["jsonl dropped it, because its queue was full"]
     output.close(0.0)
     assert found[1:] == ["jsonl ended before it was written"]
 

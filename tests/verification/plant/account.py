@@ -18,7 +18,7 @@ AUDIT = "busmaster: audit: "
 """What the record of a write begins with."""
 USUAL = (
     AUDIT,
-    *("no safe state", "safe state: when", "the safe state is confirmed", " requests, ", " cycles, "),
+    *("no safe state", "safe state at the end", "safe state confirmed", " requests, ", " cycles, "),
     *(" written, ", " answered, ", "uart: "),
 )
 """What stands on standard error without any fault."""

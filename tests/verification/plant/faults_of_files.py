@@ -152,7 +152,7 @@ def half_a_line(plant: Plant) -> None:
         file.write("2026-01-01T00:00:00.000Z,fast,1,win")
     plant.start_run()
     plant.over()
-    plant.run.heard("middle of a line", plant.fault_at)
+    plant.run.heard("incomplete line", plant.fault_at)
 
 
 ON_DISK = Site(disk=256, on_disk=("csv", "jsonl"))

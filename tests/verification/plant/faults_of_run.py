@@ -20,7 +20,7 @@ A_YEAR = 365 * 86_400
 def hangup_unchanged(plant: Plant) -> None:
     plant.run.send(signal.SIGHUP)
     plant.over()
-    plant.run.heard("was read again", plant.fault_at)
+    plant.run.heard("was reloaded", plant.fault_at)
 
 
 def hangup_changed(plant: Plant) -> None:
@@ -32,21 +32,21 @@ def hangup_changed(plant: Plant) -> None:
     plant.paths["csv"] = other
     plant.run.send(signal.SIGHUP)
     plant.over()
-    plant.run.heard("was read again", plant.fault_at)
+    plant.run.heard("was reloaded", plant.fault_at)
 
 
 def hangup_broken(plant: Plant) -> None:
     plant.file.write_text(plant.text().replace("[nodes.winder]", "[nodes.winder"))
     plant.run.send(signal.SIGHUP)
     plant.over()
-    plant.run.heard("nothing of it taken", plant.fault_at)
+    plant.run.heard("reload failed", plant.fault_at)
 
 
 def hangups(plant: Plant) -> None:
     for _ in range(20):
         plant.run.send(signal.SIGHUP)
     plant.over()
-    plant.run.heard("was read again", plant.fault_at)
+    plant.run.heard("was reloaded", plant.fault_at)
 
 
 def terminated(plant: Plant) -> str:
@@ -95,7 +95,7 @@ def terminal_closed(plant: Plant) -> None:
     os.close(plant.terminal)
     plant.terminal = None
     plant.over()
-    plant.run.heard("standard output is down", plant.fault_at)
+    plant.run.heard("standard output failed", plant.fault_at)
 
 
 def screen_killed(plant: Plant) -> None:
@@ -104,15 +104,15 @@ def screen_killed(plant: Plant) -> None:
     [screen] = children
     os.kill(int(screen), signal.SIGKILL)
     plant.over()
-    plant.run.heard("the screen is gone", plant.fault_at)
+    plant.run.heard("the terminal was closed", plant.fault_at)
 
 
 def stdout_full(plant: Plant) -> None:
     plant.disk.fill()
-    plant.run.heard("standard output is down", plant.fault_at)
+    plant.run.heard("standard output failed", plant.fault_at)
     plant.disk.clear()
     plant.over()
-    plant.run.heard("standard output is up again", plant.fault_at)
+    plant.run.heard("standard output works again", plant.fault_at)
 
 
 def stdin_closed(plant: Plant) -> None:

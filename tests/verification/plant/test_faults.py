@@ -25,4 +25,4 @@ def test_nothing_is_lost_by_a_fault_that_is_not_counted_and_no_value_is_wrong(na
 def test_a_dead_node_in_the_safe_state_is_named_and_ends_with_1() -> None:
     found = trial(FAULTS["term-dead"])
     assert not found.problems
-    assert any("the safe state of winder/setpoint is not confirmed" in line for line in found.told)
+    assert any("safe state of winder/setpoint not confirmed" in line for line in found.told)
