@@ -14,16 +14,16 @@ from busmaster.errors import BusError
 MOST_EXCHANGES = 50
 """Messages of exchanges that one page has not taken; of more, the oldest are dropped."""
 PAST_VALUES = 60
-"""Of a point, that a page is told at first, for its trend."""
+"""Values of a point that a new page gets, for its trend."""
 PAST_POINTS = 500
-"""Points of which it is."""
+"""Number of points whose past values a new page gets."""
 
 Key = tuple[str, int]
 """What a message replaces: the one before of the same method and part."""
 
 
 class Seat:
-    """One page: what it has not been told yet."""
+    """One page, with its unsent messages."""
 
     def __init__(self) -> None:
         self.wants_exchanges = False
@@ -32,19 +32,19 @@ class Seat:
         self._something = asyncio.Event()
 
     def put(self, key: Key, text: str) -> None:
-        """Have it told, instead of what was said under this key before and was not taken yet."""
-        self._latest.pop(key, None)  # a key that stays has its old place, before what it may depend on
+        """Add a message, which replaces an unsent one with the same key."""
+        self._latest.pop(key, None)  # a key that stays would keep its old place, before messages that it depends on
         self._latest[key] = text
         self._something.set()
 
     def put_exchanges(self, text: str) -> None:
-        """Have it told what passed on the line."""
+        """Add a message with exchanges on the line."""
         self._count += 1
         self._latest.pop(("exchanges", self._count - MOST_EXCHANGES), None)
         self.put(("exchanges", self._count), text)
 
     async def take(self) -> list[str]:
-        """Return what is to be said, once there is something."""
+        """Return the unsent messages, once there are any."""
         await self._something.wait()
         self._something.clear()
         texts, self._latest = list(self._latest.values()), {}
@@ -52,13 +52,13 @@ class Seat:
 
 
 class Audience:
-    """The pages of one line. Exchanges are asked for only while a page wants them."""
+    """The pages of one line. Exchanges are requested only while a page wants them."""
 
     def __init__(self, line: Following) -> None:
         self._line = line
         self._seats: set[Seat] = set()
         self._said: dict[Key, str] = {}
-        """What a page that comes now is told first."""
+        """The first messages for a new page."""
         self._set = 0
         self._exchanges: RemoteExchanges | None = None
         self._asking: asyncio.Task[None] | None = None
@@ -66,7 +66,7 @@ class Audience:
         line.on_state(self._changed)
 
     def join(self) -> Seat:
-        """Return a seat, which is told all that is known."""
+        """Return a seat, which gets the whole present state."""
         seat = Seat()
         self._seats.add(seat)
         seat.put(("state", 0), self._state())
@@ -76,12 +76,12 @@ class Audience:
         return seat
 
     def leave(self, seat: Seat) -> None:
-        """Tell this page no more."""
+        """Remove this page."""
         self._seats.discard(seat)
         self.look_at_exchanges()
 
     def look_at_exchanges(self) -> None:
-        """Begin or end to be told what passes on the line, as the pages want it."""
+        """Start or stop to request the exchanges on the line, as the pages want them."""
         wanted = any(seat.wants_exchanges for seat in self._seats) and self._line.is_connected
         if wanted and self._exchanges is None and self._asking is None:
             self._asking = asyncio.ensure_future(self._ask())
@@ -93,7 +93,7 @@ class Audience:
         try:
             self._exchanges = await self._line.remote.exchanges(self._hear_exchanges)
         except BusError:
-            pass  # the owner has gone: it is asked again when it is back
+            pass  # the owner has gone: the request is repeated when it is back
         finally:
             self._asking = None
         self.look_at_exchanges()  # the pages may have gone meanwhile
@@ -114,7 +114,7 @@ class Audience:
                 seat.put_exchanges(text)
 
     def _changed(self) -> None:
-        if not self._line.is_connected:  # what is said next is of another owner, perhaps
+        if not self._line.is_connected:  # the next messages may come from another owner
             self._set = 0
             self._exchanges = None
         for seat in self._seats:
@@ -133,6 +133,6 @@ class Audience:
     def _past(self) -> str:
         rows = self._line.picture.rows[:PAST_POINTS]
         past = [list(map(list, list(row.past)[-PAST_VALUES:])) for row in rows]
-        # in a failure the values that are told have none: a page that comes then shows these
+        # after a failure the values of the picture are None: a new page shows these
         last = [[row.value, row.asked] for row in self._line.picture.rows]
         return encoded({"method": "past", "body": {"set": self._set, "past": past, "last": last}})

@@ -1,7 +1,7 @@
-"""The connections of the page's server: how many there may be, and how long each may keep the server waiting.
+"""The connections of the page's server: their maximum number, and the longest time that each may block the server.
 
-The server's library bounds neither: a connection that sends nothing, half a request, or half a body, or that does not
-read its reply, stays open for as long as its client likes, and each costs a descriptor.
+The server's library limits neither. A connection that sends nothing or half a request, or does not read its reply,
+would stay open as long as its client likes. Each needs a descriptor.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Crowd:
 
 
 class _Taken:
-    """A connection whose client must read what it is sent: one that reads nothing for SEND_WITHIN is closed."""
+    """A connection whose client must read its messages. One that reads nothing for SEND_WITHIN is closed."""
 
     transport: Any
     _reading: asyncio.TimerHandle | None = None
@@ -98,7 +98,7 @@ class HttpConnection(_Taken, H11Protocol):
         self._crowd = crowd
         self._request: asyncio.TimerHandle | None = None
         self._upgraded = False
-        """Whether the connection is a page's, which another object serves: this one hears no more of it."""
+        """Whether the connection is a page's, which another object serves from now on."""
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         self._upgraded = True

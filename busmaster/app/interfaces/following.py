@@ -1,7 +1,7 @@
-"""What all interfaces share: one line that another program owns, followed for good, whoever of the two comes and goes.
+"""The base of all interfaces: one line that another program owns, followed over all disconnects.
 
-An interface makes one `Following` and runs its `follow` beside what it serves. It looks at `picture`, is called at each
-change, and writes by `write`. How another interface is made of it: docs/interfaces.md.
+An interface makes one `Following` and runs its `follow` beside its server. It reads `picture`, is called at each
+change, and writes by `write`. docs/interfaces.md describes how to make another interface.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ Hear = Callable[[str, Mapping[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """The line is followed: what its owner says of it (`hello` in docs/service.md)."""
+    """The line is connected; `about` is the owner's description of it (`hello` in docs/service.md)."""
 
     about: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The line's owner is not there: why, and what to try."""
+    """The line's owner is not connected: the reason, and a hint."""
 
     why: str
     since: float = field(default_factory=time.time, compare=False)
@@ -42,14 +42,14 @@ class Lost:
 
 
 class Following:
-    """A line that another program owns. `follow` connects, and connects again whenever that ends, until cancelled.
+    """A line that another program owns. `follow` connects, and connects again after each loss, until cancelled.
 
-    `address` is asked anew each time: the owner may come back at another. It returns what `connect` takes, and raises
-    BusError or InvalidCommand where no line is to be found. `read_only`: nothing is written, whatever the owner allows.
-    `picture` is what is known of the line; while the owner is away it is what was known last, and `state` a `Lost`.
-    `clean` makes of what is said what the picture takes, as `Picture` has it.
+    `address` is called each time, because the owner may come back at another one. It returns the argument for
+    `connect`, and raises BusError or InvalidCommand if no line is found. `read_only`: reject all writes, even if the
+    owner permits them. `picture` is the state of the line; while the owner is disconnected it is the last one, and
+    `state` is a `Lost`. `clean` prepares received values, see `Picture`.
 
-    All is of one event loop. Times are of the line's clock, in seconds; `wall_time` makes them times of day.
+    All of it belongs to one event loop. Times are of the line's clock, in seconds; `wall_time` converts them.
     """
 
     def __init__(
@@ -72,33 +72,34 @@ class Following:
         self._remote: RemoteBus | None = None
         self._overview: RemoteOverview | None = None
 
-    # what an interface is told
+    # notifications for an interface
 
     def on_picture(self, hear: Hear) -> Callable[[], None]:
-        """Have `hear` told what the owner says, after `picture` has taken it; return what ends that.
+        """Call `hear` with the messages of the owner, after `picture` has taken them; return the function to stop that.
 
-        It is called with the messages of an overview: `rows`, `values`, `groups`, `nodes`, and `frame` behind those.
-        It must not block; what it raises ends the connection.
+        These are the messages of an overview: `rows`, `values`, `groups`, `nodes`, and then `frame`. `hear` must not
+        block. If it raises, the connection ends.
         """
         self._listeners.append(hear)
         return lambda: self._listeners.remove(hear)
 
     def on_state(self, watch: Callable[[], None]) -> Callable[[], None]:
-        """Have `watch` called when `state` has changed; return what ends that. It must not block, nor raise."""
+        """Call `watch` when `state` has changed; return the function to stop that. It must not block, nor raise."""
         self._watchers.append(watch)
         return lambda: self._watchers.remove(watch)
 
     def on_touched(self, hear: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
-        """Have `hear` told which values a write has made stale, after `picture` has taken it; return what ends that.
+        """Call `hear` with the values that a write has made stale, after `picture` has taken them; return the function
+        to stop that.
 
-        It is told before the write is confirmed. `Touches` takes the message. It must not block, nor raise.
+        It is called before the write is confirmed. `Touches` takes the message. It must not block, nor raise.
         """
         self._touch_listeners.append(hear)
         return lambda: self._touch_listeners.remove(hear)
 
     @property
     def is_connected(self) -> bool:
-        """Return whether the line's owner is there, and `picture` is of now."""
+        """Return whether the line's owner is connected, so that `picture` is the present state."""
         return isinstance(self.state, Connected)
 
     @property
@@ -115,18 +116,18 @@ class Following:
         """
         return time.time() - (self.remote.now() - moment)
 
-    # what an interface asks
+    # requests of an interface
 
     @property
     def remote(self) -> RemoteBus:
-        """Return the line's bus, for all else that a client may do. Raises LineDown while the owner is away."""
+        """Return the line's bus, for all other requests of a client. Raises LineDown while the owner is away."""
         if self._remote is None:
             raise self._away(LineDown)
         return self._remote
 
     @property
     def overview(self) -> RemoteOverview:
-        """Return what is seen of the line, and may be done there. Raises LineDown while the owner is away."""
+        """Return the overview of the line, with its commands. Raises LineDown while the owner is away."""
         if self._overview is None:
             raise self._away(LineDown)
         return self._overview
@@ -171,7 +172,7 @@ class Following:
         pause = FIRST_PAUSE
         while True:
             try:
-                # a thread, since it looks into folders and may ask for a host's address
+                # a thread, because it reads folders and may look up the address of a host
                 address = await asyncio.to_thread(self._address)
                 async with connect(address, token=self._token) as remote:
                     pause, patient = FIRST_PAUSE, True
@@ -184,7 +185,7 @@ class Following:
             pause = min(2 * pause, LONGEST_PAUSE)
 
     async def _stay(self, remote: RemoteBus) -> None:
-        """Take in what is said until the connection ends."""
+        """Handle the owner's messages until the connection ends."""
         self.picture = Picture(self._clean)
         try:
             self._remote = remote

@@ -17,17 +17,17 @@ HEADERS = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-cache"),
 )
-"""Of every answer: nothing from elsewhere runs in the page, and no other page holds it in a frame."""
+"""Headers of all replies: no content from elsewhere runs in the page, and no other page shows it in a frame."""
 
 
-BOTH_LENGTHS = "a request has a Content-Length or a Transfer-Encoding, not both"
+BOTH_LENGTHS = "a request must not have both a Content-Length and a Transfer-Encoding"
 
 
 class Guard:
-    """What is let through at an address: by Host and Origin, and by tokens where there are some.
+    """Decides which requests are accepted: by Host and Origin, and by tokens if there are any.
 
-    Off this machine nobody writes without a token. `secrets` are the digests of tokens by name. `hosts` are the names
-    under which a proxy passes requests on: whoever can reach the proxy comes with them, so a write needs a token then.
+    If other machines can connect, a write needs a token. `secrets` are the digests of tokens by name. `hosts` are the
+    names under which a proxy passes requests on. Any client of the proxy uses these, so a write needs a token then.
     """
 
     def __init__(self, listen: HostPort, secrets: Mapping[str, bytes], hosts: Iterable[str] = ()) -> None:
@@ -42,14 +42,15 @@ class Guard:
 
     @property
     def lets_write(self) -> bool:
-        """Return whether anybody may write here, with a token or without."""
+        """Return whether writes are possible here, with a token or without."""
         return self.wants_token or (is_loopback(self._listen[0]) and not self._hosts)
 
     def refusal(self, headers: Mapping[str, str]) -> str:
-        """Return why a request is refused, "" if it is not: a name of ours is asked for, and no other site's page asks.
+        """Return why a request is refused, "" if it is not: the name must be ours, and the page must not be of
+        another site.
 
-        A page whose name leads here only by its own doing, or that is another site's, says so in Host or Origin. A
-        program that is no browser says no Origin.
+        The Host or Origin shows a page of another site, or one whose name was redirected to this address. A program
+        that is not a browser sends no Origin.
         """
         if "transfer-encoding" in headers and "content-length" in headers:
             # Two servers in a row may not agree where such a request ends (RFC 9112, 6.3): no client of ours sends it.
@@ -59,7 +60,7 @@ class Guard:
             return f"no such host: {host[:60]!r}; of a proxy, name it with --host"
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:
-            return f"another site's page may not come here: {origin[:60]!r}"
+            return f"requests of another site's page are not accepted: {origin[:60]!r}"
         if headers.get("sec-fetch-site", "same-origin") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             return "another site's page may not come here"
         return ""
@@ -80,14 +81,14 @@ class Guard:
 
 
 class Guarded:
-    """An application of which nobody hears whom its guard refuses; all its answers have `HEADERS`."""
+    """An application whose guard rejects requests. All of its replies have `HEADERS`."""
 
     def __init__(self, application: Any, guard: Guard) -> None:
         self._application = application
         self._guard = guard
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Answer one request, or refuse it."""
+        """Reply to one request, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             await self._application(scope, receive, send)
             return

@@ -1,7 +1,7 @@
 """A line as a Modbus TCP server: its points as registers, and its Modbus RTU units behind the same port.
 
-The server is our own, and not that of pymodbus: that one keeps the last request of a connection in one attribute, so
-that of two requests in one segment the first is lost, and it has no bound on connections or idle time.
+The server is our own, because that of pymodbus keeps the last request of a connection in one attribute. If one segment
+has two requests, the first is lost. It also has no limit on connections or idle time.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ UNIT_REFUSED = {
     "gateway path unavailable": 10,
     "gateway target did not respond": 11,
 }
-"""The exception code of a unit, by what the line's owner says of it. Other codes are in its text as numbers."""
+"""The exception code of a unit, by the error of the line's owner. Other codes are in its text as numbers."""
 
 
 class BadFrame(Exception):
@@ -172,7 +172,7 @@ def read_reply(function: int, values: Sequence[int]) -> bytes:
 
 
 def exception_reply(function: int, code: int) -> bytes:
-    """Return the reply that says that a request was not done."""
+    """Return the reply to a request that was not carried out."""
     return bytes((function | 0x80, code))
 
 
@@ -190,7 +190,7 @@ FORMATS = {
 }
 ORDERS = ("big", "little")
 CURRENT, STALE, BAD, AWAY, NO_VALUE = 0, 1, 2, 3, 4
-"""What a status register says of the value beside it; a status bit is 0 for CURRENT, else 1."""
+"""Values of a status register, for the value beside it; a status bit is 0 for CURRENT, else 1."""
 COLUMNS = (
     "table",
     "address",
@@ -281,7 +281,7 @@ def _finite(number: Decimal) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RegisterMap:
-    """All entries. With `last`, a value that is not current is sent all the same: its status register says so."""
+    """All entries. With `last`, a value that is not current is sent with its status register set accordingly."""
 
     entries: tuple[Entry, ...] = ()
     last: bool = False
@@ -651,7 +651,7 @@ class Answers:
         self._denied = LimitedReport(tell, _denied_text)
 
     async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
-        """Return the reply to a request. Raises nothing of the line, and nothing of what was sent."""
+        """Return the reply to a request. Does not raise errors of the line, nor of the request."""
         try:
             request = request_of(pdu)
             to_unit = self._rules.pass_through and unit not in OWN_UNITS
@@ -767,7 +767,7 @@ class Answers:
 
 def _denied_text(counts: Counter[str]) -> str:
     peers = ", ".join(f"{count} from {peer}" for peer, count in counts.most_common(3))
-    why = "--allow does not name what they write, or --allow-from not their client"
+    why = "--allow does not name the point, or --allow-from does not include the client"
     return f"{counts.total()} write requests of Modbus TCP were refused, because {why}: {peers}"
 
 
@@ -877,7 +877,7 @@ async def serve(
     tell: Callable[[str], None],
     idle: float = IDLE,
 ) -> None:
-    """Follow a line and serve it by Modbus TCP until cancelled. `opened` is told where clients find it.
+    """Follow a line and serve it by Modbus TCP until cancelled. `opened` is called with the server's address.
 
     Raises InvalidCommand if it cannot listen there.
     """
@@ -971,18 +971,18 @@ def command(
     this machine (--bind 0.0.0.0:502) --allow needs --allow-from. docs/modbus-tcp.md has the map file.
     """
     if find_spec("websockets") is None:
-        raise click.UsageError("Modbus TCP needs an extra: pip install 'busmaster[modbus-tcp]'")
+        raise click.UsageError("support for Modbus TCP is not installed; pip install 'busmaster[modbus-tcp]'")
     listen = place_of(bind)
     if read_only and (allow or allow_unit):
-        raise click.UsageError("--allow names what may be written, and --read-only says that nothing may")
+        raise click.UsageError("--allow and --read-only exclude each other; leave out one of them")
     if allow_unit and not pass_through:
         raise click.UsageError("--allow-unit needs --pass-through")
     if map_file is not None and (type_ or last):
-        raise click.UsageError("--type and --last are for the automatic map: the file of --map says both")
+        raise click.UsageError("--type and --last are for the automatic map; define both in the file of --map")
     if (allow or allow_unit) and not allow_from and not is_loopback(listen[0]):
-        raise click.UsageError(f"--allow at {bind}, where all of the network may come, needs --allow-from")
+        raise click.UsageError(f"--allow at {bind}, which the whole network can reach, needs --allow-from")
     if allow_from and not (allow or allow_unit):
-        raise click.UsageError("--allow-from says who may write, and nothing may be written: give --allow")
+        raise click.UsageError("--allow-from needs points that may be written; add --allow")
     try:
         peers = tuple(ipaddress.ip_network(one) for one in allow_from)
     except ValueError as error:
@@ -998,7 +998,7 @@ def command(
         if prints:
             await print_map(values, allow)
         else:
-            await serve(values, rules, listen, lambda at: note(f"Modbus TCP clients find it at {at}"), note, idle)
+            await serve(values, rules, listen, lambda at: note(f"serving Modbus TCP at {at}"), note, idle)
 
     until_ended(run)
     return 0

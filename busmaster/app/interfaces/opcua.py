@@ -50,7 +50,7 @@ LEAST_AGE = 1.0
 LOOK_EVERY = 0.25
 """Seconds between two looks for values that are old."""
 ASK_AGAIN = 5.0
-"""Seconds after which a poll group is asked for again that its owner tells no more."""
+"""Seconds after which a poll group without messages from its owner is requested again."""
 LISTEN_AFTER = 2.0
 """Seconds after which clients are accepted although the points of the line are not known yet."""
 AT_ONCE = 50
@@ -79,13 +79,13 @@ class Shown:
     """Whether its values have names, by which it can be written."""
     read: float = -inf
     asked: float = -inf
-    """When it was asked for."""
+    """Time of the request."""
 
 
 class LineServer:
-    """Shows a line that another program owns to OPC UA clients, and hands on what they write.
+    """Shows a line that another program owns to OPC UA clients, and passes their writes on.
 
-    `tell` is called with a line for each write: who asked for it, and what became of it.
+    `tell` is called with a line for each write: the client and the result.
     """
 
     def __init__(self, server: Server, line: Following, rules: Rules, tell: Callable[[str], None]) -> None:
@@ -140,15 +140,15 @@ class LineServer:
         self._is_touched = True
         self._changed.set()
 
-    # what is shown
+    # reading
 
     async def _show(self) -> None:
-        """Bring what clients see up to what is known of the line."""
+        """Update the clients' view to the present state of the line."""
         remote = None
         if self._line.is_connected:
             with suppress(LineDown):  # it is being left
                 remote = self._line.remote
-        if remote is not self._remote:  # what was known is of the connection before
+        if remote is not self._remote:  # the present state belongs to the connection before
             self._remote = remote
             self._touches = Touches()
             self._new_rows = True
@@ -158,7 +158,7 @@ class LineServer:
             if remote is not None:
                 await self._show_points(remote)
                 await self._health.show_objects()
-        except (BusError, InvalidCommand) as error:  # the line's program goes away at this moment, and says so next
+        except (BusError, InvalidCommand) as error:  # the line's program is ending, which is reported next
             logging.getLogger("busmaster.opcua").info("%s", error)
             self._new_rows = True
         await self._health.show()
@@ -202,13 +202,13 @@ class LineServer:
             variable = await self._space.point(key, row.item, node, f"{row.name} ({details['command']})")
             shown = self._points[identity] = self._by_id[variable.place] = Shown(row, variable)
         shown.row = row
-        named = self._keys[row.key] == identity  # what has the name of another would be written there
+        named = self._keys[row.key] == identity  # of two points with the same name, a write would reach the first
         shown.writable = named and row.writable and self._rules.may_be_written(row.key)
         shown.labelled = bool(details["labels"])
         await shown.variable.describe(unit=row.unit, range_=range_of(details, row.item), writable=shown.writable)
 
     def _key_of(self, row: Row, identity: Identity) -> str:
-        """Return what a point is found by: its key, unless another has that, for two protocols may share an address."""
+        """Return the identifier of a point: its key, unless another has that, as two protocols can share an address."""
         holder = self._keys.setdefault(row.key, identity)
         return row.key if holder == identity else f"{row.protocol}:{row.key}"
 
@@ -255,7 +255,7 @@ class LineServer:
                 await shown.variable.put(None, status, time.time())
 
     async def _doubt_touched(self) -> None:
-        """Have values ambiguous that were read before a write to what they read."""
+        """Mark values as uncertain that were read before a write to their places."""
         if not self._is_touched:
             return
         self._is_touched = False
@@ -317,7 +317,7 @@ class LineServer:
             if isinstance(error, InvalidCommand) and await self._is_beyond_limits(row, value):
                 return OUT_OF_RANGE
             return status_of_write(error)
-        await self._doubt_touched()  # before the client is told, so that it never reads the old value as good
+        await self._doubt_touched()  # before the reply to the client, so that it never reads the old value as good
         self._tell(f"{who}: {row.key} = {said}: written")
         return status_of_write(None)
 
@@ -368,14 +368,14 @@ def _format_of(path: str) -> str:
 
 
 async def load_certificate(server: Server, certificate: str, key: str) -> None:
-    """Give a server its certificate and key. Raises OSError, and InvalidCommand for files that are something else."""
+    """Give a server its certificate and key. Raises OSError, and InvalidCommand for invalid files."""
     try:
-        # by what is in the file: the library goes by the end of its name, and takes server.key for DER
+        # by the contents of the file: the library uses the end of its name, and reads server.key as DER
         await server.load_certificate(certificate, _format_of(certificate))
         await server.load_private_key(key, format=_format_of(key))
     except (ValueError, TypeError) as error:
-        raise InvalidCommand(f"{certificate} and {key} are no certificate and its key: {error}") from None
-    with suppress(x509.ExtensionNotFound):  # clients hold the name that it says against the server's
+        raise InvalidCommand(f"{certificate} and {key} are not a certificate and its key: {error}") from None
+    with suppress(x509.ExtensionNotFound):  # clients compare the name in it with the server's
         names = server.iserver.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         for uri in names.get_values_for_type(x509.UniformResourceIdentifier)[:1]:
             await server.set_application_uri(uri)
@@ -390,10 +390,10 @@ async def serving(
     *,
     certificate: tuple[str, str] | None = None,
 ) -> AsyncIterator[str]:
-    """Serve a line by OPC UA, and follow it, within `async with`; its value is where clients find it.
+    """Serve a line by OPC UA, and follow it, within `async with`; its value is the server's address.
 
-    `certificate` names the files of the server's certificate and its key (PEM or DER): with them all that is said is
-    signed or encrypted. Raises OSError if it cannot listen there, InvalidCommand for files that are something else.
+    `certificate` names the files of the server's certificate and its key (PEM or DER). With them, all messages are
+    signed or encrypted. Raises OSError if it cannot listen there, InvalidCommand for invalid files.
     """
     server = OpcuaServer()
     await server.init()
@@ -413,8 +413,8 @@ async def serving(
     try:
         async with asyncio.TaskGroup() as tasks:
             running = [tasks.create_task(shown.run()), tasks.create_task(line.follow())]
-            # A client that comes back after this program was restarted subscribes once: what it does not find then,
-            # it never has again.
+            # A client that returns after a restart of this program subscribes once. It would never get variables that
+            # do not exist then.
             with suppress(TimeoutError):
                 async with asyncio.timeout(LISTEN_AFTER):
                     await shown.has_points.wait()
@@ -434,7 +434,7 @@ async def serve(
     tell: Callable[[str], None],
     certificate: tuple[str, str] | None,
 ) -> None:
-    """Serve a line by OPC UA until cancelled. `opened` is told where clients find it; the rest is as in `serving`."""
+    """Serve a line by OPC UA until cancelled. `opened` is called with the server's address; see `serving`."""
     async with serving(line, rules, listen, tell, certificate=certificate) as url:
         opened(url)
         await asyncio.Event().wait()
@@ -452,7 +452,7 @@ def read_trusted(folder: str) -> frozenset[bytes]:
             load = x509.load_pem_x509_certificate if b"-----BEGIN" in text else x509.load_der_x509_certificate
             found.add(load(text).public_bytes(Encoding.DER))
         except ValueError:
-            raise InvalidCommand(f"{path} is no certificate: {folder} is for those of trusted clients") from None
+            raise InvalidCommand(f"{path} is not a certificate; {folder} is for those of trusted clients") from None
     if not found:
-        raise InvalidCommand(f"there is no certificate in {folder}: nobody could come")
+        raise InvalidCommand(f"{folder} has no certificate, so no client could connect; add one")
     return frozenset(found)

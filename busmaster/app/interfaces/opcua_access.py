@@ -34,12 +34,12 @@ ENCRYPTED = [
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """What is let through.
+    """The rules for clients.
 
-    `allow` names the points that may be written, by their keys; `*` stands for any letters. `secrets` are digests of
-    tokens by name: with them only users who show one write. `trusted` are the certificates (DER) of clients, of which
-    None stands for all; `is_signed` lets in nobody who says things openly. `is_local` says that only programs of this
-    machine can come: no other writes without a token.
+    `allow` names the points that may be written, by their keys; `*` matches any letters. `secrets` are digests of
+    tokens by name: with them, only users with a token can write. `trusted` are the certificates (DER) of permitted
+    clients, None for all. `is_signed` rejects connections without signature. `is_local`: only programs of this machine
+    can connect; if not, a write needs a token.
     """
 
     allow: tuple[str, ...] = ()
@@ -49,18 +49,18 @@ class Rules:
     is_local: bool = True
 
     def may_be_written(self, key: str) -> bool:
-        """Return whether a point may be written by those who may write."""
+        """Return whether a point is one of those that may be written."""
         return any(fnmatchcase(key, pattern) for pattern in self.allow)
 
     def refusal(self, user: User) -> str:
-        """Return why somebody may write nothing, "" if he may."""
+        """Return why a user may not write, "" if it may."""
         if self.secrets and user.name is None:
-            return "an anonymous user writes nothing where there are tokens"
-        return "" if self.secrets or self.is_local else "nobody writes from the network without a token"
+            return "an anonymous user may not write, because there are tokens; log in with a token"
+        return "" if self.secrets or self.is_local else "a write from the network needs a token; use --token-file"
 
 
 class Users:
-    """Says who somebody is: a user with the name of a token, or an anonymous one. Nobody is an administrator."""
+    """Identifies users: by the name of a token, or as anonymous. There is no administrator."""
 
     def __init__(self, rules: Rules, failed: Callable[[str], None] = lambda _: None) -> None:
         self._rules = rules
@@ -72,11 +72,11 @@ class Users:
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: bytes | None = None
     ) -> User | None:
-        """Return who it is, None for nobody who is let in.
+        """Return the user, None for one that is not admitted.
 
         `certificate` is that of the client's channel, which has signed with it.
         """
-        if self._rules.is_signed and certificate is None:  # the library opens such a channel, whatever it offers
+        if self._rules.is_signed and certificate is None:  # the library opens such a channel, though not offered
             return None
         if self._rules.trusted is not None and certificate not in self._rules.trusted:
             return None
@@ -103,7 +103,7 @@ class Writes(AttributeService):  # type: ignore[misc]  # it is untyped
 
     async def write(self, params: ua.WriteParameters, user: User | None = None) -> list[ua.StatusCode]:
         """Write some values in their order, and return the status of each."""
-        if user is None or user.role is UserRole.Admin:  # this process itself: nobody else is
+        if user is None or user.role is UserRole.Admin:  # only this process itself
             own: list[ua.StatusCode] = await super().write(params)
             return own
         return [ua.StatusCode(await self._write(wanted, user)) for wanted in params.NodesToWrite]
@@ -114,14 +114,14 @@ def _nobody(token: Any) -> None:
 
 
 def _refuse(*arguments: Any) -> None:
-    """Raise the error of a service that there is not."""
+    """Raise the error of an unsupported service."""
     raise ServiceError(CODES.BadServiceUnsupported)
 
 
 def guard(server: Server, rules: Rules, write: Write, failed: Callable[[str], None]) -> None:
-    """Have a server let in and through what the rules say, with encryption where it has a certificate.
+    """Apply the rules to a server, with encryption if it has a certificate.
 
-    `failed` is told the address of each client whose login failed.
+    `failed` is called with the address of each client whose login failed.
     """
     iserver = server.iserver
     iserver.user_manager = Users(rules, failed)
@@ -129,9 +129,9 @@ def guard(server: Server, rules: Rules, write: Write, failed: Callable[[str], No
     iserver.attribute_service = Writes(iserver.aspace, write)
     iserver.max_connections = MOST_CONNECTIONS
     iserver.max_subscriptions = MOST_SUBSCRIPTIONS
-    # The library binds a session to whoever names it, and keeps that so where he is then refused.
+    # The library binds a session to any client that names it, and keeps that even if the client is then refused.
     iserver.lookup_external_session = _nobody
-    iserver.register_server = iserver.register_server2 = _refuse  # anybody could, and as many as he likes
+    iserver.register_server = iserver.register_server2 = _refuse  # any client could, without limit
     server.allow_remote_admin(False)
     has_key = iserver.certificate is not None
     server.set_security_policy(ENCRYPTED + SIGNED if has_key else OPEN, SimpleRoleRuleset())

@@ -68,7 +68,7 @@ class Requests(UaProcessor):  # type: ignore[misc]  # it is untyped
             return False
         goes_on = await super().process(header, body)
         if not self.has_session and self._connection._incoming_size > LONGEST_OPCUA_CHUNK:
-            return False  # chunks of a message, of a client that has not said who it is
+            return False  # chunks of a message, of a client without a login
         return bool(goes_on)
 
     async def process_message(self, seqhdr: Any, body: Any) -> bool:
@@ -126,7 +126,7 @@ class Requests(UaProcessor):  # type: ignore[misc]  # it is untyped
 
 
 class ClientConnection(OPCUAProtocol):  # type: ignore[misc]  # it is untyped
-    """One connection. It is closed when it sends what is too long or out of order, or has no session for long."""
+    """One connection. It is closed after a message that is too long or out of order, or too long without a session."""
 
     processor: Requests | None
 
@@ -168,7 +168,7 @@ class ClientConnection(OPCUAProtocol):  # type: ignore[misc]  # it is untyped
         try:
             goes_on = await super()._process_one_msg(header, buf)
         except Exception as error:  # whatever a client sends
-            self._refuse(f"what is not understood ({error})")
+            self._refuse(f"an invalid message ({error})")
             return False
         if self.transport is not None and not self.transport.is_closing() and self.messages.empty():
             self.transport.resume_reading()

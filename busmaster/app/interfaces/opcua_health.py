@@ -15,13 +15,13 @@ from busmaster.app.interfaces.opcua_terms import CODES
 LINE = {"State": "state", "Name": "line", "Utilisation": "utilisation", "Backlog": "backlog", "Losses": "losses"}
 GROUP = {name.capitalize(): name for name in ("period", "achieved", "jitter", "cycles", "missed", "paused")}
 NODE = {name.capitalize(): name for name in ("health", "requests", "failed", "late")}
-"""Names of variables, and what they show of a Frame, a Group or a Node of the picture."""
+"""Names of variables, and the attributes of a Frame, a Group or a Node of the picture that they show."""
 Place = tuple[str, str]
 """Of a variable: the object that has it, and its name."""
 
 
 class Health:
-    """The variables of a line, its groups and nodes that are no points."""
+    """The variables of a line, its groups and nodes, except for its points."""
 
     def __init__(self, space: Space, line: Following) -> None:
         self.dropped: dict[str, int] = {}
@@ -32,7 +32,7 @@ class Health:
         self._variables: dict[Place, Variable] = {}
 
     async def show(self) -> None:
-        """Bring what clients see up to what is known of the line; while its program is away, nothing is."""
+        """Update the clients' view to the present state of the line, which is unknown while its program is away."""
         known = dict(self._known()) if self._line.is_connected else {}
         known["Line", "Connected"] = self._line.is_connected
         for place, value in known.items():

@@ -30,7 +30,7 @@ from busmaster.bounds import (
 
 WRITE_BIT = ua.AccessLevel.CurrentWrite.mask
 BINARY = (None, "", "Default Binary")
-"""Names of the encodings that a client may ask for."""
+"""Names of the encodings that a client can request."""
 
 
 def refusal_of_read(wanted: ua.ReadValueId) -> int:
@@ -48,7 +48,7 @@ class Session(InternalSession):  # type: ignore[misc]  # it is untyped
     refusal: Callable[[User], str]
     """Returns why a user may not write, "" if it may."""
 
-    # The library ignores what it does not support, so that the client takes the reply for what it asked for.
+    # The library ignores unsupported parameters, so that the client would misinterpret the reply.
 
     def activate_session(
         self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None
@@ -111,8 +111,8 @@ class Session(InternalSession):  # type: ignore[misc]  # it is untyped
         found = self.subscription_service.subscriptions.get(number)
         return found is not None and found.session_id == self.session_id
 
-    # A client that has lost its connection asks for the messages that it missed, and for its former subscriptions.
-    # The library answers Good to both and sends nothing, so the client asks again for ever and never subscribes anew.
+    # A client that has lost its connection requests the missed messages and its former subscriptions. The library
+    # replies Good to both and sends nothing, so the client repeats that for ever and never subscribes again.
 
     def republish(self, params: ua.RepublishParameters) -> ua.NotificationMessage:
         """Return a message that was sent and not acknowledged. Raises BadMessageNotAvailable for any other."""
@@ -203,7 +203,7 @@ class Session(InternalSession):  # type: ignore[misc]  # it is untyped
 
 
 def _check_count(operations: Iterable[Any] | None) -> None:
-    """Raise BadTooManyOperations for a request of more than the server says that it takes."""
+    """Raise BadTooManyOperations for a request above the server's limit."""
     if operations is not None and len(list(operations)) > MOST_OPERATIONS:
         raise ServiceError(CODES.BadTooManyOperations)
 

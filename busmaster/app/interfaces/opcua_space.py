@@ -25,7 +25,7 @@ UNKNOWN = ua.DataValue(StatusCode=ua.StatusCode(CODES.BadWaitingForInitialData))
 
 
 class Variable:
-    """One variable. What clients read is what was put last: value, status and times."""
+    """One variable. Clients read the last value, status and times that were put."""
 
     def __init__(self, space: Space, place: ua.NodeId) -> None:
         self.place = place
@@ -40,7 +40,7 @@ class Variable:
         """Its variable type if its values are numbers."""
 
     async def put(self, value: Any, status: int, when: float) -> None:
-        """Have clients told a value. Of a Bad status they are told no value, and `when` is since when it is so.
+        """Send a value to clients. With a Bad status they get no value, and `when` is the time of the failure.
 
         Raises TypeError for a value that OPC UA has no type for.
         """
@@ -57,7 +57,7 @@ class Variable:
         await self._space.put(self.place, variant, status, when)
 
     async def doubt(self) -> None:
-        """Say of its value that it is of some time ago. One that is not good stays as it is."""
+        """Mark a good value as not current. One that is not good is not changed."""
         if self.status == CODES.Good:
             await self.put(self._value, CODES.UncertainLastUsableValue, self.when)
 
@@ -103,13 +103,13 @@ class Space:
     async def object(
         self, key: str, name: str, parent: ua.NodeId, type_: int = ua.ObjectIds.BaseObjectType
     ) -> ua.NodeId:
-        """Make an object, and return what it is found by."""
+        """Make an object, and return its identifier."""
         attributes = ua.ObjectAttributes()
         attributes.DisplayName = attributes.Description = ua.LocalizedText(name)
         return await self._add(ua.NodeId(key, self._health), name, parent, ua.NodeClass.Object, attributes, type_)
 
     async def variable(self, key: str, name: str, parent: ua.NodeId) -> Variable:
-        """Make a variable of what is known of line, groups or nodes."""
+        """Make a variable for the state of line, groups or nodes."""
         attributes = _attributes(name, name)
         place = ua.NodeId(key, self._health)
         type_ = ua.ObjectIds.BaseDataVariableType
@@ -177,7 +177,7 @@ class Space:
         await self.put(place, variant, CODES.Good if variant else CODES.BadConfigurationError, time.time())
 
     async def give_access(self, place: ua.NodeId, writable: bool) -> None:
-        """Say whether a variable may be written."""
+        """Set whether a variable may be written."""
         access = ua.AccessLevel.CurrentRead.mask | (ua.AccessLevel.CurrentWrite.mask if writable else 0)
         told = ua.DataValue(ua.Variant(access, ua.VariantType.Byte))
         for attribute in (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel):

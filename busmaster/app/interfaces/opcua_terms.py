@@ -129,9 +129,9 @@ def unit_of(text: str) -> ua.EUInformation:
 
 
 def range_of(details: Any, item: str) -> ua.Range | None:
-    """Return between which values a point is to be: what may be written to it, else its limits of alarm.
+    """Return the range of a point: the limits for writes, else the limits of its alarm.
 
-    `details` is what the line's owner says of the point. None where one end of it is not known.
+    `details` is the owner's description of the point. None if one end of the range is unknown.
     """
     bounds = [(limit["minimum"], limit["maximum"]) for limit in details["limits"] if limit["name"] == item]
     for low, high in (*bounds, (details["low"], details["high"])):

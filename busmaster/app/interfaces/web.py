@@ -1,4 +1,4 @@
-"""A page for the operator and a REST API over one line, in a process of its own. What it serves is in openapi.json."""
+"""A page for the operator and a REST API for one line, in a process of its own, described by openapi.json."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
     (NoReply, 504),
     (BusError, 502),
 )
-"""What an error is in HTTP: the first that fits. Its class and its sentence are in the answer."""
+"""HTTP statuses by error: the first that matches. The reply contains the error's class and text."""
 
 Told = Callable[[str], None]
 
@@ -87,7 +87,7 @@ class PastValues(Protocol):
 
 
 class Api:
-    """What is answered. `tell` is told, in a sentence, of each write that somebody asked for."""
+    """The replies of the REST API. `tell` is called with a sentence for each requested write."""
 
     def __init__(self, line: Following, guard: Guard, tell: Told, history: PastValues | None = None) -> None:
         self._line = line
@@ -133,7 +133,7 @@ class Api:
         return _json([asdict(group) for group in self._line.picture.groups])
 
     async def events(self, _: Request) -> Response:
-        """Answer what has happened last, each with its time of day."""
+        """Reply with the last events, each with its time of day."""
         frame = self._line.picture.frame
         events = frame.events if frame is not None else ()
         return _json([{"time": self._wall(when), "text": text} for when, text in events])
@@ -181,7 +181,7 @@ class Api:
         return await (self.write(request) if request.method == "PUT" else self.point(request))
 
     async def write(self, request: Request) -> Response:
-        """Write one point. The body is JSON, and says so: what a form of another site sends never is."""
+        """Write one point. The body must be declared as JSON, which a form of another site cannot do."""
         by = self._guard.writer(request.headers)
         client = request.client.host if request.client is not None else "?"
         if self._guard.wants_token and "authorization" in request.headers:
@@ -192,7 +192,7 @@ class Api:
             raise HTTPException(401 if self._guard.wants_token else 403, self._why_not())
         row, value = self._row(request), await _value(request)
         who = f"{f'token {by}' if by else 'a page'} from {client}"
-        asked = f"{row.key} = {cut(repr(value))}, asked by {who}"
+        asked = f"{row.key} = {cut(repr(value))}, from {who}"
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
@@ -202,9 +202,9 @@ class Api:
         return _json({"written": value})
 
     async def stream(self, socket: WebSocket) -> None:
-        """Tell a page all that changes, until it leaves."""
+        """Send all changes to a page, until it disconnects."""
         if self._pages >= MOST_PAGES:
-            await socket.close(1013, "too many pages look already")
+            await socket.close(1013, "too many pages are open; close one")
             return
         await socket.accept()
         seat = self._audience.join()
@@ -212,7 +212,7 @@ class Api:
         telling = asyncio.ensure_future(_tell(socket, seat))
         try:
             await self._listen(socket, seat)
-        except (WebSocketDisconnect, RuntimeError):  # RuntimeError: it went while it was told something
+        except (WebSocketDisconnect, RuntimeError):  # RuntimeError: it disconnected during a message
             pass
         finally:
             self._pages -= 1
@@ -221,11 +221,11 @@ class Api:
             await asyncio.wait([telling])
 
     async def _listen(self, socket: WebSocket, seat: Seat) -> None:
-        """Hear whether the page wants the exchanges: {"exchanges": true}."""
+        """Receive whether the page wants the exchanges: {"exchanges": true}."""
         while True:
             text = await socket.receive_text()
             if text not in WISHES:
-                await socket.close(1008, "a page says whether it wants exchanges, and nothing else")
+                await socket.close(1008, "invalid message; a page only sends whether it wants exchanges")
                 return
             seat.wants_exchanges = WISHES[text]
             self._audience.look_at_exchanges()
@@ -237,8 +237,8 @@ class Api:
 
     def _why_not(self) -> str:
         if self._guard.wants_token:
-            return "a token that is known here is needed to write"
-        return "nobody writes from the network without a token: start with --token-file"
+            return "a write needs a known token"
+        return "a write from the network needs a token; start with --token-file"
 
     def _wall(self, moment: float) -> float | None:
         """Return a time of the line as seconds since 1970, None while its owner, who has that clock, is away."""
@@ -249,12 +249,10 @@ class Api:
 
     def _row(self, request: Request) -> Row:
         group, key = request.path_params["group"], request.path_params["key"]
-        if (
-            self._line.picture.frame is None
-        ):  # who asks as the interface opens is not to think that there is no such point
+        if self._line.picture.frame is None:  # a request while the interface opens must not report an unknown point
             state = self._line.state
-            why = state.why if isinstance(state, Lost) else "its program was found only now"
-            raise LineDown(f"the points of the line are not known yet: {why}", hint="ask again in a moment")
+            why = state.why if isinstance(state, Lost) else "its program was found a moment ago"
+            raise LineDown(f"the points of the line are not known yet: {why}", hint="try again in a moment")
         for row in self._line.picture.rows:
             if (row.group, row.key) == (group, key):
                 return row
@@ -279,7 +277,7 @@ class Api:
 
 
 def _as_in_the_file(said: dict[str, Any]) -> dict[str, Any]:
-    """Return what is said of a node or a point with its protocol as LINE.toml has it: `microflex`, not `hcp2`."""
+    """Return a description of a node or a point with its protocol as in LINE.toml: `microflex`, not `hcp2`."""
     kind = said.pop("kind")
     return said | {"protocol": kind or said["protocol"]}
 
@@ -319,9 +317,9 @@ async def _tell(socket: WebSocket, seat: Seat) -> None:
 
 
 async def _value(request: Request) -> float | str:
-    """Return what is to be written. Raises HTTPException for a body that does not say it."""
+    """Return the value to write. Raises HTTPException for an invalid body."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise HTTPException(415, 'the body is JSON: {"value": NUMBER}, as application/json')
+        raise HTTPException(415, 'the body must be JSON: {"value": NUMBER}, as application/json')
     body = b""
     try:
         async for part in request.stream():
@@ -343,7 +341,7 @@ async def _value(request: Request) -> float | str:
 def application(
     line: Following, guard: Guard, tell: Told = lambda _: None, history: PastValues | None = None
 ) -> Guarded:
-    """Return the ASGI application that shows a line. `tell` is told of each write that somebody asked for."""
+    """Return the ASGI application that shows a line. `tell` is called for each requested write."""
     api = Api(line, guard, tell, history)
     one = "/api/points/{group}/{key:path}"
     routes = [
@@ -366,9 +364,9 @@ def application(
 
 @contextlib.asynccontextmanager
 async def serving(application: Any, listen: HostPort, tell: Told = lambda _: None) -> AsyncIterator[str]:
-    """Serve an application at an address, and yield its URL. `tell` is told of connections that are closed.
+    """Serve an application at an address, and yield its URL. `tell` is called for connections that are closed.
 
-    Raises InvalidCommand where nothing can listen there.
+    Raises InvalidCommand if it cannot listen there.
     """
     opened = await asyncio.to_thread(listening, listen)
     with opened:
@@ -382,7 +380,7 @@ async def serving(application: Any, listen: HostPort, tell: Told = lambda _: Non
             timeout_graceful_shutdown=CLOSE_WITHIN,
             **Crowd(tell).protocols(),
             ws_max_size=LONGEST_PAGE_MESSAGE,
-            ws_per_message_deflate=False,  # it takes as long as all else that is done for a page
+            ws_per_message_deflate=False,  # it takes as long as everything else for a page
         )
         server = _Server(config)
         task = asyncio.ensure_future(server.serve(sockets=[opened]))
@@ -411,10 +409,10 @@ async def serve(
     tell: Told = lambda _: None,
     history: PastValues | None = None,
 ) -> None:
-    """Follow a line and serve its page until cancelled. `opened` is told the page's URL, `hosts` are further names of
-    it, `history` is where past values are read.
+    """Follow a line and serve its page until cancelled. `opened` is called with the page's URL, `hosts` are further
+    names of the page, `history` reads past values.
 
-    Raises InvalidCommand where nothing can listen there.
+    Raises InvalidCommand if it cannot listen there.
     """
     async with serving(application(line, Guard(listen, secrets, hosts), tell, history), listen, tell) as url:
         opened(url)

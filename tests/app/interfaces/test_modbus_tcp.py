@@ -540,7 +540,7 @@ class Interface:
         self.process: subprocess.Popen[str] = started("modbus-tcp", *arguments, "--bind", "127.0.0.1:0").__enter__()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
-        self.port = int(self.await_text(r"find it at 127\.0\.0\.1:(\d+)")[1])
+        self.port = int(self.await_text(r"serving Modbus TCP at 127\.0\.0\.1:(\d+)")[1])
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -819,12 +819,12 @@ def test_the_map_is_printed_as_csv(file: Path, busmaster: Command) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("--read-only", "--allow", "*"), "--read-only says that nothing may"),
+        (("--read-only", "--allow", "*"), "--allow and --read-only exclude each other"),
         (("--bind", "0.0.0.0:0", "--allow", "*"), "needs --allow-from"),
         (("--bind", "0.0.0.0:0", "--pass-through", "--allow-unit", "3"), "needs --allow-from"),
         (("--allow-unit", "3"), "needs --pass-through"),
         (("--allow", "*", "--allow-from", "here"), "--allow-from: 'here'"),
-        (("--allow-from", "10.0.0.1"), "nothing may be written"),
+        (("--allow-from", "10.0.0.1"), "--allow-from needs points that may be written"),
         (("--map", "absent.toml"), "absent.toml"),
         (("--map", __file__), "test_modbus_tcp.py: "),
         (("--map", __file__, "--last"), "--type and --last are for the automatic map"),

@@ -59,7 +59,7 @@ def interface(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         assert process.stderr is not None
         try:
             said = ""
-            while "is followed" not in said or not (found := re.search(r"opc\.tcp://\S+", said)):
+            while "connected to line" not in said or not (found := re.search(r"opc\.tcp://\S+", said)):
                 line = process.stderr.readline()
                 assert line, said
                 said += line
@@ -154,7 +154,7 @@ def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("--read-only", "--allow", "*"), "--read-only says that nothing may"),
+        (("--read-only", "--allow", "*"), "--allow and --read-only exclude each other"),
         (("--bind", "0.0.0.0:0", "--allow", "*"), "needs --token-file"),
         (("--certificate", __file__), "belong together"),
         (("--trusted", "."), "--trusted needs --certificate"),

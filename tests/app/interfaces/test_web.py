@@ -621,7 +621,7 @@ async def test_a_role_of_the_line_holds_for_its_page(tmp_path: Path) -> None:
         await shows(of.line)
         assert (await of.client.get("/api/line")).json()["read_only"]
         status, said = await put(of, 1)
-        assert (status, "may read this line and not write" in said["what"]) == (400, True)
+        assert (status, "may read this line, but not write" in said["what"]) == (400, True)
         assert line.audit() == [("5/10", "refused")]
 
 
@@ -640,4 +640,4 @@ async def test_a_request_with_two_lengths_is_refused_and_its_connection_closed(t
         assert answer.startswith("HTTP/1.1 400 ")
         assert "connection: close" in answer.lower()
         assert answer.count("HTTP/1.1") == 1
-        assert "not both" in answer
+        assert "exclude each other" in answer
