@@ -1,6 +1,6 @@
-"""What the system knows of a serial port: who holds it, who may open it, what its driver does to the timing.
+"""The system's data about a serial port: programs that have it open, permissions, and its driver's effect on timing.
 
-Nothing here opens a port. Each finding says what to do about it. Linux only: elsewhere there are no findings.
+Nothing here opens a port. Each finding comes with advice. Linux only: elsewhere there are no findings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SER_RS485_ENABLED = 1
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing about a port. `ok` False: it should be changed, and `advice` says how."""
+    """One finding about a port. `ok` False: it should be changed, as `advice` describes."""
 
     topic: str
     ok: bool
@@ -41,7 +41,7 @@ class Finding:
 
 
 def inspect(name: str, *, low_latency: bool | None = None, proc: Path = PROC) -> tuple[Finding, ...]:
-    """Say everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block.
+    """Return all findings about the port at a path, or of usb:SERIAL, without opening it. May block.
 
     If `low_latency` is to be set when it is opened, its latency timer is not looked at before: see `opened_latency`.
     """
@@ -59,8 +59,8 @@ def inspect(name: str, *, low_latency: bool | None = None, proc: Path = PROC) ->
 
 
 def opened_latency(path: str) -> Iterator[Finding]:
-    """Say what an FTDI adapter's latency timer is in a port that was opened with `low_latency`. May block."""
-    yield from _latency(path, f"low_latency=1 did not shorten it: {_by_root(path)}")
+    """Return an FTDI adapter's latency timer in a port that was opened with `low_latency`. May block."""
+    yield from _latency(path, f"low_latency=1 did not shorten it; {_by_root(path)}")
 
 
 def latency_timer(path: str) -> int | None:
@@ -82,7 +82,7 @@ def low_latency(descriptor: int) -> bool | None:
 
 
 def made_rate(descriptor: int, baudrate: int) -> float | None:
-    """Return the rate that the UART of an open port makes for `baudrate`; None where its driver does not tell."""
+    """Return the rate that the UART of an open port makes for `baudrate`; None if its driver does not report it."""
     settings = array.array("i", [0] * 32)
     try:
         fcntl.ioctl(descriptor, termios.TIOCGSERIAL, settings)
@@ -109,7 +109,7 @@ def _existence(path: str) -> Finding:
         return Finding("port", False, f"{path} does not exist", "see `python -m serial.tools.list_ports`")
     status = os.stat(path)
     if not stat.S_ISCHR(status.st_mode):
-        return Finding("port", False, f"{path} is no device", "give the path of a serial port")
+        return Finding("port", False, f"{path} is not a device", "give the path of a serial port")
     subsystem = identity.entry(status.st_rdev) / "subsystem"
     if subsystem.exists() and subsystem.resolve().name != "tty":
         return Finding("port", False, f"{path} is not a serial port", "see `python -m serial.tools.list_ports`")
@@ -117,8 +117,8 @@ def _existence(path: str) -> Finding:
 
 
 def _name(name: str, path: str, scan: identity.Scan) -> Iterator[Finding]:
-    """Say which USB adapter it is, and by what name that is found again."""
-    with contextlib.suppress(OSError):  # it has just gone, which opening it will say
+    """Return which USB adapter it is, and a name that stays the same."""
+    with contextlib.suppress(OSError):  # it has just disappeared, which opening it will report
         device = identity.usb_device(os.stat(path).st_rdev)
         if device is None:
             return
@@ -128,26 +128,26 @@ def _name(name: str, path: str, scan: identity.Scan) -> Iterator[Finding]:
         if name.startswith((identity.USB, by_path)) or (name.startswith(by_id) and lasting.startswith(by_id)):
             yield Finding("name", True, f"{what}, which {name} finds again")
         elif lasting:
-            advice = f"name it {lasting}: {path} goes to whichever adapter is found first"
+            advice = f"name it {lasting}, because {path} can change between adapters"
             yield Finding("name", True, what, advice)
         else:
-            yield Finding("name", True, what, "it has no serial number: leave it in this USB port")
+            yield Finding("name", True, what, "it has no serial number; leave it in this USB port")
 
 
 def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
-        return Finding("permission", True, "it may be opened")
-    what = f"you may not open it: it belongs to the group {owning_group(path)}"
+        return Finding("permission", True, "this user may open it")
+    what = f"this user may not open it; it belongs to the group {owning_group(path)}"
     return Finding("permission", False, what, how_to_open(path))
 
 
 def _holders(path: str, proc: Path) -> Finding:
     device = os.path.realpath(path)
-    # Whoever emulates the line on a pseudo-terminal has it open as well, and is no second master.
+    # The emulator of a pseudo-terminal has it open as well, but is not a second master.
     found = [str(holder) for holder in holders(path, proc=proc) if not serves(proc / str(holder.pid), device)]
     if not found:
         if os.geteuid():
-            advice = "those of other users are seen by root alone: `sudo busmaster doctor`"
+            advice = "only root sees the programs of other users: `sudo busmaster doctor`"
             return Finding("holders", True, "no other program of yours has it open", advice)
         return Finding("holders", True, "no other program has it open")
     return Finding(
@@ -165,7 +165,7 @@ def _driver(path: str) -> Iterator[Finding]:
 
 
 def _latency(path: str, advice: str) -> Iterator[Finding]:
-    """Say how long the adapter gathers bytes; `advice` is for one that gathers for too long."""
+    """Return how long the adapter gathers bytes; `advice` is for one that gathers for too long."""
     timer = latency_timer(path)
     if timer is None:
         return

@@ -1,4 +1,4 @@
-"""What the doctor makes of what was heard: findings in words, each with what to do."""
+"""Conclusions from received bytes and replies: findings in words, each with advice."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EVERY_OTHER = 0.5
 
 @dataclass(slots=True)
 class Record:
-    """All that one node was asked."""
+    """All probes of one node."""
 
     address: int
     label: str
@@ -58,57 +58,57 @@ class Record:
 
 
 def unexpected(heard: bytes, protocol: str | None) -> Finding:
-    """Say what was heard before anything was sent."""
+    """Return the finding about bytes that were received before any request."""
     if not heard:
-        return Finding("silence", True, "nobody speaks unexpected")
+        return Finding("silence", True, "no unexpected bytes were received")
     known = [] if protocol is None else spoken(heard, protocol)
     if known:
         return Finding(
             "silence",
             False,
-            f"somebody speaks already, so nothing was sent: {known[0]}",
-            "end the other master (`busmaster monitor` shows what it asks): two on one line garble each other",
+            f"another master is active, so nothing was sent: {known[0]}",
+            "stop the other master (`busmaster monitor` shows its requests): two masters garble each other's frames",
         )
     return Finding(
         "silence",
         False,
-        f"{len(heard)} bytes came unexpected: {garbage(heard)}",
+        f"{len(heard)} unexpected bytes were received: {garbage(heard)}",
         "look for a second master, a babbling node, missing biasing or termination, or a wrong baud rate",
     )
 
 
 def spoken(heard: bytes, protocol: str) -> list[str]:
-    """Return the whole frames among it, in words."""
+    """Return the whole frames in these bytes, in words."""
     decoder = Decoder(find(protocol).protocol.dialect())
     frames = [*decoder.feed(heard, 0.0), *decoder.quiet()]
     return [frame.text for frame in frames if not frame.fault and frame.kind is not Kind.NOISE]
 
 
 def echo(sent: bytes, heard: bytes, declared: bool) -> Finding:
-    """Say what came back of bytes that nobody answers."""
+    """Return the finding about the bytes received after a test transmission to which no node replies."""
     if heard.startswith(sent):
         if declared:
-            return Finding("echo", True, "the adapter hears what it sends, as declared")
+            return Finding("echo", True, "the adapter receives its own transmissions, as declared")
         return Finding(
             "echo",
             False,
-            "the adapter hears what it sends",
-            "add --echo, or ?echo=1 to the port (echo=True in Python): else every reply begins with the request",
+            "the adapter receives its own transmissions",
+            "add --echo, or ?echo=1 to the port (echo=True in Python); else every reply would begin with the request",
         )
     if heard:
         return Finding(
             "echo",
             False,
-            f"after {sent.hex(' ')} came {garbage(heard)}",
-            "if that is the echo, something disturbs it: look for a second talker, swapped wires or missing biasing",
+            f"after {sent.hex(' ')}, these bytes were received: {garbage(heard)}",
+            "if that is the echo, it is disturbed; look for a second sender, swapped wires or missing biasing",
         )
     if declared:
-        return Finding("echo", False, "the adapter does not hear what it sends", "leave the echo option out")
-    return Finding("echo", True, "the adapter does not hear what it sends")
+        return Finding("echo", False, "the adapter does not receive its own transmissions", "leave the echo option out")
+    return Finding("echo", True, "the adapter does not receive its own transmissions")
 
 
 def garbage(data: bytes) -> str:
-    """Return a few of the bytes, and what they look like."""
+    """Return a few of the bytes, with a likely cause of their pattern."""
     text = data[:SHOWN].hex(" ") + (" ..." if len(data) > SHOWN else "")
     guess = _looks_like(data)
     return f"{text} ({guess})" if guess else text
@@ -132,7 +132,7 @@ def _looks_like(data: bytes) -> str:
 
 
 def nodes(records: Sequence[Record], timing: ReplyTiming) -> Iterator[Finding]:
-    """Say how each node does, and what their latencies say of the reply times set."""
+    """Return a finding for each node, and compare their latencies with the configured reply times."""
     for record in records:
         others = [other for other in records if other is not record and other.lives]
         clean = bool(others) and not any(other.count(Outcome.GARBLED) for other in others)
@@ -144,21 +144,21 @@ def nodes(records: Sequence[Record], timing: ReplyTiming) -> Iterator[Finding]:
 
 
 def learning(starts: Sequence[float], timing: ReplyTiming) -> Finding:
-    """Say what learned reply times would come to with these latencies, in seconds."""
+    """Return the windows that learned reply times would have with these latencies, in seconds."""
     slowest = max(starts)
     window = min(window_of(slowest, slowest), timing.window)
     if window >= timing.window:
-        return Finding("learning", True, "learned windows would be no shorter than the one that is set")
+        return Finding("learning", True, "learned windows would not be shorter than the configured one")
     return Finding(
         "learning",
         True,
-        f"learned windows would be {milliseconds(window)} ms at most: a lost reply would hold up the line for about as "
-        f'long, in place of {milliseconds(timing.max_reply_delay)} ms (--timeout learned, timing = "learned")',
+        f"learned windows would be {milliseconds(window)} ms at most; a lost reply would occupy the line for about as "
+        f'long, instead of {milliseconds(timing.max_reply_delay)} ms (--timeout learned, timing = "learned")',
     )
 
 
 def node(record: Record, others_are_clean: bool) -> Finding:
-    """Say how one node does; `others_are_clean` tells a trouble of its own from one of the line."""
+    """Return the finding for one node; `others_are_clean` separates a fault of this node from one of the line."""
     asked, garbled, silent = len(record.probes), record.count(Outcome.GARBLED), record.count(Outcome.SILENT)
     label, who = record.label, f"another node with {_address_of(record)}"
     if record.doubled:
@@ -166,7 +166,7 @@ def node(record: Record, others_are_clean: bool) -> Finding:
             label,
             False,
             f"more than one reply to {record.doubled} of {asked} requests: there is {who}",
-            "switch one off and look who is left, then give each an address of its own",
+            "switch one off and find the other, then give each its own address",
         )
     if garbled:
         probe = next(probe for probe in record.probes if probe.outcome is Outcome.GARBLED)
@@ -174,23 +174,23 @@ def node(record: Record, others_are_clean: bool) -> Finding:
         if probe.hint is not None:
             advice = probe.hint
         elif others_are_clean:
-            advice = f"look for {who}: does this one still answer when you switch it off? Else check its wiring"
+            advice = f"look for {who}: does this one still reply when you switch it off? Else check its wiring"
         else:
-            advice = "check baud rate, termination, biasing and the common ground; then, whether two share an address"
+            advice = "check baud rate, termination, biasing and the common ground; then check for a shared address"
         return Finding(label, False, what, advice)
     if silent == asked:
-        return Finding(label, False, "does not answer", "check its address, power, wiring and that it speaks this")
+        return Finding(label, False, "does not reply", "check its address, power, wiring and protocol")
     text = record.answers[0].text
     if silent:
         return Finding(
             label,
             False,
-            f"no reply to {silent} of {asked} requests, although it lives: {text}",
-            "look for a loose contact or terminal, or something that keeps it busy; then, for its bus load",
+            f"no reply to {silent} of {asked} requests, although it is alive: {text}",
+            "look for a loose contact or terminal, or another load on the node; then for its bus load",
         )
     starts = record.starts
     times = " / ".join(milliseconds(value) for value in (starts[0], median(starts), percentile(starts)))
-    return Finding(label, True, f"answers after {times} ms (least / median / p99 of {asked}): {text}")
+    return Finding(label, True, f"replies after {times} ms (least / median / p99 of {asked}): {text}")
 
 
 def _address_of(record: Record) -> str:
@@ -198,7 +198,7 @@ def _address_of(record: Record) -> str:
 
 
 def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
-    """Say how measured latencies, in seconds, go with the reply times set."""
+    """Return the finding that compares measured latencies, in seconds, with the configured reply times."""
     slow = percentile(sorted(starts))
     times = " / ".join(milliseconds(value) for value in (timing.late_after, timing.window, timing.max_reply_delay))
     what = f"replies begin within {milliseconds(slow)} ms; set are {times} ms (late_after / window / max_reply_delay)"
@@ -206,15 +206,15 @@ def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
     if slow > timing.window:
         max_reply_delay = max(timing.max_reply_delay, rounded_up(1.5 * window))
         wanted = " / ".join(milliseconds(value) for value in (rounded_up(1.5 * slow), window, max_reply_delay))
-        advice = f"their values come, late: use {wanted} ms, or --timeout {milliseconds(window)}"
+        advice = f"their values arrive late; use {wanted} ms, or --timeout {milliseconds(window)}"
         return Finding("windows", False, what, advice)
     if slow > timing.late_after:
         late_after = milliseconds(rounded_up(1.5 * slow))
-        return Finding("windows", True, what, f"they are counted late: late_after = {late_after} ms would fit")
+        return Finding("windows", True, what, f"they are counted late; late_after = {late_after} ms would fit")
     max_reply_delay = rounded_up(1.5 * window)
     if max_reply_delay < timing.max_reply_delay:
         times = f"timing = {{ window = {window:g}, max_reply_delay = {max_reply_delay:g} }}"
-        advice = f"{times} in LINE.toml would waste less on dead nodes, but leave room for busy ones"
+        advice = f"{times} in LINE.toml would waste less time on dead nodes, but leave a margin for busy ones"
         return Finding("windows", True, what, advice)
     return Finding("windows", True, what)
 
@@ -249,24 +249,24 @@ def turnaround(starts: Sequence[float], released: Sequence[float] | None, byte_t
 
 
 def nobody(asked: str, profile: Profile, settings: LineSettings | None) -> Finding:
-    """Say that no node has answered. `asked` names them, as in "nodes 1-4"."""
+    """Return the finding that no node has replied. `asked` names them, as in "nodes 1-4"."""
     at = "" if settings is None else f" at {speed(settings)}"
     return Finding(
         "nodes",
         False,
-        f"no answer from {asked}{at}",
-        "check power, wires A and B (swap them), common ground, termination, the addresses, and that they speak "
+        f"no reply from {asked}{at}",
+        "check power, wires A and B (swap them), common ground, termination, the addresses, and that they use "
         f"{profile.title}",
     )
 
 
 def other_rate(address: int | None, settings: LineSettings, asked: str, tried: int) -> Finding:
-    """Say what came of trying other settings; `settings` are those at which the node `address` answered, if one did."""
+    """Return the result of other settings; `settings` are those at which the node `address` replied, if one did."""
     if address is None:
-        what = f"{asked}: no answer with {tried} other settings either"
+        what = f"{asked}: no reply with {tried} other settings either"
         return Finding("settings", False, what, "name your nodes with --nodes if these are not among them")
     advice = f"add ?baudrate={settings.baudrate}&bytesize={settings.bytesize}&parity={settings.parity} to the port"
-    return Finding("settings", False, f"{asked}: node {address} answers at {speed(settings)}", advice)
+    return Finding("settings", False, f"{asked}: node {address} replies at {speed(settings)}", advice)
 
 
 def percentile(ordered: Sequence[float], share: float = 0.99) -> float:

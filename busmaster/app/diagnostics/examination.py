@@ -1,4 +1,4 @@
-"""The course of an examination: the port, its driver, the line while nobody is asked, and then the nodes."""
+"""The steps of an examination: the port, its driver, the line without requests, and then the nodes."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ OPENING = 0.05
 LISTENING = 0.5
 ECHOING = 0.1
 HARMLESS = bytes.fromhex("00 55 00")
-"""Begins no frame of any protocol, and is no acknowledgement: nobody answers."""
+"""Begins no frame of any protocol, and is not an acknowledgement: no node replies."""
 PROBES = 24
-"""How often a node that lives is asked again."""
+"""Number of further requests to a node that replies."""
 SILENT_PROBES = 3
-"""How often one that was named is asked before it is said to be silent."""
+"""Number of requests to a named node before it is reported as silent."""
 TOLERANCE = 0.02
-"""By how much the two ends of a line may differ in their rates: together less than half a bit in ten."""
+"""Largest relative difference of the rates of the two ends of a line: together less than half a bit in ten."""
 STRANGERS = 4
-"""How many nodes are asked at each setting that is tried."""
+"""Number of nodes that are tried at each setting."""
 RATES = (9600, 19200, 38400, 57600, 115200, 4800, 2400)
 FRAMINGS = ((8, "N"), (7, "E"), (8, "E"))
 
@@ -42,13 +42,13 @@ Tell = Callable[[Finding], None]
 
 
 class Progress(Protocol):
-    """Is told of each step of a course whose number of steps is known."""
+    """Is called for each step of a task with a known number of steps."""
 
     def advance(self) -> None: ...
 
 
 class Unseen:
-    """Shows nobody how far it is."""
+    """Progress without a display."""
 
     def advance(self) -> None:
         pass
@@ -65,9 +65,9 @@ def unseen(_label: str, _steps: int) -> AbstractContextManager[Progress]:
 
 @dataclass(frozen=True, slots=True)
 class Patient:
-    """What is examined. Without a protocol no node is asked.
+    """The object of an examination. Without a protocol no requests are sent.
 
-    `named`: the user said which nodes there are. `progress` shows how far each course is; nothing does by default.
+    `named`: the user has named the nodes. `progress` shows the progress of each task; by default nothing is shown.
     """
 
     endpoint: Endpoint
@@ -92,7 +92,7 @@ class Patient:
 
 
 async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
-    """Tell all findings, in this order; one that makes the rest pointless is the last."""
+    """Report all findings, in this order. A finding that makes the others pointless is the last."""
     where = patient.endpoint
     if isinstance(where, SerialPort):
         inspect = functools.partial(adapters.inspect, where.path, low_latency=where.low_latency)
@@ -123,7 +123,7 @@ def _opened_latency(wire: Wire) -> list[Finding]:
 
 
 def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
-    """Say what can be said of an open port."""
+    """Return the findings about an open port."""
     where = patient.endpoint
     assert wire.transport is not None
     profile = None if patient.protocol is None else patient.profile
@@ -148,7 +148,7 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
 
 
 def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
-    """Say whether the UART can make the baud rate, where its driver tells."""
+    """Return whether the UART can make the baud rate, if its driver reports that."""
     made = adapters.made_rate(descriptor, baudrate)
     if made is not None and abs(made / baudrate - 1) > TOLERANCE:
         what = f"its UART makes {made:.0f} baud of {baudrate}, {made / baudrate - 1:+.1%}"
@@ -158,7 +158,7 @@ def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
 
 
 def remote_port(transport: asyncio.Transport) -> Iterator[Finding]:
-    """Say what an RFC 2217 server reports of its port."""
+    """Return the findings from an RFC 2217 server about its port."""
     if transport.get_extra_info("line_errors")() is None:
         advice = "parity and framing errors are not counted: each shows as a garbled reply, if its checksum finds it"
         yield Finding("line errors", True, "the server has not confirmed that it reports line errors", advice)
@@ -171,7 +171,7 @@ def remote_port(transport: asyncio.Transport) -> Iterator[Finding]:
 
 
 def driver(descriptor: int, wanted: bool | None = None, *, switched: bool = False) -> Iterator[Finding]:
-    """Say what the driver of an open serial port does. `wanted` is the low-latency flag that it was opened with.
+    """Return the state of an open serial port's driver. `wanted` is the low-latency flag with which it was opened.
 
     `switched`: software switches the transmitter.
     """
@@ -181,7 +181,7 @@ def driver(descriptor: int, wanted: bool | None = None, *, switched: bool = Fals
         case True:
             yield Finding("driver", True, "its low-latency flag is set")
         case False if wanted:
-            yield Finding("driver", True, "its low-latency flag is not set, though low_latency=1 asked for it")
+            yield Finding("driver", True, "its low-latency flag is not set, although low_latency=1 was given")
         case False:
             advice = "?low_latency=1 may bring replies sooner" if wanted is None else ""
             yield Finding("driver", True, "its low-latency flag is not set", advice)
@@ -203,7 +203,7 @@ def driver(descriptor: int, wanted: bool | None = None, *, switched: bool = Fals
 
 
 async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
-    """Tell what is found on an open line; what makes the rest pointless is the last."""
+    """Report the findings on an open line. A finding that makes the others pointless is the last."""
     where = patient.endpoint
     assert wire.port is not None
     await wire.hear_all(OPENING)
@@ -212,7 +212,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     heard = await wire.hear_all(LISTENING)
     talk = diagnosis.unexpected(heard, patient.protocol)
     tell(talk)
-    # Another master, or what may be one, must not be disturbed. Noise is no reason not to ask.
+    # A possible master must not be disturbed. Noise does not prevent requests.
     if heard and (patient.protocol is None or diagnosis.spoken(heard, patient.protocol)):
         return
     settings = where.settings
@@ -221,7 +221,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     heard = await wire.hear_all(ECHOING + len(HARMLESS) * byte_time + where.receive_latency)
     tell(diagnosis.echo(HARMLESS, heard, where.echo))
     if patient.protocol is None:
-        tell(Finding("nodes", True, "no node was asked", "say which --protocol they speak, and perhaps --nodes"))
+        tell(Finding("nodes", True, "no request was sent", "name the protocol with --protocol, and perhaps --nodes"))
         return
     profile = patient.profile
     timings = profile.timings if patient.timings is None else patient.timings
@@ -246,7 +246,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
 
 
 async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
-    """Ask every address once, and those that live again and again. The silent are left out, unless they were named."""
+    """Send a request to every address, and further ones to nodes that reply. Leaves out silent nodes without a name."""
     records = []
     label = patient.profile.label
     with patient.progress("asking", len(patient.addresses)) as bar:
@@ -269,7 +269,7 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
 
 
 async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell) -> None:
-    """Try, as nobody answers, whether somebody would at another rate or framing. The port is left as it was."""
+    """Try, because no node replies, whether one does at another rate or framing. Restores the port's settings."""
     where = patient.endpoint
     settings = where.settings
     if not wire.tunable or settings is None:

@@ -1,7 +1,6 @@
-"""Asking nodes with the raw bytes in sight: what the arbiter discards while it resynchronises is what a doctor wants to
-see.
+"""Sends requests to nodes and shows the raw bytes: a doctor needs the bytes that the arbiter discards.
 
-One request at a time and nobody else on the port, so no arbiter is needed.
+It sends one request at a time, and no other master is on the port, so no arbiter is needed.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class Wire(asyncio.Protocol):
         self.marked: Counter[Mark] = Counter()
         self.closed = anyio.Event()
         self.attempt: Attempt | None = None
-        """What is asked now, for the tap."""
+        """The present attempt, for the tap."""
         self._tap = tap
         self._cause: Exception | None = None
         self._chunks: deque[tuple[float, bytes]] = deque()
@@ -68,7 +67,7 @@ class Wire(asyncio.Protocol):
         self.port = open_port(transport)
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        """Hear what is damaged all the same: whoever looks for what is wrong wants to see it."""
+        """Keep damaged bytes too, because they are of interest in a search for faults."""
         self.marked[mark] += 1
         if byte:
             self.data_received(byte)
@@ -105,7 +104,7 @@ class Wire(asyncio.Protocol):
         await self.transport.tune(settings)  # type: ignore[union-attr]  # of a tunable one, which is open
 
     def attempted(self, attempt: Attempt) -> None:
-        """Tell the tap that this is over."""
+        """Report the end of this attempt to the tap."""
         self.attempt = None
         if self._tap is not None:
             self._tap.attempted(attempt)
@@ -124,9 +123,9 @@ class Wire(asyncio.Protocol):
         return self._chunks.popleft()
 
     async def hear_all(self, within: float, quiet: float = QUIET) -> bytes:
-        """Return what begins to come `within` so many seconds, up to a silence of `quiet` seconds.
+        """Return the bytes that begin to arrive `within` so many seconds, up to a silence of `quiet` seconds.
 
-        Of what does not fall silent, it hears BABBLE seconds or MUCH.
+        If there is no silence, it ends after BABBLE seconds or MUCH bytes.
         """
         heard = b""
         until = self.clock() + within
@@ -155,7 +154,7 @@ async def opened(endpoint: Endpoint, tap: Tap | None = None) -> AsyncIterator[Wi
 
 
 class Outcome(enum.Enum):
-    """What came of a request. A refusal is an answer."""
+    """Result of a request. A refusal is a reply."""
 
     ANSWERED = "answered"
     SILENT = "silent"
@@ -164,11 +163,11 @@ class Outcome(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """One request and what was heard of it, without an echo.
+    """One request and its reply, without an echo.
 
     `start`: seconds from the request's end on the wire to the first byte, None if there was none. `text` is the command
-    and its value or refusal, or what was wrong. `raw` is all that came, and `again` what of it came after the reply, to
-    which nobody was entitled. `hint` is what to try, where the reader knows that.
+    and its value, refusal or error. `raw` is all bytes, and `again` the bytes after the reply, which no node may send.
+    `hint` is the advice of the reader, if it has any.
     """
 
     outcome: Outcome
@@ -181,7 +180,7 @@ class Probe:
 
 
 class Prober:
-    """Asks a protocol's cheapest read. `byte_time` in seconds; `echo`: what is sent is received too."""
+    """Sends a protocol's cheapest read. `byte_time` in seconds; `echo`: own transmissions are received too."""
 
     def __init__(self, wire: Wire, profile: Profile, timings: Timings, byte_time: float, echo: bool) -> None:
         self._wire = wire
@@ -192,11 +191,11 @@ class Prober:
         self._numbers = count(1)
 
     async def ask(self, address: int, *, patience: float | None = None, alone: bool = False) -> Probe:
-        """Ask a node with its probe. `patience`: seconds to wait for the first byte, the maximum reply delay by
+        """Send the probe to a node. `patience`: seconds to wait for the first byte, the maximum reply delay by
         default.
 
-        Raises LineDown. `alone`: whatever still comes within the maximum reply delay is this node's doing, and not left
-        for the next request.
+        Raises LineDown. `alone`: further bytes within the maximum reply delay belong to this node, and are not left for
+        the next request.
         """
         profile, wire = self._profile, self._wire
         command = profile.probe
@@ -225,7 +224,7 @@ class Prober:
         return hearing.probe(self._echo.strip(rest) or b"")
 
     def _say(self, data: bytes) -> float:
-        """Send `data`, and return when it will have left: at once, where nobody knows how long it takes."""
+        """Send `data`, and return the time when it will have left: at once, if its duration is not known."""
         self._echo.sent(data)
         return self._wire.say(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
 
@@ -258,10 +257,10 @@ class _Hearing:
         """Take it that this came in place of the echo."""
         self._hear(self.asked, data)
         self._collided = True
-        self.driver.fail(FrameError("what came back differs from what was sent: a collision"))
+        self.driver.fail(FrameError("the echo differs from the sent bytes: a collision"))
 
     def verdict(self) -> tuple[Verdict, Any]:
-        """Return how it ended, and the value or what was wrong. Raises what a bug of the protocol raised."""
+        """Return how it ended, and the value or the error. Raises the exception of a bug in the protocol."""
         ending = self.driver.ending
         if ending is None:
             return (Verdict.NO_REPLY, "no reply") if self.start is None else (Verdict.GARBLED, "cut short")

@@ -1,4 +1,4 @@
-"""Looking for nodes on an unknown line: listen first, send nothing where somebody talks, and nothing but reads."""
+"""Searches for nodes on an unknown line: listens first, sends nothing if another master is active, and only reads."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from busmaster.registry import NodeKind, Protocol
 RECOGNISING = 1.0
 """Seconds in which talk is listened to with each of the settings."""
 RECOGNISED = 2
-"""Whole frames by which a protocol is known."""
+"""Number of whole frames by which a protocol is recognised."""
 CONFIRMED = 2
-"""How often a node must answer again to be taken for one: at wrong settings, noise may look like an answer."""
+"""Number of further replies that confirm a node: at wrong settings, noise may look like a reply."""
 SLOW = 10.0
 """Seconds that the other addresses may take before the user is offered to stop."""
 MEASURED = 10
-"""How often a node is asked for its reply time."""
+"""Number of requests to a node that measure its reply time."""
 
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A node that answers. `starts`: seconds until its replies began, in order; `text`: what it said."""
+    """A node that replies. `starts`: seconds until its replies began, in order; `text`: its reply."""
 
     kind: NodeKind
     address: int
     starts: tuple[float, ...]
     text: str
     refuses: bool
-    """It answers, and refuses what was asked: it lives, but has no such item."""
+    """It replies, but refuses the request: it is alive, but has no such item."""
 
     @property
     def protocol(self) -> Protocol:
@@ -50,22 +50,22 @@ class Found:
 
 @dataclass(slots=True)
 class Discovery:
-    """What came of a search. `settings` are those of the line, None where nobody knows them; `echo`: it echoes."""
+    """The result of a search. `settings` are those of the line, None if unknown; `echo`: it echoes."""
 
     settings: LineSettings | None = None
     echo: bool = False
     found: list[Found] = field(default_factory=list)
     talk: str = ""
-    """Who talks there already, in words; then nothing was sent."""
+    """Description of another master; then nothing was sent."""
     not_asked: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    """The addresses that were not asked, by kinds of nodes that were tried and may be on this line."""
+    """The addresses that were not tried, by kinds of nodes that were tried and may be on this line."""
 
 
 class Search:
-    """Looks for nodes on an open port. `tell` is called with what is noticed on the way, in words.
+    """Searches for nodes on an open port. `tell` is called with findings on the way, in words.
 
-    `stop_offered` is called before many addresses are asked on a slow line. It tells the user how to stop, and returns
-    what says whether the user has done so.
+    `stop_offered` is called before many addresses are tried on a slow line. It informs the user how to stop, and
+    returns a function that returns whether the user has done so.
     """
 
     def __init__(
@@ -83,10 +83,10 @@ class Search:
         self._echo = endpoint.echo
         self._stop_offered = stop_offered
         self._silent: set[tuple[LineSettings | None, bytes]] = set()
-        """Requests that nobody answered, and how the line was set: some protocols have the same ones."""
+        """Requests without a reply, with the line's settings, because some protocols have the same requests."""
 
     async def listen(self, tried: Sequence[Step]) -> str:
-        """Return who talks there, in words, and nothing if nobody does. Nothing is sent. Raises LineDown."""
+        """Return a description of another master, "" if there is none. Nothing is sent. Raises LineDown."""
         wire = self._wire
         assert wire.port is not None
         await wire.hear_all(OPENING)
@@ -102,14 +102,14 @@ class Search:
                     for step in tried:
                         known = spoken(heard, step.kind.protocol.kinds[0].name) if step.settings == one else []
                         if len(known) >= RECOGNISED:
-                            return f"somebody talks {step.kind.profile.title} already{_at(one)}: {known[0]}"
+                            return f"another master is active, with {step.kind.profile.title}{_at(one)}: {known[0]}"
                 bar.advance()
-        return f"somebody talks already, in a way that is not known here: {garbage(heard)}"
+        return f"another master is active, with an unknown protocol: {garbage(heard)}"
 
     async def look(self, tried: Sequence[Step]) -> Discovery:
-        """Try one step after the other; where nodes are found, only what may share a line with them is tried on.
+        """Try one step after the other. If nodes are found, only kinds that may share a line with them are tried then.
 
-        Then the other addresses of their protocols are asked too. Raises LineDown.
+        Then the other addresses of their protocols are tried too. Raises LineDown.
         """
         discovery = Discovery()
         found: dict[tuple[str, int], Found] = {}
@@ -136,17 +136,17 @@ class Search:
         return discovery
 
     async def _finish(self, asked: Sequence[Step], found: dict[tuple[str, int], Found], discovery: Discovery) -> None:
-        """Ask the other addresses of the protocols of which nodes have replied, and note which were not asked."""
+        """Try the other addresses of the protocols of which nodes have replied, and note those that were not tried."""
         spoken = {node.protocol.name for node in found.values()}
         due = [step for step in asked if step.kind.protocol.name in spoken and step.rest]
         discovery.not_asked = {step.kind.name: step.rest for step in asked if step.rest and step not in due}
         total, stopped = sum(step.seconds_for(step.rest) for step in due), lambda: False
         if due:
             names = "; ".join(f"{step.kind.name} {ranges(step.rest)}" for step in due)
-            self._tell(f"nodes have replied, so the other addresses are asked too ({names}): up to {total:.0f} s")
+            self._tell(f"nodes have replied, so the other addresses are tried too ({names}): up to {total:.0f} s")
         if total > SLOW:
             stopped = self._stop_offered()
-        with self._progress("asking the others", sum(len(step.rest) for step in due)) as bar:
+        with self._progress("trying the others", sum(len(step.rest) for step in due)) as bar:
             for step in due:
                 if step.settings is not None and not await self._tuned(step.settings):
                     discovery.not_asked[step.kind.name] = step.rest
@@ -160,7 +160,7 @@ class Search:
         return other.settings == found.settings and other.kind.profile.may_share_with(found.kind.profile)
 
     async def _tuned(self, settings: LineSettings) -> bool:
-        """Set the port so, and return whether it takes that. What was on its way before is heard and forgotten."""
+        """Apply the settings to the port, and return whether it accepts them. Earlier bytes are discarded."""
         try:
             await self._wire.tune(settings)
         except LineDown as error:
@@ -184,7 +184,7 @@ class Search:
         advance: Callable[[], None],
         stopped: Callable[[], bool] = lambda: False,
     ) -> int:
-        """Ask addresses, and add the nodes that reply to `found`. Returns how many were asked before it was stopped."""
+        """Try addresses, and add the nodes that reply to `found`. Returns the number that were tried before a stop."""
         before: int | None = None
         name, profile = step.kind.protocol.name, step.kind.profile
         for number, address in enumerate(some):
@@ -196,7 +196,7 @@ class Search:
                 if probe.outcome is Outcome.SILENT:
                     self._silent.add((step.settings, request))
                 else:
-                    # A late answer is heard behind the next request: it may be that of the node before.
+                    # A late reply arrives after the next request, so it may be that of the node before.
                     for one in (before, address):
                         if (
                             one is not None
@@ -225,20 +225,20 @@ class Search:
         return found
 
     async def _ask(self, step: Step, address: int, request: bytes) -> Probe:
-        """Ask a node once. An adapter that echoes is found out by the first request that comes back."""
+        """Send one request to a node. The first request that comes back reveals an adapter with an echo."""
         profile = step.kind.profile
         probe = await self._prober(step).ask(address, patience=profile.timings.read.window)
-        # an echo may look like an answer: that of a Mentor II begins with EOT
+        # an echo may look like a reply: that of a Mentor II begins with EOT
         if not self._echo and probe.raw.startswith(request):
             self._echo = True
-            self._tell("the adapter hears what it sends")
+            self._tell("the adapter receives its own transmissions")
             probe = await self._prober(step).ask(address, patience=profile.timings.read.window)
         return probe
 
     async def _confirmed(self, step: Step, address: int) -> Found | None:
-        """Ask a node again and again; None unless it answers each time, with nobody else to answer for it."""
+        """Send further requests to a node; None unless it replies to each, without a second reply."""
         prober = self._prober(step)
-        await self._wire.hear_all(step.kind.profile.timings.read.max_reply_delay)  # an answer of before is over then
+        await self._wire.hear_all(step.kind.profile.timings.read.max_reply_delay)  # earlier replies are over then
         probes = [await prober.ask(address, alone=True) for _ in range(CONFIRMED)]
         if any(probe.outcome is not Outcome.ANSWERED for probe in probes):
             return None

@@ -1,4 +1,4 @@
-"""What is tried on an unknown line, in which order, and how long that takes at most. Nothing is opened here."""
+"""The steps of a search on an unknown line, their order, and their longest duration. Nothing is opened here."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from busmaster.ext import Profile
 from busmaster.registry import NodeKind, protocols
 
 USUAL = range(1, 9)
-"""The nodes that are asked unless others are named."""
+"""The nodes that are tried unless others are named."""
 LISTENING = 3.0
-"""Seconds of silence after which nobody else is taken to talk there."""
+"""Seconds of silence after which no other master is expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Ask some nodes of one kind, the line set so. `settings` None: as it is, which cannot be changed from here.
+    """Try some nodes of one kind with these settings of the line. None: the settings cannot be changed from here.
 
-    `rest` are the kind's other addresses: they are asked too if a node of its protocol has replied.
+    `rest` are the kind's other addresses: they are tried too if a node of its protocol has replied.
     """
 
     settings: LineSettings | None
@@ -53,10 +53,10 @@ def usual_kinds() -> list[NodeKind]:
 
 
 def steps(kinds: Iterable[NodeKind], nodes: Sequence[int] | None, allowed: LineSettings | int | None) -> list[Step]:
-    """Return what to try, the likeliest settings of each kind of node first.
+    """Return the steps, the likeliest settings of each kind of node first.
 
-    `nodes`: those to ask of each kind that has such addresses. `allowed`: these settings alone, or this baud rate
-    alone, whether a protocol's document has it or not. Raises InvalidCommand where nothing is left to try.
+    `nodes`: those to try of each kind that has such addresses. `allowed`: only these settings, or only this baud rate,
+    whether a protocol's document has it or not. Raises InvalidCommand if no step is left.
     """
     asked = [(kind, addresses(kind.profile, nodes), rest(kind.profile, nodes)) for kind in kinds]
     rounds = zip_longest(*(_settings(kind.profile, allowed) for kind, _, _ in asked))
@@ -72,7 +72,7 @@ def steps(kinds: Iterable[NodeKind], nodes: Sequence[int] | None, allowed: LineS
 
 
 def untuned_steps(kinds: Iterable[NodeKind], nodes: Sequence[int] | None) -> list[Step]:
-    """Return what to try on a port whose rate and framing are set elsewhere. Raises InvalidCommand for nothing."""
+    """Return the steps for a port whose rate and framing are set elsewhere. Raises InvalidCommand if there are none."""
     found = [Step(None, kind, addresses(kind.profile, nodes), rest(kind.profile, nodes)) for kind in kinds]
     found = [step for step in found if step.addresses]
     if not found:
@@ -81,15 +81,15 @@ def untuned_steps(kinds: Iterable[NodeKind], nodes: Sequence[int] | None) -> lis
 
 
 def seconds(tried: Iterable[Step]) -> float:
-    """Return how long all of them take where nobody answers, with the listening before."""
+    """Return the duration of all steps if no node replies, including the listening before."""
     return LISTENING + sum(step.seconds for step in tried)
 
 
 def addresses(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Return which nodes are asked in a protocol: of those that are named the ones that it has, else the usual ones.
+    """Return the addresses to try with a protocol: those that are named and exist in it, else the usual ones.
 
-    Where the usual ones do not exist in it, they are as many from its first on. Where it has no addresses, it is the
-    one node that there is, whatever is named.
+    If the usual ones do not exist in it, they are as many from its first on. If it has no addresses, it is its only
+    node in any case.
     """
     if not profile.addressed:
         return (profile.addresses[0],)
@@ -100,7 +100,7 @@ def addresses(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
 
 
 def rest(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the addresses that are asked after a node has replied: the others, unless the user named some."""
+    """Return the addresses to try after a node has replied: the others, unless the user named some."""
     if nodes is not None:
         return ()
     asked = addresses(profile, nodes)

@@ -17,15 +17,15 @@ UART_ERRORS = {
     ),
     "overruns": (
         "byte lost in the UART",
-        "this machine comes too late: use an adapter that buffers more",
+        "this machine reads too late; use an adapter that buffers more",
     ),
-    "buffer_overruns": ("byte lost in the driver", "nobody read in time: look for what keeps this machine busy"),
+    "buffer_overruns": ("byte lost in the driver", "it was not read in time; look for a load on this machine"),
 }
-"""How each count is called, and what to look for."""
+"""The name of each counter, and advice."""
 
 
 def damage(damaged: int, breaks: int, driver: DriverErrors | None) -> dict[str, int]:
-    """Return what was found wrong, by the keys of UART_ERRORS: the driver's counts where it has any, else the marks."""
+    """Return the errors by the keys of UART_ERRORS: the driver's counts if it has any, else the marks."""
     counts = {} if driver is None else {name: getattr(driver, name) for name in UART_ERRORS if name != "damaged"}
     if not any(counts.values()):
         counts = {"damaged": damaged, "breaks": breaks}
@@ -33,12 +33,12 @@ def damage(damaged: int, breaks: int, driver: DriverErrors | None) -> dict[str, 
 
 
 def damage_text(counts: Mapping[str, int]) -> str:
-    """Return what was found wrong in a few words; empty if nothing was."""
+    """Return the errors in a few words; empty if there are none."""
     return ", ".join(counted(count, UART_ERRORS[name][0]) for name, count in counts.items())
 
 
 def findings(damaged: int, breaks: int, driver: DriverErrors | None) -> Iterator[Finding]:
-    """Say what the UART found wrong while nodes were asked. Nothing is said of a port that cannot tell."""
+    """Return the errors of the UART during the requests. Nothing is returned for a port that cannot report them."""
     counts = damage(damaged, breaks, driver)
     if driver is not None and not counts:
         yield Finding("uart", True, "no byte was damaged or lost")

@@ -1,4 +1,4 @@
-"""A LINE.toml of what was found: it polls every node that answers, and is the beginning of one's own."""
+"""A LINE.toml for the nodes that were found: it polls every node that replied, and is a start for the user's own."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def lasting(port: SerialPort | TcpPort) -> SerialPort | TcpPort:
 
 
 def summary(discovery: Discovery) -> str:
-    """Return in a few words what was found: "Host Comms Protocol 2 at 57600 8N1, nodes 1, 2, 5"."""
+    """Return the result in a few words: "Host Comms Protocol 2 at 57600 8N1, nodes 1, 2, 5"."""
     texts = []
     for protocol in dict.fromkeys(node.protocol for node in discovery.found):
         nodes = [node for node in discovery.found if node.protocol is protocol]
@@ -87,7 +87,7 @@ def _name(node: Found, found: Sequence[Found]) -> str:
 
 
 def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
-    """Yield the lines of [port]: what was found, and of what the user said all that is not as usual."""
+    """Yield the lines of [port]: the settings that were found, and the user's settings that are not the defaults."""
     said = _set(port)
     if isinstance(said.get("rs485"), Rs485):
         said["rs485"] = _set(said["rs485"])
@@ -112,7 +112,7 @@ def _node(name: str, node: Found) -> Iterator[str]:
     others = [other.name for other in node.protocol.kinds if other is not kind]
     times = " / ".join(map(milliseconds, (node.starts[0], median(node.starts), percentile(node.starts))))
     yield f"[nodes.{name}]"
-    yield f"# it said: {' '.join(node.text.split())}; replies began after {times} ms (least / median / p99)"
+    yield f"# its reply: {' '.join(node.text.split())}; replies began after {times} ms (least / median / p99)"
     yield f"protocol = {toml_text(kind.name)}" + (f"  # or {', '.join(map(toml_text, others))}" if others else "")
     if node.protocol.profile.addressed:
         yield f"address = {node.address}"
@@ -124,7 +124,7 @@ def _node(name: str, node: Found) -> Iterator[str]:
 
 
 def _period(settings: LineSettings | None, nodes: Sequence[Found]) -> float:
-    """Return a period, in seconds, in which all of them can be asked with room to spare."""
+    """Return a period, in seconds, in which all of them can be read with time to spare."""
     total = sum(node.starts[-1] + 64 * (settings or node.protocol.profile.line).byte_time for node in nodes)
     return max(SHORTEST_WRITTEN_PERIOD, math.ceil(2 * ROOM * total) / 2)
 

@@ -95,7 +95,7 @@ def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("/dev/pts/99999")
     (tmp_path / "null").symlink_to("/dev/null")
     for name, says in (
-        ("file", "is no device"),
+        ("file", "is not a device"),
         ("link", "which is gone"),
         ("none", "does not exist"),
         ("null", "is not a serial port"),
@@ -212,7 +212,7 @@ def test_the_low_latency_flag_is_told_with_how_to_set_it(
     assert told(0) == ("its low-latency flag is not set", "?low_latency=1 may bring replies sooner")
     assert told(None) == ("it has no low-latency flag", "")
     assert told(1 << 13, wanted=True) == ("its low-latency flag is set", "")
-    assert told(0, wanted=True) == ("its low-latency flag is not set, though low_latency=1 asked for it", "")
+    assert told(0, wanted=True) == ("its low-latency flag is not set, although low_latency=1 was given", "")
     assert told(0, wanted=False) == ("its low-latency flag is not set", "")
 
 
@@ -251,7 +251,7 @@ def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, 
     usb.plug(pty_master.path, "A500ABC")
     finding = name_of(pty_master.path)
     assert finding.what == f"{pty_master.path} is FTDI A500ABC"
-    assert finding.advice == f"name it usb:A500ABC: {pty_master.path} goes to whichever adapter is found first"
+    assert finding.advice == f"name it usb:A500ABC, because {pty_master.path} can change between adapters"
     finding = name_of("usb:A500ABC")
     assert finding.what == f"{pty_master.path} is FTDI A500ABC, which usb:A500ABC finds again"
     assert not finding.advice
@@ -261,11 +261,11 @@ def test_an_adapter_without_a_serial_number_goes_by_its_place(
     usb: UsbTree, pty_master: PtyMaster, tmp_path: Path
 ) -> None:
     usb.plug(pty_master.path, place="1-1.2")
-    assert name_of(pty_master.path).advice == "it has no serial number: leave it in this USB port"
+    assert name_of(pty_master.path).advice == "it has no serial number; leave it in this USB port"
     link = tmp_path / "links/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
     link.parent.mkdir(parents=True)
     link.symlink_to(pty_master.path)
-    assert name_of(pty_master.path).advice.startswith(f"name it {link}: ")
+    assert name_of(pty_master.path).advice.startswith(f"name it {link}, ")
     assert not name_of(str(link)).advice
 
 

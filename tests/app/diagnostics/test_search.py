@@ -157,7 +157,7 @@ def test_where_somebody_talks_nothing_is_sent_and_it_is_said_what_is_spoken() ->
     talkers.attentive = True
     discovery = looked(line_of(settings, talkers), steps(usual_kinds(), None, None))
     assert not discovery.found
-    assert discovery.talk.startswith("somebody talks Modbus RTU already at 9600 8N1: ")
+    assert discovery.talk.startswith("another master is active, with Modbus RTU at 9600 8N1: ")
     assert talkers.heard == b""
 
 
@@ -177,7 +177,7 @@ def test_talk_that_nobody_knows_is_left_alone_too() -> None:
     babbler = Babbler()
     babbler.attentive = True
     discovery = looked(line_of(LineSettings(9600), babbler), steps(usual_kinds(), None, None))
-    assert "in a way that is not known here" in discovery.talk
+    assert "with an unknown protocol" in discovery.talk
 
 
 def test_an_adapter_that_echoes_is_noticed() -> None:
@@ -185,7 +185,7 @@ def test_an_adapter_that_echoes_is_noticed() -> None:
     line = line_of(LineSettings(9600), make_device("hcp2", 3), echo=Echo())
     discovery = looked(line, steps(usual_kinds(), None, None), told)
     assert discovery.echo
-    assert told[0] == "the adapter hears what it sends"
+    assert told[0] == "the adapter receives its own transmissions"
     assert [(node.address, node.label) for node in discovery.found] == [(3, "node 3")]
 
 
@@ -311,7 +311,7 @@ def test_if_a_node_replies_the_other_addresses_of_its_protocol_are_asked(name: s
     discovery = found_on(line, name, told=told)
     assert sorted(node.address for node in discovery.found) == list(nodes)
     assert discovery.not_asked == {}
-    assert "so the other addresses are asked too" in told[-1]
+    assert "so the other addresses are tried too" in told[-1]
 
 
 @pytest.mark.parametrize("ignores", [False, True])
