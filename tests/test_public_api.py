@@ -140,8 +140,7 @@ def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (
-        "busmaster: the command line needs click, rich, which the extra named cli brings: "
-        "pip install 'busmaster[cli]'\n"
+        "busmaster: the command line needs click, rich; install the extra cli: pip install 'busmaster[cli]'\n"
     )
 
 

@@ -1,4 +1,4 @@
-"""The command line: one module for each command, and what they share. `main` is the console script."""
+"""The command line: one module for each command, and shared modules. `main` is the console script."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         print(
-            f"busmaster: the command line needs {', '.join(missing)}, which the extra named cli brings: "
+            f"busmaster: the command line needs {', '.join(missing)}; install the extra cli: "
             "pip install 'busmaster[cli]'",
             file=sys.stderr,
         )
         return WRONG_USAGE
     try:
         from busmaster.app.cli.app import run
-    except KeyboardInterrupt:  # importing takes a moment; from then on `run` hears it
+    except KeyboardInterrupt:  # importing takes a moment; afterwards `run` handles Ctrl-C
         return INTERRUPTED
     return run(arguments)

@@ -22,15 +22,13 @@ from busmaster.ext import meant
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 STATUSES = {
-    str(OK): "All is good.",
-    str(
-        FAILED
-    ): "An error came from the line, a port or a file; one line on standard error says what, and what to try.",
+    str(OK): "Success.",
+    str(FAILED): "The line, a port or a file failed; one line on standard error states the error and a suggestion.",
     str(WRONG_USAGE): "The usage or a value is wrong, and nothing was sent.",
     str(INTERRUPTED): "Ctrl-C ended it.",
-    "128 + N": "Signal N ended it; of `run` and `serve` SIGTERM is no error, and ends with 0.",
+    "128 + N": "Signal N ended it. `run` and `serve` end with 0 after SIGTERM.",
 }
-"""With what a command ends; where one means more by it, its help says so."""
+"""Exit statuses of all commands. The help of a command states further meanings."""
 COMMANDS = (
     "demo",
     "read",
@@ -81,14 +79,14 @@ class Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that the arguments name. Raises UsageError, with what was meant, for a name that is none."""
+        """Find the command that the arguments name. Raises UsageError with the nearest name for an unknown one."""
         known = self.list_commands(ctx)
         if args and not args[0].startswith("-") and args[0] not in known:
             raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], known)}", ctx)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command and return its result, or the exit status of what it raised."""
+        """Run a command and return its result, or the exit status for the exception that it raised."""
         try:
             return super().invoke(ctx)
         except (click.ClickException, click.exceptions.Exit, click.Abort):
@@ -106,13 +104,13 @@ def installed_interfaces() -> list[importlib.metadata.EntryPoint]:
 def loaded_interface(entry: importlib.metadata.EntryPoint) -> click.Command:
     """Import the command of an interface. Raises UsageError if its package is broken.
 
-    `--help` lists all commands: there a broken package has a line that says so.
+    `--help` lists all commands, and for a broken package a line with the error.
     """
     package = f" of {entry.dist.name}" if entry.dist is not None else ""
     try:
         command = entry.load()
         if not isinstance(command, click.Command):
-            raise TypeError(f"it is not a click command but a {type(command).__name__}")
+            raise TypeError(f"expected a click command, not a {type(command).__name__}")
     except Exception as error:  # another package can raise anything
         why = f"the interface {entry.name!r}{package} cannot be used: {error}; fix or uninstall that package"
 
@@ -124,7 +122,7 @@ def loaded_interface(entry: importlib.metadata.EntryPoint) -> click.Command:
 
 
 def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> None:
-    """Print the version and end the command, if it was asked for."""
+    """Print the version and end the command, if --version was given."""
     if asked:
         try:
             number = importlib.metadata.version("busmaster")
@@ -139,11 +137,11 @@ def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> Non
 def cli() -> None:
     """One master for many drives on one serial line.
 
-    PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E); usb:SERIAL for the USB
-    adapter with that serial number, whatever its path; socket://HOST:PORT for a serial server
-    that passes raw TCP; or rfc2217://HOST:PORT for one whose line settings are set from here.
+    PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E), or usb:SERIAL, the USB
+    adapter with that serial number. socket://HOST:PORT is a serial server with raw TCP. rfc2217://HOST:PORT is a
+    serial server whose line settings are set from here.
     A PORT that another busmaster owns is used through its owner; `busmaster status` lists those. `read`, `write`,
-    `poll` and `scan` take the address of an owner too: unix:PATH, or tcp://HOST:PORT with a token in BUSMASTER_TOKEN.
+    `poll` and `scan` accept the address of an owner too: unix:PATH, or tcp://HOST:PORT with a token in BUSMASTER_TOKEN.
     """
 
 
@@ -172,9 +170,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def print_somewhere() -> None:
-    """Replace standard output or standard error by nothing where its reader has closed it.
+    """Discard standard output or standard error if it was closed before the start.
 
-    Whoever closed it wants to hear nothing there: print would use the other.
+    Otherwise `print` would write the text for the closed stream to the other one.
     """
     if sys.stdout is None or sys.stderr is None:
         nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  it stays open as long as the process
@@ -182,7 +180,7 @@ def print_somewhere() -> None:
 
 
 def listen_quietly() -> None:
-    """Keep logs and warnings off standard error, where one line says what went wrong.
+    """Keep logs and warnings off standard error, which has one line for an error.
 
     BUSMASTER_DEBUG=1 shows them.
     """
@@ -207,22 +205,22 @@ def show_warning(
 
 
 def usage_text(error: click.UsageError) -> str:
-    """Return what is wrong, and what was meant, or else where to look."""
+    """Return the error, with the nearest option or the command's help as a hint."""
     text = error.format_message().rstrip(".").replace(". Did you mean", ": did you mean")
     text = text[:1].lower() + text[1:]
     return text if error.ctx is None or text.endswith("?") else f"{text}; see {error.ctx.command_path} --help"
 
 
 def complain(text: str, status: int) -> int:
-    """Say on one line of standard error what went wrong, and return `status`."""
+    """Print an error on one line of standard error, and return `status`."""
     note(" ".join(text.split()), Level.ERROR)
     return status
 
 
 def status_of(error: BaseException) -> int:
-    """Say in one line what went wrong, and return the status with which the process ends.
+    """Print an error on one line, and return the exit status of the process.
 
-    An error that nobody foresaw is raised again under BUSMASTER_DEBUG=1.
+    If BUSMASTER_DEBUG=1 is set, an internal error is raised again.
     """
     error = only_one(error)
     match error:
@@ -240,7 +238,7 @@ def status_of(error: BaseException) -> int:
         case BusError():
             return complain(bus_error_text(error), FAILED)
         case OSError():
-            if not can_flush():  # a full disk: Python would complain of what is still held once more at exit
+            if not can_flush():  # a full disk: Python would report the buffered bytes again at exit
                 forget_standard_output()
             what = error.strerror or str(error)
             return complain(f"{error.filename}: {what}" if error.filename else what, FAILED)
@@ -248,11 +246,11 @@ def status_of(error: BaseException) -> int:
             if os.environ.get("BUSMASTER_DEBUG"):
                 raise error
             kind = type(error).__name__
-            return complain(f"internal error: {kind}: {error}; BUSMASTER_DEBUG=1 shows where", FAILED)
+            return complain(f"internal error: {kind}: {error}; set BUSMASTER_DEBUG=1 to see where", FAILED)
 
 
 def bus_error_text(error: BusError) -> str:
-    """Return what the error says, without the command where only the node matters."""
+    """Return the text of an error, without the command if only the node matters."""
     if not isinstance(error, NoReply):
         return str(error)
     text = f"{error.label}: {error.what}" if error.label else error.what
@@ -262,7 +260,7 @@ def bus_error_text(error: BusError) -> str:
 
 
 def only_one(error: BaseException) -> BaseException:
-    """Take an error out of a task group's wrapping: the first that says something, Ctrl-C before all."""
+    """Unwrap the errors of a task group: Ctrl-C if it is among them, otherwise the first one with a text."""
     while isinstance(error, BaseExceptionGroup):
         interrupts = error.subgroup(KeyboardInterrupt)
         error = (interrupts or error).exceptions[0]
@@ -270,7 +268,7 @@ def only_one(error: BaseException) -> BaseException:
 
 
 def can_flush() -> bool:
-    """Flush standard output, and tell whether that worked."""
+    """Flush standard output, and return whether that worked."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -279,9 +277,9 @@ def can_flush() -> bool:
 
 
 def forget_standard_output() -> None:
-    """Point standard output at nothing: what is left unsaid must not complain at exit.
+    """Redirect standard output to /dev/null, so that Python does not report the unwritten rest at exit.
 
-    Whoever read it has gone, which is no error.
+    The reader has closed the pipe, which is not an error.
     """
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, sys.stdout.fileno())

@@ -24,12 +24,12 @@ NOT_THE_FILES = (
     *("capture", "capture_files", "capture_mb", "verify", "as_json"),
     *("items", "output", "dry_run", "yes", "enabled", "undo", "within", "at_least"),
 )
-"""Options that say nothing of a line, and stand beside a LINE.toml."""
+"""Options that do not describe a line, and are permitted with a LINE.toml."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A PORT and how to speak on it, as the options say. Nothing is opened."""
+    """A PORT and the protocol and settings given by the options. Nothing is opened."""
 
     port: str
     protocol: str
@@ -53,14 +53,14 @@ class Connection:
 
     @property
     def timings(self) -> Timings | Learned | None:
-        """The timings that the options say; None leaves the protocol's."""
+        """The timings given by the options; None for those of the protocol."""
         if self.timeout is None or isinstance(self.timeout, Learned):
             return self.timeout
         return self.profile.timings.with_window(self.timeout)
 
     @property
     def max_reply_delay(self) -> float:
-        """The seconds after which nothing comes any more, as the options say, else the protocol."""
+        """Maximum reply delay in seconds, from the options, by default the protocol's."""
         return (documented(self.timings) or self.profile.timings).read.max_reply_delay
 
     def endpoint(self) -> SerialPort | TcpPort:
@@ -104,7 +104,7 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How what is polled is shown: for so many seconds or until Ctrl-C, as JSON, as plain lines, or on the screen."""
+    """How polled values are shown: until a time or Ctrl-C, as JSON, as plain lines, or on the screen."""
 
     seconds: float | None = None
     as_json: bool = False
@@ -112,7 +112,7 @@ class View:
     read_only: bool = False
     """No key of the screen writes."""
     silent: bool = False
-    """Nothing is shown; what matters is told on standard error."""
+    """Show no values; report important events on standard error."""
 
 
 def line_settings(profile: Profile, baud: int | None) -> LineSettings:
@@ -123,7 +123,7 @@ def line_settings(profile: Profile, baud: int | None) -> LineSettings:
 def only_address(profile: Profile) -> int:
     """Return the one address of a protocol without addresses. Raises UsageError for one that has them."""
     if profile.addressed:
-        raise click.UsageError(f"{profile.name} needs a node: one of {span(profile)}")
+        raise click.UsageError(f"{profile.name} needs a node address, {span(profile)}; none was given")
     return profile.addresses[0]
 
 
@@ -133,7 +133,7 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
     Raises UsageError for one that the protocol cannot have, and for any where it has no addresses.
     """
     if not profile.addressed:
-        raise click.UsageError(f"{profile.name} has no addresses: one drive a line, named without a node")
+        raise click.UsageError(f"{profile.name} has no node addresses (one drive per line); leave out the node")
     for node in nodes:
         parsed(profile.check_address, node)
     return tuple(nodes)
@@ -142,12 +142,12 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
 def single_nodes(profile: Profile, nodes: Sequence[int]) -> tuple[int, ...]:
     """Return the nodes that were given. Raises UsageError as `checked`, and for the address that means all nodes."""
     if profile.broadcast in nodes:
-        raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
+        raise click.UsageError(f"{profile.name}: {profile.broadcast} is the broadcast address; name a single node")
     return checked(profile, nodes)
 
 
 def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the addresses to ask: those of --nodes, else all. Raises UsageError for one that no node can have."""
+    """Return the addresses of --nodes, by default all. Raises UsageError for an address that is not possible."""
     return tuple(profile.addresses) if nodes is None else single_nodes(profile, nodes)
 
 
@@ -159,7 +159,7 @@ def span(profile: Profile) -> str:
 def connected(command: F, *, or_file: bool = False, port: bool = True) -> F:
     """Give a command PORT, --protocol and the options of a port, as one `Connection` named `connection`.
 
-    `or_file`: PORT may be a LINE.toml, which says all of that; `connection.protocol` is then "". Without `port` the
+    `or_file`: PORT may be a LINE.toml, which defines all of that; `connection.protocol` is then "". Without `port` the
     command has no PORT of its own, and `connection` is a function that returns the connection for one.
     """
 
@@ -180,7 +180,7 @@ def connected(command: F, *, or_file: bool = False, port: bool = True) -> F:
             if or_file and is_line_file(port):
                 spoken = none_but_the_files(port)
             elif protocol is None:
-                raise click.UsageError("say what is spoken there: --protocol P, or a LINE.toml in place of the port")
+                raise click.UsageError("protocol missing; use --protocol P, or a LINE.toml instead of the port")
             else:
                 spoken = protocol
             own = take_options(handle_options(), spoken, dict(given))
@@ -192,17 +192,17 @@ def connected(command: F, *, or_file: bool = False, port: bool = True) -> F:
         *([click.argument("port", metavar="PORT|LINE.toml" if or_file else "PORT")] if port else []),
         protocol_option(required=not or_file),
         click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default."),
-        click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),
+        click.option("--echo", is_flag=True, help="The adapter receives its own transmissions (two-wire)."),
         click.option(
             "--timeout",
             type=option_type(parse_window),
             metavar="MS",
             help="The reply window, in milliseconds; or `learned`, from the replies.",
         ),
-        click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again."),
+        click.option("--retries", type=Whole(min=0), metavar="N", help="How many times a failed read is repeated."),
         capture_option,
     )
-    for option in reversed(options):  # the help lists first what was put on last
+    for option in reversed(options):  # the help lists the option first that was added last
         gathered = option(gathered)
     return gathered  # type: ignore[return-value]  # the decorated function takes more than the one it wraps
 
@@ -214,7 +214,7 @@ def none_but_the_files(path: str) -> str:
         name = parameter.name or ""
         said = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         if said and isinstance(parameter, click.Option) and name not in NOT_THE_FILES:
-            raise click.UsageError(f"{path} says what is on the line: leave out {parameter.opts[0]}")
+            raise click.UsageError(f"{path} already defines the line; leave out {parameter.opts[0]}")
     return ""
 
 
@@ -225,7 +225,7 @@ def viewed(command: F) -> F:
     def gathered(seconds: float | None, as_json: bool, plain: bool, read_only: bool, **options: Any) -> Any:
         return command(view=View(seconds, as_json, plain, read_only), **options)
 
-    read_only = click.option("--read-only", is_flag=True, help="No key, MQTT command or program writes to a node.")
+    read_only = click.option("--read-only", is_flag=True, help="Reject writes from keys, MQTT commands and programs.")
     for option in (read_only, plain_option, json_option, seconds_option):
         gathered = option(gathered)
     return gathered  # type: ignore[return-value]  # likewise
@@ -238,5 +238,5 @@ nodes_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 plain_option = click.option("--plain", is_flag=True, help="Plain lines on a terminal too.")
 seconds_option = click.option(
-    "--seconds", type=option_type(parse_seconds), metavar="S", help="End by itself after so many seconds."
+    "--seconds", type=option_type(parse_seconds), metavar="S", help="End after this many seconds."
 )

@@ -1,4 +1,4 @@
-"""The audit log on standard error: for systemd's journal, or whoever reads there."""
+"""The audit log on standard error, for systemd's journal or another reader."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from busmaster.app.cli.output import Level, note
 NAME = "busmaster.audit"
 TICK = 0.05
 MOST_WAITING_ENTRIES = 1_000
-"""Lines that may wait for a standard error from which nobody takes them."""
+"""Maximum number of lines that wait while standard error is blocked."""
 FAREWELL = 2.0
 """Seconds in which it is to take the rest, at the end."""
 
 
 class AuditLog(logging.Handler):
-    """Prints what comes to the log "busmaster.audit", in `with`, in a thread of its own: it never holds up the line.
+    """Print the records of the log "busmaster.audit", in `with`, in a thread of its own: it never delays the line.
 
-    `is_free` says whether a line may be printed now; where a live view is drawn, it may not.
+    `is_free` returns whether a line may be printed now; not while a live view is drawn.
     """
 
     def __init__(self, is_free: Callable[[], bool]) -> None:
@@ -29,7 +29,7 @@ class AuditLog(logging.Handler):
         self._is_free = is_free
         self._log = logging.getLogger(NAME)
         self._level_before = self._log.level
-        self._waiting: deque[tuple[str, Level]] = deque()  # loop and thread share it: what they do with it is atomic
+        self._waiting: deque[tuple[str, Level]] = deque()  # loop and thread share it: its operations are atomic
         self._lost = 0
         self._stop = threading.Event()
         # a daemon: a standard error that takes nothing must not keep the process from ending
@@ -67,5 +67,5 @@ class AuditLog(logging.Handler):
             while self._waiting:
                 note(*self._waiting.popleft())
             if (lost := self._lost) > told:
-                note(f"audit: {lost - told} writes are not listed here: nobody took the lines", Level.WARNING)
+                note(f"audit: {lost - told} writes are not listed here; standard error was blocked", Level.WARNING)
                 told = lost

@@ -68,50 +68,57 @@ HEAD = ("LATENCY, ms", "COUNT", "MEAN", *FIGURES)
     "--every",
     type=option_type(parse_seconds),
     metavar="S",
-    help="Each caller reads once in so many seconds; without it, as soon as it has its value.",
+    help="Seconds from read to read of each caller; by default each reads again as soon as it has its value.",
 )
 @click.option(
     "--priorities",
     type=option_type(parse_priorities),
     metavar="NAME=N,...",
-    help="The classes of the reads and how often each is drawn, like command=8,urgent=1; command alone by default.",
+    help="Priorities of the reads and their relative frequency, like command=8,urgent=1; by default only command.",
 )
 @click.option(
     "--period",
     type=option_type(parse_seconds),
     metavar="S",
-    help="A poll group reads one value of each node once in so many seconds, beside the callers.",
+    help="Add a poll group with one value of each node, and this period in seconds.",
 )
 @click.option(
     "--items",
     type=option_type(parse_items),
     metavar="ITEM,ITEM...",
-    help="What to read; the protocol's probe and sync reads by default.",
+    help="Items to read; by default the protocol's probe and sync reads.",
 )
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option(
     "--reply-delay",
     type=option_type(Delay.parse),
     metavar="MS[-MS]",
-    help="Of the emulated nodes, from a request to its reply, in milliseconds; 2 by default.",
+    help="Reply delay of the emulated nodes, in milliseconds; 2 by default.",
 )
 @click.option(
     "--fault",
     "faults",
     multiple=True,
     metavar="NAME=VALUE",
-    help=f"What goes wrong with every emulated node, like lost=0.1. Again for more. One of {' '.join(NAMES)}.",
+    help=f"Fault of every emulated node, like lost=0.1. Repeatable. One of {' '.join(NAMES)}.",
 )
-@click.option("--seed", type=int, metavar="N", default=1, show_default=True, help="Makes what is random repeatable.")
+@click.option(
+    "--seed",
+    type=int,
+    metavar="N",
+    default=1,
+    show_default=True,
+    help="Seed of all random numbers, for a repeatable run.",
+)
 @click.option("--virtual", is_flag=True, help="Emulate in virtual time: the same result each time, on any machine.")
-@click.option("--echo", is_flag=True, help="The adapter of PORT hears what it sends (two-wire).")
+@click.option("--echo", is_flag=True, help="The adapter of PORT receives its own transmissions (two-wire).")
 @click.option(
     "--timeout",
     type=option_type(parse_window),
     metavar="MS",
     help="The reply window, in milliseconds; or `learned`, from the replies.",
 )
-@click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again.")
+@click.option("--retries", type=Whole(min=0), metavar="N", help="How many times a failed read is repeated.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object, for --compare.")
 @click.option(
     "--plot",
@@ -126,24 +133,24 @@ HEAD = ("LATENCY, ms", "COUNT", "MEAN", *FIGURES)
     type=option_type(Budget.parse),
     metavar="FIGURE=LIMIT",
     help="Exit with 1 if a figure is above its limit in milliseconds, like p99=20, urgent.max=15, 5.p99.9=40, "
-    "cycle.p99=90; errors=0 and missed=0 are counts; p99=1.2x, with --compare, is a multiple. Again for more.",
+    "cycle.p99=90; errors=0 and missed=0 are counts; p99=1.2x, with --compare, is a multiple. Repeatable.",
 )
 @click.option(
     "--compare", nargs=2, metavar="A.json B.json", help="Measure nothing: print the ratio of B to A. Budgets are for B."
 )
 @click.pass_context
 def command(context: click.Context, /, **given: Any) -> int:
-    """Measure how long reads take from the call to the value, and how much of what the wire allows is reached.
+    """Measure how long reads take from the call to the value, and how much of the wire's limit is reached.
 
     Without a PORT the line is emulated, on a pseudo-terminal in a process of its own or, with --virtual, in virtual
-    time; node 1 alone unless --nodes names others. A PORT is only read from, never written to, and must not be in use.
+    time; with node 1 only, unless --nodes names others. On a PORT nothing is written. It must not be in use.
 
     Callers read one after another, of all nodes in turn if there are fewer callers than nodes. A latency is the time
-    from when the read was due, or called, until the caller has its value. Failed reads are counted by kind of error and
-    have no latency. The limit of the wire is what the bits of these exchanges and the reply delay alone take; on a PORT
-    the reply delay is the median of those observed.
+    from the time at which the read was due, or called, until the caller has its value. Failed reads are counted by
+    error and have no latency. The limit of the wire follows from the bits of these exchanges and the reply delay. On a
+    PORT, the reply delay is the median of those observed.
 
-    The exit status is 1 if a budget is exceeded, or no value came. Ctrl-C prints what was measured so far.
+    The exit status is 1 if a budget is exceeded, or no value was received. Ctrl-C prints the result so far.
     """
     if given["compare"]:
         first, second = given["compare"]
@@ -152,13 +159,13 @@ def command(context: click.Context, /, **given: Any) -> int:
 
 
 class Run:
-    """One measurement, as the options say. Raises UsageError and InvalidCommand before anything is opened."""
+    """One measurement, defined by the options. Raises UsageError and InvalidCommand before anything is opened."""
 
     def __init__(self, given: dict[str, Any]) -> None:
         self.port: str | None = given["port"]
         protocol: str | None = given["protocol"]
         if protocol is None:
-            raise click.UsageError("name what to measure: --protocol P, or --compare A.json B.json")
+            raise click.UsageError("nothing to measure; use --protocol P, or --compare A.json B.json")
         self._check_options(given)
         self.as_json: bool = given["as_json"]
         self.picture: str | None = given["picture"]
@@ -192,14 +199,16 @@ class Run:
         """Raise UsageError for an option of the other kind of line."""
         if self.port is None:
             if given["echo"]:
-                raise click.UsageError("--echo is for a PORT")
+                raise click.UsageError("--echo needs a PORT; leave it out for an emulated line")
             return
         if is_served(self.port):
-            raise click.UsageError(f"{self.port} is a line of another program, and its owner's reads would count too")
+            raise click.UsageError(
+                f"{self.port} is a line of another program, whose reads would distort the result; stop it first"
+            )
         wrong = {"virtual": "--virtual", "reply_delay": "--reply-delay", "faults": "--fault"}
         for name, option in wrong.items():
             if given[name]:
-                raise click.UsageError(f"{option} is for an emulated line: leave out the PORT, or {option}")
+                raise click.UsageError(f"{option} needs an emulated line; leave out the PORT, or {option}")
 
     def _check_budgets(self) -> None:
         """Raise UsageError for a budget of something that is not measured."""
@@ -207,15 +216,17 @@ class Run:
         known += [CYCLE] if self.workload.period is not None else []
         for budget in self.budgets:
             if budget.relative:
-                raise click.UsageError(f"budget {budget}: a multiple such as {budget.limit:g}x is for --compare")
+                raise click.UsageError(
+                    f"budget {budget}: a multiple ({budget.limit:g}x) needs --compare; use milliseconds"
+                )
             parsed(partial(check_scope, budget), known)
 
     def result(self) -> int:
-        """Measure, print what was measured, also if it was ended before its time, and return the exit status."""
+        """Measure, print the result, also if it was interrupted, and return the exit status."""
         with ExitStack() as lines:
             measurement = self._measurement(lines)
             if not self.virtual:
-                note(f"measuring for {self.workload.seconds:g} s; Ctrl-C ends it and prints what was measured")
+                note(f"measuring for {self.workload.seconds:g} s; Ctrl-C ends it and prints the result so far")
             try:
                 until_ended(measurement.run, loop_factory=VirtualTimeLoop if self.virtual else None)
             finally:
@@ -257,7 +268,7 @@ class Run:
     def _status(self, report: BenchReport) -> int:
         status = tell_excess(report.exceeded(self.budgets))
         if not report.values:
-            note("no value came", Level.ERROR)
+            note("no value was received; check the port, the protocol and the nodes", Level.ERROR)
             return FAILED
         return status
 
@@ -269,11 +280,11 @@ def tell_excess(texts: Sequence[str]) -> int:
     return FAILED if texts else OK
 
 
-# what is printed
+# the report
 
 
 def page(report: BenchReport) -> Iterator[str]:
-    """Yield the lines of a report: what was measured, percentiles, the histogram, the share of the wire's limit."""
+    """Yield the lines of a report: workload, percentiles, histogram, share of the wire's limit."""
     yield head(report)
     yield work(report)
     rows = [HEAD, *(row(name, times) for name, times in distributions(report))]
@@ -301,10 +312,10 @@ def head(report: BenchReport) -> str:
 
 
 def work(report: BenchReport) -> str:
-    """Return what was requested of it."""
+    """Return the workload as text."""
     load = report.workload
     callers = len(load["nodes"]) if load["callers"] is None else load["callers"]
-    every = "as fast as values come" if load["every"] is None else f"once in {load['every']:g} s"
+    every = "without pauses" if load["every"] is None else f"once in {load['every']:g} s"
     shares = ", ".join(f"{name} {share}" for name, share in load["priorities"].items())
     group = "no poll group" if load["period"] is None else f"a poll group every {load['period']:g} s"
     return f"{callers} caller{'' if callers == 1 else 's'}, each {every} ({shares}); {group}; seed {load['seed']}"
@@ -346,7 +357,7 @@ def compare(context: click.Context, first: str, second: str, budgets: Sequence[B
     for parameter in context.command.get_params(context):
         said = parameter.name and context.get_parameter_source(parameter.name) is click.core.ParameterSource.COMMANDLINE
         if said and parameter.name not in ("compare", "budgets", "as_json"):
-            raise click.UsageError(f"--compare measures nothing: leave out {parameter.human_readable_name}")
+            raise click.UsageError(f"--compare does not measure; leave out {parameter.human_readable_name}")
     before, after = read_report(first), read_report(second)
     excess = after.exceeded(budgets, before=before)  # first: a budget of something that is not measured is wrong usage
     found = ratios(before, after)

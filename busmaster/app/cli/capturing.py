@@ -16,7 +16,7 @@ from busmaster.capture import COUNT, SIZE, Recorder
 F = TypeVar("F", bound=Callable[..., Any])
 MEGABYTE = 1_000_000
 LIMITS = "busmaster.capture"
-"""Where the command's context keeps what is said of a capture beside its name."""
+"""Key of the capture's further options in the command's context."""
 
 
 def _limit(name: str, metavar: str, default: int, text: str) -> Callable[[F], F]:
@@ -40,18 +40,18 @@ def _keep(context: click.Context, option: click.Parameter, value: int) -> None:
 def capture_option(command: F) -> F:
     """Give a command `capture`, the path or None; its limits reach `capturing` by the command's context."""
     options = (
-        _limit("--capture-files", "N", COUNT, "Keep so many files of the capture, the newest."),
+        _limit("--capture-files", "N", COUNT, "Keep only this many files of the capture, the newest."),
         _limit(
             "--capture-mb",
             "MB",
             SIZE // MEGABYTE,
-            "Begin the next file of the capture, FILE-2 and so on, after so many megabytes.",
+            "Begin the next file of the capture (FILE-2 and so on) after this many megabytes.",
         ),
         click.option(
             "--capture",
             type=click.Path(dir_okay=False),
             metavar="FILE",
-            help="Record the line: a pcapng file for Wireshark, or for busmaster replay. None is overwritten.",
+            help="Record the line to a pcapng file, for Wireshark or busmaster replay. Existing files are kept.",
         ),
     )
     for option in options:
@@ -63,9 +63,8 @@ def capture_option(command: F) -> F:
 def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = False) -> Iterator[Recorder | None]:
     """Yield a recorder to be the bus's tap, or None without a path.
 
-    Enter it outside the loop: leaving waits for the disk. What it is named, and what could not be recorded, is said on
-    standard error: at once, or at the end where a live view may be drawn. Raises UsageError if the file cannot be
-    written at all.
+    Enter it outside the loop: leaving waits for the disk. The file's name and the number of lost events are printed on
+    standard error: at once, or at the end if a live view may be drawn. Raises UsageError if the file cannot be written.
     """
     if path is None:
         yield None
@@ -87,7 +86,7 @@ def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = F
     except OSError as error:
         raise click.UsageError(f"--capture {path}: {error.strerror}") from None
     if recorder.path != path:
-        note(f"{path} is there already: the capture goes to {recorder.path}")
+        note(f"{path} exists; the capture goes to {recorder.path}")
     try:
         with recorder:
             yield recorder
@@ -95,6 +94,6 @@ def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = F
         for text in held:
             note(text)
     if recorder.error is not None:
-        note(f"the capture ends early: {recorder.path}: {recorder.error.strerror}")
+        note(f"capture stopped: {recorder.path}: {recorder.error.strerror}")
     if recorder.dropped:
         note(f"the capture lacks {recorder.dropped} events, which could not be written in time")

@@ -13,14 +13,14 @@ from busmaster.app.service.picture import OLD_AFTER, Frame, Group, Node, Row
 
 BARS = "▁▂▃▄▅▆▇█"
 RIPPLE = 0.1
-"""Of a value: what varies by less is no trend."""
+"""Relative change of a value below which no trend is drawn."""
 GAUGE = 20
 BUSY = 0.9
-"""Of the line's time: beyond it, little is left for what comes."""
+"""Share of the line's time above which little is left for further requests."""
 LEAST = 1e-3
 """Numbers below it are written with an exponent where they are too long."""
 COLUMNS = {"NODE": 9, "ITEM": 14, "": 1, "VALUE": 11, "UNIT": 5}
-"""With a space between them and what must be there, HEALTH and AGE, these are the 60 columns of a small terminal."""
+"""Together with HEALTH and AGE, and a space between columns, they fill the 60 columns of a small terminal."""
 LAST = {"AGE": 5, "HEALTH": 9}
 MORE = {"TREND": 8, "P50ms": 5}
 """What a wider terminal has besides."""
@@ -34,7 +34,7 @@ STYLES = {
     "down": "bold reverse",
     "offline": "bold reverse",
 }
-"""Of a health. Nothing is told by its colour alone; those that a light or a dark ground swallows are not used."""
+"""Colours of the health states. Each state also has a word. Colours that a background hides are not used."""
 MARKS = {
     "error": ("!", "bold red"),
     "high": ("↑", "bold magenta"),
@@ -154,10 +154,10 @@ def gauge_line(frame: Frame, width: int) -> Text:
         (f" {frame.utilisation:4.0%} busy", "bold magenta" if busy else ""),
         "  ",
         (frame.state, "bold reverse" if frame.state == "offline" else ""),
-        f"  {frame.backlog} waiting",
+        f"  {frame.backlog} queued",
     )
     if frame.losses:
-        line.append(f"  lost {frame.losses} time{'s' if frame.losses > 1 else ''}", "bold")
+        line.append(f"  {frame.losses} disconnect{'s' if frame.losses > 1 else ''}", "bold")
     if frame.read_only:
         line.append("  read-only")
     line.truncate(width, overflow="ellipsis")

@@ -30,11 +30,11 @@ SPEEDS = (25.0, -40.0, 60.0, 0.0, 80.0, -15.0, 40.0)
 @seconds_option
 @plain_option
 def command(seconds: float | None, plain: bool) -> int:
-    """Emulate a line with eight drives in a process of its own, poll it live and command it meanwhile.
+    """Emulate a line with eight drives in a process of its own, poll it live and send commands.
 
-    Controllers (nodes 1 to 3) move their axes, MicroFlex drives (4 to 8) get a new speed reference now and then, and
-    node 7 loses its wire for some seconds: for about a second, until it is known to be down, cycles are missed.
-    Nothing is connected or listened to. Ctrl-C ends it.
+    Controllers (nodes 1 to 3) move their axes. MicroFlex drives (4 to 8) get a new speed reference now and then.
+    Node 7 is disconnected for some seconds. Cycles are missed for about a second, until the node is down. No port of
+    this machine is used. Ctrl-C ends it.
     """
     view = View(seconds=seconds, plain=plain)
     with ExitStack() as lines:  # a terminal that is taken is kept: else the next one would be the same
@@ -62,7 +62,7 @@ def emulated_line() -> Iterator[str]:
         try:
             path = process.stdout.readline().strip()
             if not path:
-                raise click.ClickException("the emulated line did not start")
+                raise click.ClickException("the emulated line did not start; its error is printed above")
             yield path
         finally:
             process.stdin.close()
@@ -83,7 +83,7 @@ async def demo(path: str, view: View) -> int:
 
 
 def devices(bus: Bus) -> tuple[list[MicroFlexDrive], list[Point[float]]]:
-    """Return the drives of the line, and what is polled of these and of the controllers."""
+    """Return the drives of the line, and the points that are polled on drives and controllers."""
     axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
     drives = [MicroFlexDrive(bus, address) for address in DRIVES]
     points = [point for axis in axes for point in (axis.position, axis.velocity)]
@@ -104,9 +104,9 @@ async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:
 
 
 async def attempt(watch: Watch, drive: MicroFlexDrive, order: Callable[..., Awaitable[object]], *values: float) -> bool:
-    """Give a drive one order, and tell whether it took it.
+    """Send one command to a drive, and return whether it succeeded.
 
-    An order that goes wrong is an event to show: the demo goes on.
+    A failed command is shown as an event; the demo continues.
     """
     try:
         await order(*values)

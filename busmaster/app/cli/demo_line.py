@@ -39,7 +39,7 @@ def make_line(seed: int = 1) -> Line:
 
 
 def input_ended(within: float) -> bool:
-    """Wait so many seconds for the end of standard input, and tell whether it came."""
+    """Wait this many seconds for the end of standard input, and return whether it was reached."""
     readable, _, _ = select.select([sys.stdin], (), (), within)
     return bool(readable) and not os.read(sys.stdin.fileno(), 1)
 

@@ -20,7 +20,7 @@ QUALITIES = {"late": "came late", "stale": "older than a write to it"}
 def details_text(
     row: Row, node: Node | None, group: Group | None, told: Mapping[str, Any], frame: Frame | None, width: int
 ) -> Text:
-    """Return what is known of a point, for `width` columns. `told` is what the line's owner says of it."""
+    """Return the details of a point, for `width` columns. `told` is the description from the line's owner."""
     lines = [Text(f"{row.name}  ({row.key})", "bold")]
     facts = _facts(row, node, group, made_printable(dict(told)), frame)
     lines += [Text.assemble((f"{name:<9}", "bold"), text) for name, text in facts]
@@ -40,12 +40,12 @@ def _facts(
     row: Row, node: Node | None, group: Group | None, told: Mapping[str, Any], frame: Frame | None
 ) -> Iterator[tuple[str, str]]:
     value = f"{value_text(row.value, row.precision)} {row.unit}".rstrip()
-    age = f", asked for {age_text(frame.now - row.asked)} ago" if frame and row.asked is not None else ""
+    age = f", requested {age_text(frame.now - row.asked)} ago" if frame and row.asked is not None else ""
     yield "value", value + (f", {QUALITIES[row.quality]}" if row.quality in QUALITIES else "") + age
     if row.alarm:
         yield (
             "alarm",
-            f"the bit is {row.alarm}" if row.alarm in ("set", "clear") else f"it has left its {row.alarm} limit",
+            f"the bit is {row.alarm}" if row.alarm in ("set", "clear") else f"value beyond its {row.alarm} limit",
         )
     if row.error:
         yield "error", f"{row.error}; {told['hint']}" if told.get("hint") else row.error
@@ -84,7 +84,7 @@ def _exchange_text(times: Mapping[str, Any]) -> str:
     queued, started = times["queued"], times["started"]
     attempts = times["attempts"]
     if started is None:
-        return f"{attempts} attempts, none answered" if attempts else "not sent"
+        return f"{attempts} attempts, no reply" if attempts else "not sent"
     parts = [f"waited {_ms(started - queued)}"]
     if times["exchanges_ahead"]:
         parts[0] += f" behind {times['exchanges_ahead']}"

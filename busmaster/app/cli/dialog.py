@@ -1,4 +1,4 @@
-"""The questions of the screen, and what it shows on demand, at the foot of the picture."""
+"""The dialogs of the screen, at its bottom: questions, and texts that the user requested."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Dialog .box { width: 100%; height: auto; max-height: 100%; border: round ansi_de
 Dialog Static { color: ansi_default; background: ansi_default; width: 1fr; }
 Dialog Input { border: none; height: 1; padding: 0; background: ansi_default; color: ansi_default; }
 """
-"""Of the dialogs, behind what the screen says of all its parts."""
+"""Style sheet of the dialogs, which follows that of the screen."""
 
 
 class Dialog(ModalScreen[T]):
@@ -31,12 +31,12 @@ class Dialog(ModalScreen[T]):
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "leave", show=False)]
 
     def action_leave(self) -> None:
-        """End it without an answer."""
+        """Close the dialog without a result."""
         self.dismiss(None)
 
 
 class AskYes(Dialog[bool]):
-    """Asks whether something is meant. Its result is True for yes, else None."""
+    """Request a confirmation. The result is True for yes, else None."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("y", "agree", show=False),
@@ -57,7 +57,7 @@ class AskYes(Dialog[bool]):
 
 
 class AskValue(Dialog[str]):
-    """Asks for a value of `name`, then whether to write it. Its result is the value, or None for no."""
+    """Request a value for `name`, then a confirmation. The result is the value, or None for no."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "leave", show=False),
@@ -73,11 +73,11 @@ class AskValue(Dialog[str]):
     def compose(self) -> ComposeResult:
         with Vertical(classes="box"):
             unit = f" in {self.unit}" if self.unit else ""
-            yield Static(Text(f"write {self.asked}{unit}  (Enter; Esc leaves it)"), id="question")
+            yield Static(Text(f"write {self.asked}{unit}  (Enter; Esc cancels)"), id="question")
             yield Input(placeholder="value")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Take the value and ask whether it is meant, or say why it is no number."""
+        """Accept the value and request a confirmation, or show why it is not a number."""
         event.stop()
         if not event.value.strip():
             return
@@ -85,7 +85,7 @@ class AskValue(Dialog[str]):
         try:
             parse_value(event.value)
         except InvalidCommand as error:
-            question.update(Text(f"write {self.asked}: {error}  (Enter; Esc leaves it)"))
+            question.update(Text(f"write {self.asked}: {error}  (Enter; Esc cancels)"))
             return
         self.value = event.value.strip()
         event.input.remove()
@@ -98,7 +98,7 @@ class AskValue(Dialog[str]):
 
 
 class AskWords(Dialog[str]):
-    """Asks for the words of which rows are shown. Its result is these; None leaves them as they are."""
+    """Request the words of the row filter. The result is the words; None for no change."""
 
     def __init__(self, words: str) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class AskWords(Dialog[str]):
 
 
 class Show(Dialog[None]):
-    """Shows a text, which may change, until a key is pressed that says so."""
+    """Show a text, which may change, until one of its keys is pressed."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("enter,space,q,question_mark", "leave", show=False),

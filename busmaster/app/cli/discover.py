@@ -33,43 +33,47 @@ USUAL = LineSettings(9600)
 
 @dataclass(frozen=True, slots=True)
 class Errand:
-    """What is to be done: on which port, and what is tried."""
+    """The port of a search and the steps to try."""
 
     port: SerialPort | TcpPort
     tried: Sequence[Step]
 
 
-@click.command(short_help="Find out what is on an unknown cable.")
+@click.command(short_help="Identify the nodes on an unknown line.")
 @click.argument("port")
-@click.option("--yes", is_flag=True, help="Send without asking first.")
-@click.option("-o", "--output", metavar="LINE.toml", help="Write what was found there; to standard output by default.")
+@click.option("--yes", is_flag=True, help="Send without a question.")
+@click.option(
+    "-o", "--output", metavar="LINE.toml", help="Write the result to this file; by default to standard output."
+)
 @click.option(
     "--protocol",
     "names",
     multiple=True,
     type=click.Choice(list(kinds())),
     metavar="P",
-    help="Try this protocol alone (or these: may be given again); all by default.",
+    help="Try only this protocol. Repeatable. All by default.",
 )
 @nodes_option
 @capture_option
 def command(
     port: str, yes: bool, output: str | None, names: tuple[str, ...], nodes: tuple[int, ...] | None, capture: str | None
 ) -> int:
-    """Find out at which rate, in which framing and which protocols the nodes on PORT speak; write a LINE.toml for them.
+    """Find the baud rate, framing and protocols of the nodes on PORT, and write a LINE.toml for them.
 
-    It says what it will try and how long that takes, and asks before it does. It listens first, and sends nothing where
-    somebody else talks. Nothing but reads is sent. Nodes 1 to 8 are asked unless --nodes names others. If one answers,
-    all other addresses of its protocol are asked too, and what was not asked is printed. A baud rate in PORT
-    (`?baudrate=9600`) is the only one that is tried, and with a framing (`&bytesize=7&parity=E`) that too.
+    The command prints its steps and their duration, and requests a confirmation. It listens first, and sends nothing if
+    another master is active. It sends only reads. Nodes 1 to 8 are tried unless --nodes names others. If one replies,
+    all other addresses of its protocol are tried too, and the addresses that were not tried are printed. A baud rate in
+    PORT (`?baudrate=9600`) is the only one that is tried, and so is a framing with it (`&bytesize=7&parity=E`).
     """
     errand = Errand(*parsed(lambda text: what_to_try(text, names, nodes), port))
     if output is not None and Path(output).exists():
-        raise click.UsageError(f"{output} is there already, and not overwritten: choose another name")
+        raise click.UsageError(f"{output} exists and is not overwritten; choose another name")
     tell_plan(errand)
     if not yes and not sys.stdin.isatty():
-        raise click.UsageError("nobody can be asked here, so nothing was sent: say --yes")
-    if not yes and not click.confirm("Send these reads, if nobody else talks there?", err=True):
+        raise click.UsageError(
+            "confirmation required, but there is no terminal; nothing was sent; use --yes to skip the question"
+        )
+    if not yes and not click.confirm("Send these reads, if no other master is active?", err=True):
         note("nothing was sent")
         return FAILED
     with capturing(capture, port=errand.port.name, protocol="", echo=errand.port.echo) as recorder:
@@ -90,9 +94,9 @@ def command(
 def what_to_try(
     port: str, names: Sequence[str], nodes: Sequence[int] | None
 ) -> tuple[SerialPort | TcpPort, Sequence[Step]]:
-    """Return the port, and what is tried there. Raises InvalidCommand."""
+    """Return the port and the steps to try there. Raises InvalidCommand."""
     if is_served(port):
-        raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
+        raise InvalidCommand(f"{port} is the line of another program; stop it, discover needs the port itself")
     wanted: Sequence[NodeKind] = list(dict.fromkeys(find(name) for name in names)) or usual_kinds()
     where = endpoint(port, defaults=USUAL)
     if isinstance(where, TcpPort) and not isinstance(where, Rfc2217Port):
@@ -104,7 +108,7 @@ def what_to_try(
 
 
 def tell_plan(errand: Errand) -> None:
-    """Say what will be tried, and for how long."""
+    """Print the steps and their duration."""
     tried = errand.tried
     settings = list(dict.fromkeys(step.settings for step in tried))
     titles = dict.fromkeys(step.kind.profile.title for step in tried)
@@ -118,25 +122,25 @@ def tell_plan(errand: Errand) -> None:
             at = f"at {len(settings)} settings of the line"
     reads = "1 read" if requests == 1 else f"{requests} reads"
     note(f"{errand.port.name}: listen for {LISTENING:g} s; then {reads}, {at}, in {', '.join(titles)}")
-    note(f"that takes {seconds(tried):.0f} s at most where nobody answers; nothing is written to any node")
+    note(f"at most {seconds(tried):.0f} s if no node replies; nothing is written to any node")
     if any(step.rest for step in tried):
-        note("if a node answers, the other addresses of its protocol are asked too")
+        note("if a node replies, the other addresses of its protocol are tried too")
 
 
 async def discover(errand: Errand, tap: Tap | None) -> Discovery | None:
-    """Listen, and look. Returns None where nothing was found or nothing was sent, having said why."""
+    """Listen, then search. Returns None, after a message, if nothing was sent or found."""
     from busmaster.app.cli.progress import Bar  # it takes a fifth of the time of --help
 
     async with opened(errand.port, tap) as wire, EnterStops() as stop:
         search = Search(wire, errand.port, note, Bar, stop.offered)
         if talk := await search.listen(errand.tried):
-            note(f"{talk}; nothing was sent. `busmaster monitor` shows it; end the other master to look for nodes")
+            note(f"{talk}; nothing was sent. `busmaster monitor` shows it; stop the other master to look for nodes")
             return None
         discovery = await search.look(errand.tried)
     if not discovery.found:
-        note("nobody answered: check power, wires A and B (swap them), termination; name nodes beyond 1-8 with --nodes")
+        note("no node replied; check power, wires A and B (swap them), termination; name nodes beyond 1-8 with --nodes")
     for name, addresses in discovery.not_asked.items():
-        note(f"not asked: {name} {ranges(addresses)}")
+        note(f"not tried: {name} {ranges(addresses)}")
     return discovery if discovery.found else None
 
 
@@ -155,14 +159,14 @@ class EnterStops:
             asyncio.get_running_loop().remove_reader(self._watched)
 
     def offered(self) -> Callable[[], bool]:
-        """Tell the user how to stop, where that is possible, and return what says whether the user has."""
+        """Print how to stop, if that is possible, and return a function that returns whether the user did."""
         if sys.stdin.isatty() and self._watched is None:
             try:
                 asyncio.get_running_loop().add_reader(sys.stdin.fileno(), self._press)
             except NotImplementedError:  # Windows: its event loop does not watch a console
                 return lambda: False
             self._watched = sys.stdin.fileno()
-            note("press Enter to stop and keep what was found")
+            note("press Enter to stop and keep the nodes found so far")
         return lambda: self._pressed
 
     def _press(self) -> None:

@@ -107,7 +107,7 @@ def action_of(target: Target, name: str) -> Action:
 def options_of(
     action: Action, name: str, values: Sequence[float], within: float | None, at_least: float | None
 ) -> dict[str, float]:
-    """Return the arguments of an action beside its numbers. Raises UsageError for what it does not take, or misses."""
+    """Return the arguments of an action beside its numbers. Raises UsageError if one is missing or unknown."""
     some = bool(action.numbers) and action.numbers[-1].endswith(MORE)
     fixed = len(action.numbers) - some
     if len(values) < fixed or (len(values) > fixed and not some):
@@ -125,7 +125,7 @@ def options_of(
 async def carry_out(
     target: Target, name: str, action: Action, values: Sequence[float], options: dict[str, float], as_json: bool
 ) -> None:
-    """Carry out an action and print that it is done. What it writes is on record where no owner keeps one."""
+    """Carry out an action and print that it is done. Its writes are recorded if no owner does so."""
     records: list[WriteRecord] = []
     audit, handle = None, target.handle
     if target.line is not None and not target.owned:
@@ -159,7 +159,7 @@ class RecordedNode(HeldNode):
         self._by = by
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Do as the node does, and keep a record of what is refused."""
+        """Check as the node does, and record rejected writes."""
         for command in commands:
             try:
                 self._node.check(command, stop=stop)
@@ -169,7 +169,7 @@ class RecordedNode(HeldNode):
 
     @asynccontextmanager
     async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
-        """Do as the node does: what is written in the sequence is on record too."""
+        """Hold the line as the node does. The writes of the sequence are recorded too."""
         async with self._node.exclusive(max_hold=max_hold) as held:
             yield RecordedNode(held, self._line, self._name, self._handle, self._by)
 
@@ -190,7 +190,7 @@ class RecordedNode(HeldNode):
             return await self._node.request(command, touches=touches, stops_seen=stops_seen, stop=stop, **options)
 
     def _wish(self, command: Command[Any]) -> Wish:
-        """Return what is on record of a write: a point and its value; of what is no point, the command."""
+        """Return the audit entry of a write: its point and value, or the command if no point matches."""
         for item in (*self._line.file.nodes[self._name].points, *self._handle.items()):
             point = self._line.point(f"{self._name}/{item}")
             if isinstance(command, Changing) and isinstance(point.command, Placed):

@@ -1,4 +1,4 @@
-"""`busmaster doctor`: what is wrong with this port, adapter or line, and what to do about it."""
+"""`busmaster doctor`: diagnosis of a port, an adapter or a line, with advice."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ FAILED = 1
 TOPIC = 10
 """Columns of a finding's topic."""
 USUAL = LineSettings(9600)
-"""What a port is opened with where neither a protocol nor the user says."""
+"""Line settings of the port if neither a protocol nor the user defines them."""
 
 
-@click.command(short_help="Find out what is wrong with a port, an adapter or a line.")
+@click.command(short_help="Diagnose a port, an adapter or a line.")
 @click.argument("port")
 @protocol_option(required=False)
 @nodes_option
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
-@click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire).")
+@click.option("--echo", is_flag=True, help="The adapter receives its own transmissions (two-wire).")
 @click.option("--timeout", type=option_type(parse_window), metavar="MS", help="The reply window, in milliseconds.")
 @json_option
 @capture_option
@@ -46,10 +46,10 @@ def command(
     as_json: bool,
     capture: str | None,
 ) -> int:
-    """Examine PORT and, with --protocol, the nodes on it. Whatever is not in order comes with what to do.
+    """Examine PORT and, with --protocol, the nodes on it. Each problem is printed with advice.
 
-    Nothing but reads is sent, and nothing at all while another program holds the port or another master is heard. All
-    addresses of the protocol are asked unless --nodes names some.
+    Only reads are sent, and nothing while another program holds the port or another master is active. All addresses of
+    the protocol are tried unless --nodes names some.
     """
     patient = patient_of(Connection(port, protocol or "", baud, echo, timeout), nodes)
     wrong = 0
@@ -69,7 +69,7 @@ def command(
 
 
 def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
-    """Return what is to be examined, as the options say. Raises UsageError."""
+    """Return the examination defined by the options. Raises UsageError."""
     from busmaster.app.cli.progress import Bar  # it takes a fifth of the time of --help
 
     if connection.protocol:
@@ -77,7 +77,7 @@ def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
         addresses = nodes_to_ask(connection.profile, nodes)
         return Patient(where, connection.protocol, documented(connection.timings), addresses, nodes is not None, Bar)
     if nodes is not None:
-        raise click.UsageError("--nodes needs a --protocol, to ask them in")
+        raise click.UsageError("--nodes needs the protocol of the nodes; add --protocol P")
     settings = USUAL if connection.baud is None else replace(USUAL, baudrate=connection.baud)
     where = parsed(lambda port: endpoint(port, defaults=settings), connection.port)
     return Patient(replace(where, echo=True) if connection.echo else where, progress=Bar)

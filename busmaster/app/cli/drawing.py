@@ -46,7 +46,7 @@ async def draw(address: str) -> int:
 
 @asynccontextmanager
 async def served_here(authorisation: Authorisation, title: str) -> AsyncIterator[Service]:
-    """Serve a line to this process's own view alone: what is not to be served to others, or cannot be."""
+    """Serve a line only to this process's own view, because other programs must not or cannot use it."""
     with tempfile.TemporaryDirectory(prefix="busmaster-") as folder:
         async with Service(
             authorisation.bus, authorisation=authorisation, path=Path(folder) / "view.sock", title=title

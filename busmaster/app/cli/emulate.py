@@ -30,28 +30,34 @@ LOOK_FOR_SIGNALS = 0.2
 
 @click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
 @file_argument(required=False)
-@protocol_option(required=False, text="One of {}; without a file.")
+@protocol_option(required=False, text="Protocol without a file. One of {}.")
 @nodes_option
 @click.option(
-    "--pty", is_flag=False, flag_value="", metavar="[LINK]", help="A pseudo-terminal (the default), and a link to it."
+    "--pty",
+    is_flag=False,
+    flag_value="",
+    metavar="[LINK]",
+    help="Use a pseudo-terminal (the default), and make this link to it.",
 )
-@click.option("--tcp", type=option_type(host_and_port), metavar="HOST:PORT", help="A TCP port; 0 picks a free one.")
+@click.option(
+    "--tcp", type=option_type(host_and_port), metavar="HOST:PORT", help="Use a TCP port; 0 selects a free one."
+)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
-@click.option("--paced", is_flag=True, help="Bytes take their time on the wire.")
+@click.option("--paced", is_flag=True, help="Simulate the transmission time of each byte.")
 @click.option(
     "--reply-delay",
     type=option_type(Delay.parse),
     metavar="MS[-MS]",
-    help="From a request to its reply, in milliseconds; 2 by default.",
+    help="Reply delay, in milliseconds; 2 by default.",
 )
 @click.option(
     "--fault",
     "faults",
     multiple=True,
     metavar="NAME=VALUE",
-    help=f"What goes wrong with every drive, like lost=0.1. Again for more. One of {' '.join(NAMES)}.",
+    help=f"Fault of every drive, like lost=0.1. Repeatable. One of {' '.join(NAMES)}.",
 )
-@click.option("--seed", type=int, metavar="N", help="Makes what is random repeatable; the file's, or 1, by default.")
+@click.option("--seed", type=int, metavar="N", help="Seed of all random numbers; the file's, or 1, by default.")
 @seconds_option
 def command(
     path: str | None,
@@ -68,14 +74,15 @@ def command(
 ) -> None:
     """Emulate the drives of a line until Ctrl-C. The first line printed is the PORT to use.
 
-    With LINE.toml all its nodes, as its [emulator] says, at its port: a TCP port of this machine, or a link to a
-    pseudo-terminal, which is never made under /dev. Without a file node 1 alone unless --nodes names others.
+    With LINE.toml, all its nodes are emulated at its port, as its [emulator] defines. The port is a TCP port of this
+    machine, or a link to a pseudo-terminal, which is never created in /dev. Without a file, the line has node 1 only,
+    unless --nodes names others.
     """
     if pty is not None and tcp is not None:
-        raise click.UsageError("either --pty or --tcp, not both")
+        raise click.UsageError("--pty and --tcp exclude each other; leave out one of them")
     if path is not None:
         if protocol is not None or nodes is not None or baud is not None:
-            raise click.UsageError("the file says protocol, nodes and baud rate")
+            raise click.UsageError("the file defines protocol, nodes and baud rate; leave out the options for these")
         file = load(path)
         if pty is None and tcp is None:
             pty, tcp = own_port(file.port)
@@ -88,9 +95,9 @@ def command(
 
 
 def serve_for(seconds: float | None) -> None:
-    """Wait so many seconds, or for ever, while the line's own thread serves it.
+    """Wait this many seconds, or forever, while the line's own thread serves it.
 
-    A signal that the system hands to that thread wakes nobody here, so that it is looked for.
+    A signal that the system delivers to that thread does not wake this one, so it is checked periodically.
     """
     end = inf if seconds is None else time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
@@ -98,8 +105,8 @@ def serve_for(seconds: float | None) -> None:
 
 
 def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: int | None, paced: bool) -> Line:
-    """Return the file's line; what the command line says goes before what the file says."""
-    ConfiguredLine(file, outputs=False)  # what is wrong in it is said here as everywhere
+    """Return the file's line. Options of the command line override the file."""
+    ConfiguredLine(file, outputs=False)  # reports faults of the file as everywhere
     line = emulated_line(file, paced=paced or None, seed=seed)
     for device in line.devices:
         device.delay = delay or device.delay
@@ -113,7 +120,7 @@ def own_port(port: SerialPort | TcpPort) -> tuple[str | None, tuple[str, int] | 
     Raises UsageError for a port of RFC 2217.
     """
     if isinstance(port, Rfc2217Port):
-        raise click.UsageError(f"{port.name}: an emulated line does not speak RFC 2217; use --tcp or --pty")
+        raise click.UsageError(f"{port.name}: an emulated line does not support RFC 2217; use --tcp or --pty")
     if isinstance(port, TcpPort):
         return None, (port.host, port.port)
     is_device = port.path.startswith(USB) or os.path.abspath(port.path).startswith("/dev/")
@@ -129,9 +136,9 @@ def drives(
     seed: int | None,
     paced: bool,
 ) -> Line:
-    """Make the line that the command line says, without a file. Raises UsageError."""
+    """Make the line that the options define, without a file. Raises UsageError."""
     if protocol is None:
-        raise click.UsageError("name a LINE.toml, or the drives: --protocol P")
+        raise click.UsageError("no drives to emulate; name a LINE.toml, or use --protocol P")
     profile = find(protocol).profile
     devices = [make_device(protocol, address, delay=delay) for address in nodes_to_emulate(profile, nodes)]
     wrong = parsed(Faults.parse, faults)
@@ -156,6 +163,6 @@ def serve(line: Line, link: str | None, address: tuple[str, int] | None) -> Line
         )
     except OSError as error:
         where = f"{address[0]}:{address[1]}" if address else link or "a pseudo-terminal"
-        hint = "use another port, or 0 for a free one" if address else "name a link that is not there yet"
+        hint = "use another port, or 0 for a free one" if address else "name a link that does not exist yet"
         what = os.strerror(error.errno) if error.errno else str(error)
         raise LineDown(f"cannot serve on {where}: {what}", hint=hint) from error

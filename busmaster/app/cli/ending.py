@@ -1,4 +1,4 @@
-"""How a command ends that is told to: a signal unwinds it, so that ports, links and files are given back."""
+"""Signals end a command in an orderly way, so that ports, links and files are released."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import click
 
 T = TypeVar("T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
-"""Those that somebody sends, and that would end the process where it stands. Not SIGABRT, by which a supervisor ends
-one that hangs: it would hang on."""
+"""Signals that users and supervisors send, and that would end the process at once. Not SIGABRT, by which a supervisor
+ends a process that hangs: it would continue to hang."""
 PATIENCE = 2.0
 
 
@@ -30,9 +30,9 @@ class Ending:
 
     def __init__(self) -> None:
         self.patience = PATIENCE
-        """Seconds in which the same wish said again is not heard: what must be done first may need longer."""
+        """Seconds in which the same signal is ignored, because the safe state may need longer."""
         self.number = 0
-        """The signal that was heard; 0 before."""
+        """The signal that was received; 0 before."""
         self._since = 0.0
         self._running = False
         self._cancel: Callable[[], object] | None = None
@@ -49,9 +49,9 @@ class Ending:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Give the signals back, unless one was heard.
+        """Restore the signal handlers, unless a signal was received.
 
-        What still comes while a process that was told to end shuts down is not heard.
+        Further signals while the process shuts down are ignored.
         """
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_IGN if self.number else handler)
@@ -89,7 +89,7 @@ class Ending:
             # threadsafe, though it is this thread: nothing else wakes a loop that waits in select
             self._cancel = lambda: loop.call_soon_threadsafe(task.cancel)
             try:
-                if self.number:  # heard while there was no task yet to cancel
+                if self.number:  # received while there was no task yet to cancel
                     raise asyncio.CancelledError
                 return await function(*arguments)
             finally:

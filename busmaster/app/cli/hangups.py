@@ -1,4 +1,4 @@
-"""SIGHUP: what ends a process that does not hear it is, to one that does, the wish to read its file again."""
+"""SIGHUP requests that a process reads its file again. By default the signal ends a process."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 
 
 class Hangups:
-    """Hears SIGHUP, in `with`: enter it before anything that takes time, as loading a file does.
+    """Handle SIGHUP, in `with`. Enter it before anything that takes time, such as loading a file.
 
-    What comes before somebody waits is not lost; several that come meanwhile are one.
+    A signal that arrives before a caller waits is kept; several count as one.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class Hangups:
         self._before: Any = None
 
     def __enter__(self) -> Hangups:
-        if threading.current_thread() is threading.main_thread():  # signals are heard nowhere else
+        if threading.current_thread() is threading.main_thread():  # Python handles signals only there
             self._before = signal.signal(signal.SIGHUP, self._hear)
         return self
 

@@ -18,13 +18,14 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 
 def interface_options(bind: str) -> Callable[[Decorated], Decorated]:
-    """Add what every interface is told: the line, where to listen (by default at `bind`), and that nothing is
-    written."""
+    """Add the options of every interface: the line, the address to listen on (by default `bind`), and --read-only."""
 
     def add(function: Decorated) -> Decorated:
         for option in (
-            click.option("--read-only", is_flag=True, help="Nobody writes through this interface."),
-            click.option("--bind", default=bind, show_default=True, metavar="HOST:PORT", help="Where it listens."),
+            click.option("--read-only", is_flag=True, help="Reject all writes through this interface."),
+            click.option(
+                "--bind", default=bind, show_default=True, metavar="HOST:PORT", help="Address and port to listen on."
+            ),
             click.argument("line", required=False, metavar="[LINE|unix:PATH|PORT]"),
         ):
             function = option(function)
@@ -42,21 +43,21 @@ def place_of(bind: str) -> tuple[str, int]:
 
 
 def following(line: str | None, *, read_only: bool) -> Following:
-    """Return what follows the line that is meant, and tells on standard error when it comes and goes, and when it may
-    only be read.
+    """Return a follower of the named line. It reports on standard error when the line connects and disconnects, and
+    whether it is read-only.
 
-    Raises UsageError where it is not clear which is meant. That it is not served yet is no error.
+    Raises UsageError if the name is ambiguous. A line that is not served yet is not an error.
     """
     token = None
     try:
         token = token_for(address_of(line))
     except LineDown as error:
-        note(f"{error}; the interface opens, and waits for it", Level.WARNING)
+        note(f"{error}; the interface starts, and waits for the line", Level.WARNING)
     followed = Following(_Meant(line), token=token, read_only=read_only)
 
     def tell() -> None:
         if isinstance(followed.state, Connected):
-            note(f"{followed.state.about['line']} is followed{', and may only be read' if followed.read_only else ''}")
+            note(f"connected to line {followed.state.about['line']}{' (read-only)' if followed.read_only else ''}")
         else:
             note(followed.state.why, Level.WARNING)
 

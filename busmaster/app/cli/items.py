@@ -17,22 +17,22 @@ from busmaster.registry import NodeKind, find
 HEAD = ("ITEM", "NUMBER", "UNIT", "ACCESS", "MEANING")
 
 
-@click.command(short_help="List what a protocol's documents name.")
+@click.command(short_help="List the items in a protocol's documents.")
 @click.argument("protocol", type=option_type(parse_protocol))
 @click.argument("words", nargs=-1, metavar="[WORD]...")
 @json_option
 def command(protocol: str, words: tuple[str, ...], as_json: bool) -> None:
-    """List what the documents name of PROTOCOL: item, number, unit, access and meaning, and the bits of words.
+    """List the items in the documents of PROTOCOL: item, number, unit, access and meaning, and the bits of words.
 
-    With WORDs only what has all of them somewhere: `busmaster items hcp2 axis0 error`. 1-99 stands for each of them.
-    Access is left blank where the documents do not say it.
+    With WORDs, only items that contain all of them are listed: `busmaster items hcp2 axis0 error`. 1-99 stands for each
+    of these items. Access is blank if the documents do not define it.
     """
     kind = find(protocol)
     found = [item for item in kind.documented if all(word.lower() in text_of(item).lower() for word in words)]
     if words and kind.documented and not found:
-        raise click.UsageError(f"{protocol} has nothing with {' '.join(words)!r}; {guess(words, kind)}")
+        raise click.UsageError(f"{protocol} has no item with {' '.join(words)!r}; {guess(words, kind)}")
     if not kind.documented:
-        note(f"{protocol}: no item has a meaning of its own; write {kind.items}")
+        note(f"{protocol}: its documents define no items; use {kind.items}")
     elif as_json:
         emit_all(json_line(**fields(item)) for item in found)
     else:
@@ -40,13 +40,13 @@ def command(protocol: str, words: tuple[str, ...], as_json: bool) -> None:
 
 
 def text_of(item: Item) -> str:
-    """Return all that is said of an item, to be searched."""
+    """Return all texts of an item, for the search."""
     bits = " ".join(f"{bit.name} {bit.severity} {bit.meaning}" for bit in item.bits)
     return f"{item.item} {item.number} {item.unit} {item.access} {item.meaning} {item.keyword} {bits}"
 
 
 def guess(words: Sequence[str], kind: NodeKind) -> str:
-    """Return words that name the item that may have been meant, or the items that there are if none is near."""
+    """Return a hint with the nearest item, or with all items if none is near."""
     return meant(words[0], (item.item for item in kind.documented))
 
 
@@ -70,7 +70,7 @@ def bit_row(bit: Bit) -> tuple[str, ...]:
 
 
 def fields(item: Item) -> dict[str, Any]:
-    """Return the item for JSON; null for what the documents do not say."""
+    """Return the item for JSON; null for unknown properties."""
     return {
         "item": item.item,
         "number": item.number or None,

@@ -1,4 +1,4 @@
-"""Nodes that answer after their reply window: the commands say so, and which window would fit."""
+"""Reports nodes that reply after their reply window, with a window that would fit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from busmaster.events import MaxReplyDelayRaised, RepliesLate
 STEP = 0.05
 """Suggested windows are multiples of this many seconds."""
 ROOM = 1.5
-"""How much longer than the late answer took they are."""
+"""Factor of the suggested window to the time of the late reply."""
 
 
 class LateNodes:
@@ -29,41 +29,41 @@ class LateNodes:
         self._ages: dict[int, tuple[str, float]] = {}
 
     async def listen(self, bus: Bus | RemoteBus) -> None:
-        """Note late answers, until cancelled."""
+        """Record late replies, until cancelled."""
         async for event in bus.events():
             if isinstance(event, MaxReplyDelayRaised | RepliesLate):
                 self._ages[event.node.address] = (event.node.label, event.age)
 
     async def explain(self, error: NoReply, max_reply_delay: float) -> None:
-        """Say in an error what to try where its node is only late. Waits as long as the answer may still come."""
+        """Add advice to an error if its node replies late. Waits as long as a reply can still arrive."""
         await anyio.sleep(max_reply_delay)
         if error.address is not None and error.address in self._ages:
             _, age = self._ages.pop(error.address)
             error.hint = advice(age)
 
     def tell(self) -> None:
-        """Print on standard error, once for each late node, what to try."""
+        """Print advice on standard error, once for each late node."""
         for label, age in self._ages.values():
             note(f"{label}: {advice(age, in_file=self._in_file)}", Level.WARNING)
         self._ages.clear()
 
 
 def advice(age: float, *, in_file: bool = False) -> str:
-    """Return what to try for a node that has answered after so many seconds: an option, or what to write `in_file`."""
+    """Return advice for a node with a reply after `age` seconds: an option, or a key of LINE.toml if `in_file`."""
     window = math.ceil(ROOM * age / STEP) * STEP
     what = f"set timing = {{ window = {window:g} }} in its section" if in_file else f"try --timeout {window * 1000:.0f}"
-    return f"it answers late, after {age * 1000:.0f} ms: {what}"
+    return f"late reply, {age * 1000:.0f} ms after the request; {what}"
 
 
 @asynccontextmanager
 async def late_nodes(bus: Bus | RemoteBus, *, in_file: bool = False) -> AsyncIterator[LateNodes]:
-    """Listen for late answers on an open bus until the end of the block, where those not told yet are told."""
+    """Record late replies on an open bus until the end of the block, which reports the remaining ones."""
     late = LateNodes(in_file=in_file)
     listening = asyncio.create_task(late.listen(bus))
-    await asyncio.sleep(0)  # it hears from now on
+    await asyncio.sleep(0)  # it listens from now on
     try:
         yield late
     finally:
-        await asyncio.sleep(0)  # it hears what came last
+        await asyncio.sleep(0)  # it receives the last events
         listening.cancel()
         late.tell()

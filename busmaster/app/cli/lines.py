@@ -16,7 +16,7 @@ from busmaster.app.outputs.distributor import Distributor
 from busmaster.app.service.record import WriteRecord
 
 PATIENCE = 5.0
-"""Seconds in which outputs are to keep a record of what was written, and what waited before it."""
+"""Seconds for the outputs to store the audit log and the data queued before it."""
 LOOK = 0.02
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -32,24 +32,24 @@ def file_argument(required: bool = True) -> Callable[[F], F]:
     )
 
 
-port_option = click.option("--port", metavar="PORT", help="Use this port in place of the file's.")
+port_option = click.option("--port", metavar="PORT", help="Use this port instead of the file's.")
 
 
 def other_port(file: LineFile, port: str | None) -> SerialPort | TcpPort | None:
     """Return the port of --port. Raises InvalidCommand.
 
-    What it leaves open of a serial line is as the file's line is. None without a --port.
+    Line settings that it does not contain are those of the file. None without a --port.
     """
     return None if port is None else endpoint(port, defaults=line_settings(file))
 
 
 def is_line_file(port: str) -> bool:
-    """Tell whether PORT is a LINE.toml that is there."""
+    """Return whether PORT is an existing LINE.toml."""
     return port.endswith(".toml") and os.path.isfile(port)
 
 
 async def keep(audit: Distributor, records: Iterable[WriteRecord]) -> None:
-    """Have the outputs of a line keep these records of what was written; one that could not is named."""
+    """Store these audit entries in the outputs of a line. Reports an output that failed."""
     audit.start(())
     for record in records:
         audit.record(record)
@@ -60,8 +60,8 @@ async def keep(audit: Distributor, records: Iterable[WriteRecord]) -> None:
     await audit.close()
     for counts in audit.statistics():
         if counts.dropped:
-            why = f": {counts.error}" if counts.error else " in time"
-            note(f"{counts.kind} could not keep the record of what was written{why}", Level.WARNING)
+            why = counts.error or f"not written within {PATIENCE:g} s"
+            note(f"{counts.kind}: the audit log is incomplete: {why}", Level.WARNING)
 
 
 __all__ = ["file_argument", "is_line_file", "keep", "load", "other_port", "port_option"]

@@ -1,4 +1,4 @@
-"""The screen: draws the picture of a line, and says to the line's owner what the person wishes."""
+"""The screen: draws the picture of a line, and sends the user's commands to the line's owner."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from busmaster.errors import BusError, InvalidCommand
 
 SUSPENDED_FOR = 60.0
 SILENT_AFTER = 2.0
-"""Seconds without a word of the line's owner after which that is said."""
+"""Seconds without a message from the line's owner before the screen reports that."""
 ASKED_EVERY = 1.0
 """Seconds between two questions for the details that are shown."""
 EVENTS = 3
@@ -52,10 +52,10 @@ HELP = """\
 Enter   details of the row: limits, last exchange, past
 /       only rows with some words: node, item, group, health
 o       order: by node, by item, oldest first, trouble first
-p P     pause the row's group, all groups; again: go on
+p P     pause the row's group, all groups; again: resume
 d D     poll the row's group now, all groups
-s       suspend the row's node, or let it go on (asks)
-w       write the row's point (asks)
+s       suspend the row's node, or resume it (confirm)
+w       write the row's point (confirm)
 q       {leave}
 Ctrl-C  the same, with exit status 130
 
@@ -78,7 +78,7 @@ class Line(Protocol):
 
 
 class Screen(App[int]):
-    """Draws `picture` whenever `take_picture` says that there is news. Its result is an exit status."""
+    """Draw `picture` whenever `take_picture` reports changes. The result is an exit status."""
 
     ENABLE_COMMAND_PALETTE = False
     CSS = f"{STYLE}{STYLE_OF_DIALOGS}"
@@ -117,7 +117,7 @@ class Screen(App[int]):
         self.foot = Static(id="foot")
         self._widths = column_widths(80)
         self._frame: Frame | None = None
-        """Of the rows that are drawn: the picture may be another's by now, who has told nothing yet."""
+        """The time base of the drawn rows: `picture` may already belong to a new owner."""
         self._of_node: Mapping[tuple[str, int], Node] = {}
         self._of_group: Mapping[str, Group] = {}
         self._due = False
@@ -146,7 +146,7 @@ class Screen(App[int]):
             self.call_later(self.draw)
 
     def draw(self) -> None:
-        """Draw all that there is."""
+        """Draw the whole screen."""
         self._due = False
         frame = self.picture.frame
         if frame is None:
@@ -203,11 +203,11 @@ class Screen(App[int]):
         return Text("\n").join(lines)
 
     def _trouble(self) -> str:
-        """Return why what is shown may be old, "" while there is news."""
+        """Return why the shown data may be old, "" if it is current."""
         silent = time.monotonic() - self.heard
         if self.away:
-            return "its owner is away"
-        return f"no news for {silent:.0f} s" if silent > SILENT_AFTER else ""
+            return "its owner is not running"
+        return f"no data for {silent:.0f} s" if silent > SILENT_AFTER else ""
 
     def _foot(self, frame: Frame) -> Text:
         width, row = self.size.width, self.table.selected
@@ -229,7 +229,7 @@ class Screen(App[int]):
     # what the person wishes
 
     def _wish(self, what: str, doing: Callable[[], Coroutine[Any, Any, None]], done: str = "") -> None:
-        """Have it done while the picture goes on, and say what became of it."""
+        """Run a command in the background, and show its result."""
 
         async def run() -> None:
             try:
@@ -255,7 +255,7 @@ class Screen(App[int]):
         self.push_screen(Show(Text(HELP.format(leave=self.leave))))
 
     def action_filter(self) -> None:
-        """Ask which rows are shown."""
+        """Open the dialog for the row filter."""
 
         def take(words: str | None) -> None:
             if words is not None:
@@ -274,7 +274,7 @@ class Screen(App[int]):
         return [group for group in self._of_group.values() if all_groups or (row and group.name == row.group)]
 
     def action_pause(self, all_groups: bool) -> None:
-        """Pause the row's group, or all groups, or go on with what is paused."""
+        """Pause the row's group or all groups, or resume the paused ones."""
         groups = self._chosen(all_groups)
         paused = not all(group.paused for group in groups)
         for group in groups:
@@ -286,15 +286,13 @@ class Screen(App[int]):
             self._wish(f"poll {group.name}", partial(self.line.demand, group.name))
 
     def action_suspend(self) -> None:
-        """Ask whether the row's node is to be suspended, or to go on."""
+        """Suspend or resume the row's node, after a confirmation."""
         row = self.table.selected
         node = self._of_node.get((row.protocol, row.address)) if row is not None else None
         if node is None:
             return
         rests = node.health == "suspended"
-        question = (
-            f"let {node.label} go on" if rests else f"suspend {node.label} for {SUSPENDED_FOR:.0f} s, all its polls"
-        )
+        question = f"resume {node.label}" if rests else f"suspend {node.label} for {SUSPENDED_FOR:.0f} s, all its polls"
 
         def take(meant: bool | None) -> None:
             if meant:
@@ -304,7 +302,7 @@ class Screen(App[int]):
         self.push_screen(AskYes(f"{question}?"), take)
 
     def action_write(self) -> None:
-        """Ask for a value of the selected point, and again whether to write it."""
+        """Write the selected point, after dialogs for the value and a confirmation."""
         row, frame = self.table.selected, self.picture.frame
         if row is None or frame is None:
             return
@@ -345,7 +343,7 @@ class Screen(App[int]):
 
 
 def keys_line(width: int, leave: str, shown: str) -> Text:
-    """Draw the keys, as many as there is room for, and what is shown of the rows."""
+    """Draw the keys, as many as there is space for, and the state of order and filter."""
     line = Text(f" {shown} " if shown else " ", "reverse" if shown else "")
     for key, label in KEYS:
         more = Text.assemble((key, "bold"), f" {leave if key == 'q' else label}  ")

@@ -15,7 +15,7 @@ from busmaster.app.line.points_taking import write_beside
 
 @click.command(short_help="Convert a file of an older version.")
 @file_argument()
-@click.option("--write", is_flag=True, help="Change the file. Without it, what would change is printed.")
+@click.option("--write", is_flag=True, help="Change the file. Without this option, the changes are only printed.")
 def command(path: str, write: bool) -> int:
     """Give each key of LINE.toml that has another name now its new name. Comments, order and values stay as they are.
 

@@ -31,33 +31,33 @@ from busmaster.ext import check_settings
 from busmaster.registry import find
 
 BEAT = 0.05
-"""Seconds from one look at the clock to the next. Two that are further apart tell that the program stood still."""
+"""Seconds between two readings of the clock. A longer gap means that the program was stopped."""
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
-@click.command(short_help="Listen to a line, and decode what passes.")
+@click.command(short_help="Listen to a line and decode its frames.")
 @click.argument("port", metavar="PORT|LINE.toml")
 @protocol_option(required=False)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @capture_option
 def command(port: str, protocol: str | None, baud: int | None, as_json: bool, capture: str | None) -> None:
-    """Decode what passes on PORT, a line a frame, until Ctrl-C. Nothing is ever sent.
+    """Decode the frames on PORT, one per line, until Ctrl-C. Nothing is ever sent.
 
-    An arrow tells who spoke, the host (->) or a node (<-); the time behind a reply is its delay. Frames are told
-    apart by what they say: a silence only ends one that was cut short.
+    An arrow shows the sender: the host (->) or a node (<-). The time after a reply is its delay. Frames are separated
+    by their content; a silence only ends an incomplete one.
 
-    With a LINE.toml, its points and outputs are fed from what its line's own master asks: a line for each value that
-    passed, or, with --json, for each group and period. The quality of these values is "overheard", never good: a
-    reply carries no address, and a listener that misses two frames can take it for another node's.
+    With a LINE.toml, its points and outputs receive the values that its line's own master reads. The command prints a
+    line for each value or, with --json, for each group and period. The quality of these values is "overheard", never
+    good: a reply contains no address, and a listener that misses two frames can attribute it to another node.
     """
     if is_line_file(port):
         if protocol is not None or baud is not None:
-            raise click.UsageError("LINE.toml says which protocol and rate it is: leave out --protocol and --baud")
+            raise click.UsageError("LINE.toml already defines protocol and baud rate; leave out --protocol and --baud")
         monitor_file(load(port), as_json, capture)
         return
     if protocol is None:
-        raise click.UsageError("say what is spoken there: --protocol P, or a LINE.toml in place of the port")
+        raise click.UsageError("protocol missing; use --protocol P, or a LINE.toml instead of the port")
     endpoint = Connection(port, protocol, baud).endpoint()
     kind = find(protocol)
     check_settings(kind.profile, endpoint)
@@ -69,7 +69,7 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
 
 
 def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
-    """Listen to the line of a file until Ctrl-C. Nothing is ever sent, whoever asks for it."""
+    """Listen to the line of a file until Ctrl-C. Nothing is ever sent."""
     protocol = only_protocol(file)
     kind = find(protocol)
     line = ConfiguredLine(silent(file), tell=note, asks=False)  # never entered: its bus opens no port
@@ -97,7 +97,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
             until_ended(run, recorder)
         finally:
             if overheard.ambiguous:
-                note(f"{overheard.ambiguous} replies could have been those to earlier requests, and were no values")
+                note(f"{overheard.ambiguous} replies could belong to earlier requests and were discarded")
             for counts in line.outputs.statistics():
                 note(output_text(counts))
 
@@ -117,9 +117,9 @@ def wall_clock() -> Clock:
 
 
 class Listener(asyncio.Protocol):
-    """Decodes what comes and tells each frame, with the time of day; a frame that is not finished waits for silence.
+    """Decode received bytes and report each frame with its time of day. An incomplete frame waits for silence.
 
-    Bytes that waited while the program stood still came at an unknown time: after it was last seen running.
+    Bytes that were received while the program was stopped have an unknown time, after the last reading of the clock.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class Listener(asyncio.Protocol):
         return now - since
 
     def data_received(self, data: bytes) -> None:
-        """Decode these bytes and tell the frames; a frame that is not finished waits for silence."""
+        """Decode these bytes and report the frames. An incomplete frame waits for silence."""
         now = self._clock()
         if self._recorder is not None:
             self._recorder.overheard(time.monotonic(), data)
@@ -165,7 +165,7 @@ class Listener(asyncio.Protocol):
             self._timer = self._loop.call_later(DEFAULT_GAP, self._rest)
 
     def connection_lost(self, cause: Exception | None) -> None:
-        """Tell the last frame, and end `lost` with LineDown."""
+        """Report the last frame, and end `lost` with LineDown."""
         self._beating.cancel()
         self._rest()
         if not self.lost.done():
@@ -176,9 +176,9 @@ class Listener(asyncio.Protocol):
         self._pass(self._decoder.quiet())
 
     def _pass(self, frames: list[Frame]) -> None:
-        """Tell each frame.
+        """Report each frame.
 
-        Nothing is raised into the transport: whoever waits for the end of the line is told.
+        Errors are not raised into the transport, but to the caller that waits for the end of the line.
         """
         try:
             for frame in frames:
@@ -196,7 +196,7 @@ async def listen(
     recorder: Recorder | None = None,
     clock: Clock | None = None,
 ) -> None:
-    """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be told."""
+    """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be printed."""
     listener = Listener(decoder, tell, recorder, clock)
     transport = await endpoint.open(lambda: listener)
     try:
@@ -223,7 +223,7 @@ def plain_text(frame: Frame, names: Mapping[str, str]) -> str:
 
 
 def json_text(frame: Frame, names: Mapping[str, str]) -> str:
-    """Return a frame as one JSON object; null for what it does not say."""
+    """Return a frame as one JSON object; null for unknown properties."""
     sender = None if frame.sender is Direction.UNKNOWN else frame.sender.name.lower()
     fields = {
         "time": utc(frame.time, "microseconds"),
@@ -242,7 +242,7 @@ def json_text(frame: Frame, names: Mapping[str, str]) -> str:
 
 
 def json_values(frame: Frame) -> Any:
-    """Return one number, or a list where there are several; text that is no number stays text."""
+    """Return one number, or a list of several. A text that is not a number stays a text."""
     values = [number_of(part) for part in frame.value.split(",")] if frame.value else []
     return values if frame.item == "flags" or len(values) != 1 else values[0]
 

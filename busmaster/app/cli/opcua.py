@@ -18,18 +18,20 @@ FILE = click.Path(exists=True, dir_okay=False)
 FOLDER = click.Path(exists=True, file_okay=False)
 
 
-@click.command(short_help="Serve a line that another program owns by OPC UA.")
+@click.command(short_help="Serve a line of another program by OPC UA.")
 @interface_options(BIND)
 @click.option(
     "--allow",
     multiple=True,
     metavar="POINT",
-    help="Clients may write it, like winder/force or 'drive*/speed'. Again for more.",
+    help="Points that clients may write, like winder/force or 'drive*/speed'. Repeatable.",
 )
-@click.option("--token-file", metavar="FILE", help="Who may write: a name and its token on each line.")
-@click.option("--certificate", type=FILE, metavar="FILE", help="The server's: what is said is signed or encrypted.")
+@click.option("--token-file", metavar="FILE", help="Users who may write: a name and a token on each line.")
+@click.option(
+    "--certificate", type=FILE, metavar="FILE", help="The server's certificate. Messages are then signed or encrypted."
+)
 @click.option("--key", type=FILE, metavar="FILE", help="The private key of the certificate.")
-@click.option("--trusted", type=FOLDER, metavar="FOLDER", help="Certificates of clients; no others may come.")
+@click.option("--trusted", type=FOLDER, metavar="FOLDER", help="Certificates of the permitted clients.")
 def command(
     line: str | None,
     bind: str,
@@ -48,17 +50,17 @@ def command(
     token for that: it is the password of the user of its name.
     """
     if any(find_spec(module) is None for module in ("asyncua", "websockets")):
-        raise click.UsageError("OPC UA needs an extra: pip install 'busmaster[opcua]'")
+        raise click.UsageError("OPC UA support is not installed; pip install 'busmaster[opcua]'")
     listen = place_of(bind)
     is_local = is_loopback(listen[0])
     if read_only and allow:
-        raise click.UsageError("--allow names what may be written, and --read-only says that nothing may")
+        raise click.UsageError("--allow and --read-only exclude each other; leave out one of them")
     if allow and not is_local and token_file is None:
-        raise click.UsageError(f"--allow at {bind}, where all of the network may come, needs --token-file")
+        raise click.UsageError(f"--allow at {bind}, which the whole network can reach, needs --token-file")
     if (certificate is None) != (key is None):
-        raise click.UsageError("--certificate and --key belong together")
+        raise click.UsageError("--certificate and --key need each other; give both")
     if trusted is not None and certificate is None:
-        raise click.UsageError("--trusted needs --certificate: without one no client shows its own")
+        raise click.UsageError("--trusted needs --certificate: without it, clients do not send theirs")
     secrets = {} if token_file is None else read_tokens(token_file)
     followed = following(line, read_only=read_only)
     from busmaster.app.interfaces.opcua import read_trusted, serve
@@ -69,7 +71,7 @@ def command(
     pair = None if certificate is None or key is None else (certificate, key)
 
     def opened(url: str) -> None:
-        note(f"OPC UA clients find it at {url}")
+        note(f"serving OPC UA at {url}")
 
     until_ended(serve, followed, rules, listen, opened, note, pair)
     return OK

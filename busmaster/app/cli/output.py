@@ -29,12 +29,12 @@ __all__ = [
 
 
 def emit(*lines: str) -> None:
-    """Print to standard output and flush. Raises BrokenPipeError when nobody reads it any more."""
+    """Print to standard output and flush. Raises BrokenPipeError if the reader has closed it."""
     emit_all(lines)
 
 
 def emit_all(lines: Iterable[str]) -> None:
-    """Print the lines to standard output and flush. Raises BrokenPipeError when nobody reads it any more."""
+    """Print the lines to standard output and flush. Raises BrokenPipeError if the reader has closed it."""
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     sys.stdout.flush()
 
@@ -61,9 +61,9 @@ class Level(enum.IntEnum):
 
 
 def note(line: str, level: Level = Level.INFO) -> None:
-    """Print a line for the person, on standard error; where that is systemd's journal, with its level.
+    """Print a line for the user on standard error, with its level if that is systemd's journal.
 
-    A standard error that nobody can write to any more (its terminal was closed, its disk is full) ends nothing.
+    A failure of standard error (terminal closed, disk full) is ignored.
     """
     text = f"busmaster: {printable(line)}\n"
     if is_journal(sys.stderr, os.environ.get("JOURNAL_STREAM", "")):
@@ -78,19 +78,19 @@ def note(line: str, level: Level = Level.INFO) -> None:
 
 
 def is_journal(stream: TextIO, device_and_inode: str) -> bool:
-    """Tell whether the stream is the one that systemd has connected to its journal, as JOURNAL_STREAM names it."""
+    """Return whether the stream is the one that systemd has connected to its journal, named by JOURNAL_STREAM."""
     try:
         status = os.fstat(stream.fileno())
     except (OSError, ValueError):
         return False
-    # the variable is inherited: whoever redirects our standard error leaves it as it was
+    # the variable is inherited, and stays set if standard error is redirected
     return device_and_inode == f"{status.st_dev}:{status.st_ino}"
 
 
 class SteadyOutput:
-    """Standard output for what must go on when nobody can write there: a full disk, a terminal that was closed.
+    """Standard output for programs that must continue if it fails: disk full, terminal closed.
 
-    What could not be printed is counted. `tell` is told, on the caller's thread, when it begins and when it is over.
+    Lost lines are counted. `tell` is called on the caller's thread when a failure begins and ends.
     """
 
     def __init__(self, tell: Callable[[str, Level], object]) -> None:
@@ -117,11 +117,11 @@ class SteadyOutput:
             self._torn = False
             if self._error:
                 self._error = ""
-                self._tell(f"standard output is up again, {self.lost} lines were lost", Level.NOTICE)
+                self._tell(f"standard output works again; {self.lost} lines were lost", Level.NOTICE)
 
     def _failed(self, error: str, written: bytes, lines: int) -> None:
         self._torn = bool(self._torn and not written) or not (written or b"\n").endswith(b"\n")
         self.lost += lines - written.count(b"\n")
         if error != self._error:
             self._error = error
-            self._tell(f"standard output is down: {error}; polling goes on, its lines are lost", Level.WARNING)
+            self._tell(f"standard output failed: {error}; polling continues, these lines are lost", Level.WARNING)

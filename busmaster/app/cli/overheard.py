@@ -1,10 +1,10 @@
-"""The points of a file, fed from what its line's own master asks and its nodes answer, without a word of ours.
+"""Samples of a file's points from the requests and replies of another master, without any transmission.
 
-Replies carry neither an address nor a number, and another master keeps rules of its own: it may repeat a request before
-the reply to the first one can no longer come, or go on to the next node. So a request stays *open* until its reply was
-heard for certain, or its node's maximum reply delay is over, and a reply that an open request could have caused is no
-value. A listener can still miss two frames in a row and take one node's reply for another's: what it hears is never
-good, it is overheard.
+Replies contain neither an address nor a sequence number, and another master has its own rules. It can repeat a request,
+or go on to the next node, while the first reply can still arrive. So a request stays *open* until its reply was
+received for certain, or its node's maximum reply delay has passed. A reply that an open request could have caused is
+discarded. A listener can still miss two frames in a row and attribute a reply to the wrong node. So the quality of its
+values is never good, but overheard.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from busmaster.registry import Protocol, find
 from busmaster.statistics import Timeline
 
 Question = tuple[int, Command[Any]]
-"""The address of a node, and what it is asked."""
+"""The address of a node, and the command."""
 Clock = Callable[[], float]
-"""Tells the time, in seconds."""
+"""Returns the time, in seconds."""
 MOST_OPEN = 1000
 """More requests than fit into the longest maximum reply delay; the oldest goes."""
 
@@ -51,7 +51,7 @@ def only_protocol(file: LineFile) -> str:
     names = {node.protocol for node in file.nodes.values()}
     spoken = {find(name).protocol.name for name in names}
     if len(spoken) > 1:
-        raise InvalidCommand(f"one line is listened to in one protocol, and the file has {', '.join(sorted(spoken))}")
+        raise InvalidCommand(f"monitor supports one protocol per line, and the file has {', '.join(sorted(spoken))}")
     return names.pop() if len(names) == 1 else spoken.pop()
 
 
@@ -77,8 +77,8 @@ class HeardGroup:
             self._heard[point] = sample
 
     def turn(self, now: float, wall: float) -> Snapshot | None:
-        """Hand on what was heard since the last time, and return it; None where nothing was."""
-        # stays on its grid, whatever was slept through
+        """Publish the samples since the last call, and return them; None if there are none."""
+        # stays on its grid, even after a standstill
         due, self.due = self.due, self.due + self.period * max(1, (now - self.due) // self.period)
         if not self._heard:
             return None
@@ -107,16 +107,16 @@ class OpenRequest:
 
 
 class Overheard:
-    """Makes samples of frames: of reads, and of writes that were confirmed, each of which may tell several points.
+    """Make samples from the frames of reads and confirmed writes, each of which can contain several points.
 
-    An answer counts only where the reader of its request takes it, as in a master, and where it can be no open
-    request's. `clock` is the one by which the frames are timed.
+    A reply counts only if the exchange of its request accepts it, as in a master, and if it cannot belong to an open
+    request. `clock` is the clock of the frames' times.
     """
 
     def __init__(self, protocol: Protocol, points: Iterable[Point[Any]], clock: Clock) -> None:
         self.groups: list[HeardGroup] = []
         self.ambiguous = 0
-        """Replies that were no values, as they could have been another request's."""
+        """Number of replies that were discarded because they could have belonged to another request."""
         self._clock = clock
         self._open: list[OpenRequest] = []
         self._request_ended = -inf
@@ -151,7 +151,7 @@ class Overheard:
             self._request_ended, self._max_reply_delay, self._unread = frame.ended, self._longest(), True
 
     def _ask(self, frame: Frame) -> None:
-        """Begin an exchange; what the request before asked for may still come."""
+        """Begin an exchange. The reply to the request before can still arrive."""
         self._give_up()
         address = frame.node if self._profile.addressed else self._profile.addresses[0]
         node = None if address is None else self._nodes.get(address)
@@ -199,20 +199,20 @@ class Overheard:
         self._unread = False
 
     def _still_open(self, reply: Frame) -> list[OpenRequest]:
-        """Return the earlier requests to which this could be the reply, as far as time tells."""
+        """Return the earlier requests to which this can be the reply, judged by time."""
         came = reply.time - reply.earlier
         self._open = [request for request in self._open if request.until > came]
         return self._open
 
     def _longest(self) -> float:
-        """Return the maximum reply delay of whatever node it was that was asked."""
+        """Return the maximum reply delay of the node of the last request."""
         timings = (self._profile.timings, *(node.timings for node in self._nodes.values()))
         return max(
             max(each.read.max_reply_delay, each.write.max_reply_delay) + each.packet.max_reply_delay for each in timings
         )
 
     def _found(self, node: Node, command: Command[Any], value: Any) -> dict[Point[Any], Any]:
-        """Return what each point would have read, of all that the exchange tells."""
+        """Return the value that each point of the exchange would have read."""
         found: dict[Point[Any], Any] = dict.fromkeys(self._by_command.get((node.address, command), ()), value)
         told: Mapping[Hashable, Any] = {}
         if isinstance(command, Changing):
@@ -222,7 +222,7 @@ class Overheard:
         for place in told:
             for point in self._by_place.get((node.address, place), ()):
                 assert isinstance(point.command, Placed)
-                with suppress(KeyError):  # a part of it alone was told
+                with suppress(KeyError):  # only a part of it was received
                     found.setdefault(point, point.command.shown(told))
         return found
 
@@ -239,7 +239,7 @@ class Overheard:
 
 
 async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snapshot], None]) -> None:
-    """Hand on what is heard, each group at its period, until cancelled; the outputs then write what they hold."""
+    """Publish the samples of each group at its period, until cancelled. The outputs then write their queued data."""
     now = asyncio.get_running_loop().time
     for section in line.file.groups.values():
         overheard.groups.append(HeardGroup(section.name, section.period, line.members(section.name), now()))
@@ -255,7 +255,7 @@ async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snaps
                         show(snapshot)
                         ext.take_overheard(line.bus, snapshot.samples)
     finally:
-        for group in overheard.groups:  # what the last period heard, before the outputs end
+        for group in overheard.groups:  # the samples of the last period, before the outputs end
             group.turn(time.monotonic(), time.time())
             group.close()
         await line.outputs.close()

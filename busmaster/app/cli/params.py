@@ -58,17 +58,17 @@ items_option = click.option(
     "--items",
     type=option_type(parse_items),
     metavar="ITEM,ITEM...",
-    help="These alone; 1.17:20 is 20 from there on. By default all that the protocol's document and LINE.toml list.",
+    help="Only these items; 1.17:20 is 20 from 1.17 on. By default all in the protocol's document and LINE.toml.",
 )
 
 
 class Subcommands(click.Group):
-    """A group that says which command was meant."""
+    """A group that suggests the nearest command."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that the arguments name. Raises UsageError, with what was meant, for a name that is none."""
+        """Find the command that the arguments name. Raises UsageError with the nearest name for an unknown one."""
         if args and not args[0].startswith("-") and args[0] not in self.commands:
             raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], self.commands)}", ctx)
         return super().resolve_command(ctx, args)
@@ -78,7 +78,7 @@ class Subcommands(click.Group):
 def command() -> None:
     """Save the parameters of a node to a file, compare files and nodes, and write a file to a node.
 
-    Each of the three says more with --help.
+    Each command has its own --help.
     """
 
 
@@ -154,13 +154,13 @@ def called(parameter: Parameter) -> str:
 @click.option("-o", "--output", required=True, metavar="FILE.toml", help="The file to write.")
 @items_option
 def save_command(connection: Connection, node: str | None, output: str, items: tuple[str, ...] | None) -> int:
-    """Read all parameters of a node and write them to a file: item, name, value, unit, range, and of which node.
+    """Read all parameters of a node and write them to a file: the node, and item, name, value, unit and range of each.
 
-    NODE is the name of a node in LINE.toml, or an address on PORT; it is left out where the protocol has no addresses.
-    The reads are in the background of other traffic. Parameters that the node does not have are left out.
+    NODE is the name of a node in LINE.toml, or an address on PORT. Leave it out if the protocol has no addresses.
+    The reads have the lowest priority. Parameters that the node does not have are left out.
 
-    What was read is kept in FILE.toml.part: if the command is interrupted, the same command goes on from there.
-    FILE.toml is written at the end, as a whole. Where another busmaster owns the line, the reads go through it.
+    Values are stored in FILE.toml.part: if the command is interrupted, the same command continues from there. FILE.toml
+    is written at the end, as a whole. If another busmaster owns the line, the reads go through it.
     """
     parsed_output(output)
     target = Lines().target(connection, node or "")
@@ -176,7 +176,7 @@ def parsed_output(path: str) -> None:
 
 
 async def save(target: Target, parameters: Sequence[Parameter], path: str) -> int:
-    """Read the parameters and write the file. Raises BusError for a node that does not reply; what was read is kept."""
+    """Read the parameters and write the file. Raises BusError if the node does not reply. Values are kept."""
     from busmaster.app.cli.progress import Bar  # it takes a fifth of the time of --help
 
     read = 0
@@ -186,7 +186,7 @@ async def save(target: Target, parameters: Sequence[Parameter], path: str) -> in
             with PartFile(path, empty, parameters, target.kind) as part, Bar(target.label, len(parameters)) as bar:
                 read = len(parameters) - len(part.missing)
                 if read:
-                    note(f"{path}{PART}: {read} of {len(parameters)} were read before; going on")
+                    note(f"{path}{PART}: {read} of {len(parameters)} were read before; continuing")
                 bar.advance(read)
                 async for found in walk(target.handle, part.missing):
                     part.add(found)
@@ -194,14 +194,14 @@ async def save(target: Target, parameters: Sequence[Parameter], path: str) -> in
                     bar.advance()
     except BaseException:
         if read:
-            note(f"{read} of {len(parameters)} are in {path}{PART}: the same command goes on from there", Level.NOTICE)
+            note(f"{read} of {len(parameters)} are in {path}{PART}; the same command continues there", Level.NOTICE)
         raise
     done = part.finish()
     gaps = sum(one.gap for one in part.gaps.values())
-    note(f"{path}: {len(done.entries)} parameters of {target.label}; {gaps} that it does not have are left out")
+    note(f"{path}: {len(done.entries)} parameters of {target.label}; without {gaps} that the node does not have")
     unread = [one for one in part.gaps.values() if not one.gap]
     for one in unread:
-        note(f"{called(one.parameter)} is not in it: {one.why}", Level.WARNING)
+        note(f"{called(one.parameter)} could not be read: {one.why}", Level.WARNING)
     return FAILED if unread else OK
 
 
@@ -225,11 +225,11 @@ def diff_command(
     lines = Lines()
     try:
         sides = [side(lines, connection, text) for text in (one, other)]
-    except OSError as error:  # status 1 would say that they differ
+    except OSError as error:  # status 1 would mean that they differ
         raise click.ClickException(f"{error.filename}: {error.strerror}") from error
     kinds = [each.kind for each in sides]
     if kinds[0] is not kinds[1]:
-        raise click.UsageError(f"{one} is of a {kinds[0].name}, {other} of a {kinds[1].name}: their items differ")
+        raise click.UsageError(f"{one} belongs to a {kinds[0].name}, {other} to a {kinds[1].name}; their items differ")
     try:
         return until_ended(diff, lines, sides, items, as_json)
     except BusError as error:
@@ -307,13 +307,13 @@ async def read(target: Target, files: Sequence[ParameterSet], items: Sequence[st
 @partial(connected, or_file=True, port=False)
 @click.argument("path", metavar="FILE.toml", type=click.Path(exists=True, dir_okay=False))
 @click.argument("node", metavar=NODE_AT)
-@click.option("--dry-run", is_flag=True, help="Print what would be written, and write nothing.")
-@click.option("--yes", is_flag=True, help="Write without asking first.")
-@click.option("--enabled", is_flag=True, help="Write to a drive that is enabled or runs, too.")
+@click.option("--dry-run", is_flag=True, help="Print the changes, and write nothing.")
+@click.option("--yes", is_flag=True, help="Write without a question.")
+@click.option("--enabled", is_flag=True, help="Write even if the drive is enabled or running.")
 @click.option(
     "--undo",
     metavar="FILE.toml",
-    help="Where to save what is overwritten; by default beside FILE.toml, with the time.",
+    help="File for the overwritten values; by default beside FILE.toml, with the time.",
 )
 def load_command(
     connection: Callable[[str], Connection],
@@ -324,15 +324,15 @@ def load_command(
     enabled: bool,
     undo: str | None,
 ) -> int:
-    """Write to a node what differs from the file, after one question, and print `ITEM ok` for each.
+    """Write the parameters that differ from the file to a node, after one question, and print `ITEM ok` for each.
 
     Parameters are written in the order of the protocol's document, a mode before all others and a command that stores
-    them after all others; each is read back. What the document or LINE.toml calls read-only, and what the node is
-    reached by, is not written. What cannot be written is named with the reason, and the exit status is 1.
+    them after all others. Each is read back. Read-only parameters and the node's communication settings are not
+    written. Parameters that cannot be written are printed with the reason, and the exit status is 1.
 
-    What is overwritten is saved first, to a file that the same command loads again. A drive that is enabled is refused
-    unless --enabled is given; where its protocol does not tell, a message says so. The limits of LINE.toml hold, and
-    its outputs keep a record of each write. If the line is lost meanwhile, the same command writes what is left.
+    The old values are saved first, to a file that the same command can load. An enabled drive is refused unless
+    --enabled is given; if its protocol cannot report this, a message is printed. The limits of LINE.toml apply, and its
+    outputs log each write. If the line is lost, the same command writes the remaining parameters.
     """
     wanted = read_set(path)
     name, where = split(node)
@@ -341,7 +341,9 @@ def load_command(
     undo = undo or default_undo(path)
     parsed_output(undo)
     if not (yes or dry_run) and not sys.stdin.isatty():
-        raise click.UsageError("nobody can be asked here, so nothing was sent: say --yes, or --dry-run")
+        raise click.UsageError(
+            "confirmation required, but there is no terminal; nothing was sent; use --yes or --dry-run"
+        )
     return until_ended(write, target, wanted, dry_run, yes, enabled, undo, node)
 
 
@@ -373,7 +375,7 @@ async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabl
                 if not await may_be_written(target, enabled, again=True):
                     return FAILED
             write_set(undo, plan.undo, target.kind)
-            note(f"what is overwritten is in {undo}: `busmaster params load {undo} {node}` writes it again")
+            note(f"the old values are in {undo}; to restore them: busmaster params load {undo} {node}")
             return max(status, await carry_out(plan, target))
     finally:
         if audit is not None:
@@ -381,17 +383,17 @@ async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabl
 
 
 async def may_be_written(target: Target, enabled: bool, *, again: bool = False) -> bool:
-    """Return whether the node is at rest, or is to be written to in any case; say so if it is not, or does not tell.
+    """Return whether the node is stopped, or --enabled was given. Prints a message if it runs or cannot report this.
 
-    `again`: it was asked before, and nothing that was said then is repeated.
+    `again`: a second check, which does not repeat messages.
     """
     why = await target.handle.in_operation(priority=Priority.BACKGROUND)
     if why is None and not enabled and not again:
         kind = target.kind.name
-        note(f"{target.label}: {kind} does not tell whether it is enabled: make sure that it is not", Level.WARNING)
+        note(f"{target.label}: {kind} cannot report whether it is enabled; make sure that it is not", Level.WARNING)
     elif why and not (again and enabled):
         level = Level.WARNING if enabled else Level.ERROR
-        advice = "" if enabled else "; nothing was written: stop it first, or say --enabled"
+        advice = "" if enabled else "; nothing was written; stop the drive first, or use --enabled"
         note(f"{target.label} is in operation: {why}{advice}", level)
     return enabled or not why
 
@@ -403,12 +405,12 @@ async def prepare(target: Target, wanted: SetFile) -> ParameterLoad:
     for item, value in wanted.set.identity.items():
         now = plan.undo.identity.get(item)
         if now is not None and now != value:
-            note(f"{item} of {target.label} is {value_text(now)}, in the file {value_text(value)}", Level.WARNING)
+            note(f"{target.label}: {item} is {value_text(now)}, but {value_text(value)} in the file", Level.WARNING)
     return plan
 
 
 def tell_plan(plan: ParameterLoad, target: Target) -> None:
-    """Print what is to be written, and what is not and why."""
+    """Print the changes, and the excluded parameters with the reason."""
     rows = [
         (
             each.parameter.item,
@@ -423,7 +425,7 @@ def tell_plan(plan: ParameterLoad, target: Target) -> None:
         emit(*columns([("ITEM", "NAME", "NOW", "FILE", "UNIT"), *rows], right=(2, 3)))
     for left in plan.left:
         note(left_text(left, target.kind), Level.INFO if left.expected else Level.WARNING)
-    note(f"{target.label}: to be written {len(rows)}, as in the file {plan.equal}, not written {len(plan.left)}")
+    note(f"{target.label}: {len(rows)} to write, {plan.equal} equal, {len(plan.left)} excluded")
 
 
 def left_text(left: Left, kind: NodeKind) -> str:
@@ -462,16 +464,16 @@ async def carry_out(plan: ParameterLoad, target: Target) -> int:
             else:
                 tell_failure(outcome)
     finally:
-        # A signal, or an error that no one foresaw: none is left out.
+        # A signal or an internal error: report the remaining changes too.
         for number, change in enumerate(plan.changes[len(outcomes) :]):
             result = Result.UNCONFIRMED if number == 0 else Result.NOT_WRITTEN
-            tell_failure(Outcome(change, result, "the command was ended"))
+            tell_failure(Outcome(change, result, "the command was interrupted"))
     written = sum(outcome.result is Result.WRITTEN for outcome in outcomes)
     note(f"{target.label}: {written} of {len(plan.changes)} written")
     return OK if written == len(plan.changes) else FAILED
 
 
 def tell_failure(outcome: Outcome) -> None:
-    """Say on standard error what became of a change that was not written."""
+    """Report the result of a change that was not written on standard error."""
     level = Level.CRITICAL if outcome.result is Result.UNCONFIRMED else Level.ERROR
     note(f"{called(outcome.change.parameter)}: {outcome.result.value}: {outcome.why}", level)

@@ -1,4 +1,4 @@
-"""Arguments as they are written: each reader refuses what is none."""
+"""Parsers of command-line arguments. Each rejects invalid text."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SEPARATORS = re.compile(r"\s*[,;\t]\s*|\s+")
 
 
 class Whole(click.IntRange):
-    """Says "is not a valid whole number" of what is none."""
+    """A whole number. Errors use this name, not "integer"."""
 
     name = "whole number"
 
@@ -52,10 +52,10 @@ def parse_nodes(text: str) -> tuple[int, ...]:
     for part in text.split(","):
         first, dash, last = (piece.strip() for piece in part.partition("-"))
         if not is_decimal(first) or (dash and not is_decimal(last)):
-            raise InvalidCommand(f"a node list is written like 1-8,255, not {text!r}")
+            raise InvalidCommand(f"{text!r} is not a node list; write it like 1-8,255")
         start, stop = int(first), int(last or first)
         if start > stop:
-            raise InvalidCommand(f"a range goes upwards: {stop}-{start}, not {part.strip()}")
+            raise InvalidCommand(f"the range {part.strip()} is descending; write {stop}-{start}")
         if not any(stop in kind.profile.addresses or stop == kind.profile.broadcast for kind in kinds().values()):
             raise InvalidCommand(f"no protocol has a node {stop}")
         addresses.update(dict.fromkeys(range(start, stop + 1)))
@@ -66,7 +66,7 @@ def parse_seconds(text: str) -> float:
     """Return a time in seconds, above 0. Raises InvalidCommand for any other."""
     seconds = parse_value(text)
     if not 0 < seconds < float("inf"):
-        raise InvalidCommand(f"a time is above 0, not {text}")
+        raise InvalidCommand(f"a time must be above 0, not {text}")
     return seconds
 
 
@@ -79,7 +79,7 @@ def parse_window(text: str) -> float | Learned:
         return LEARNED
     seconds = parse_seconds(text) / 1000
     if seconds > LONGEST_WINDOW:
-        raise InvalidCommand(f"a reply window is at most {LONGEST_WINDOW * 1000:.0f} ms, not {text}")
+        raise InvalidCommand(f"a reply window must be at most {LONGEST_WINDOW * 1000:.0f} ms, not {text}")
     return seconds
 
 
@@ -87,12 +87,12 @@ def parse_items(text: str) -> tuple[str, ...]:
     """Return the items of `--items a,b,c`. Raises InvalidCommand for none."""
     items = tuple(item for item in (part.strip() for part in text.split(",")) if item)
     if not items:
-        raise InvalidCommand("--items names at least one item")
+        raise InvalidCommand("--items needs at least one item")
     return tuple(dict.fromkeys(items))
 
 
 class Assignment(NamedTuple):
-    """What is written: an item, its values, and the file that they are from, or empty."""
+    """An item, its new values, and the file of the values, or empty."""
 
     item: str
     values: tuple[float, ...]
@@ -110,7 +110,7 @@ def parse_assignment(text: str) -> Assignment:
     item, equals, values = text.partition("=")
     item, values = item.strip(), values.strip()
     if not equals or not item or not values:
-        raise InvalidCommand(f"an assignment is written ITEM=VALUE, like 1=123.456, not {text!r}")
+        raise InvalidCommand(f"{text!r} is not an assignment; write ITEM=VALUE, like 1=123.456")
     if values.startswith(FROM_FILE):
         path = values.removeprefix(FROM_FILE)
         return Assignment(item, numbers_of_file(path), path)
@@ -152,7 +152,7 @@ def _numbers(path: str, text: str) -> Iterator[float]:
 
 
 def parse_value(text: str) -> float:
-    """Return the number; a whole one stays whole. Hexadecimal (0x41) is taken for the words. Raises InvalidCommand."""
+    """Return the number; a whole one stays whole. Hexadecimal (0x41) is accepted for words. Raises InvalidCommand."""
     text = text.strip()
     try:
         return int(text, 16) if text.lower().startswith("0x") else int(text)
@@ -161,11 +161,11 @@ def parse_value(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InvalidCommand(f"{text!r} is no number") from None
+        raise InvalidCommand(f"{text!r} is not a number") from None
 
 
 def parsed(parse: Callable[[S], T], value: S) -> T:
-    """Return what `parse` makes of an argument; what it refuses is wrong usage. Raises UsageError."""
+    """Return the result of `parse` for an argument. Raises UsageError for an InvalidCommand."""
     try:
         return parse(value)
     except InvalidCommand as error:

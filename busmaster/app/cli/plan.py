@@ -29,15 +29,15 @@ HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "M
 @file_argument()
 @json_option
 def command(path: str, as_json: bool) -> int:
-    """Calculate how busy LINE.toml's poll groups will keep its line, and what would fit. Nothing is opened; what the
-    file says of emulated nodes is checked too.
+    """Calculate the line load of LINE.toml's poll groups, and suggest periods that fit. The port is not opened.
+    The settings of emulated nodes are checked too.
 
     Reply times are the file's `reply_time`, else half of `late_after`. The exit status is 1 if cycles will be
     missed.
     """
     file = load(path)
     line = ConfiguredLine(file, outputs=False)
-    emulated_line(file)  # made for its complaints alone, as `emulate` says them
+    emulated_line(file)  # made only for its errors, which are those of `emulate`
     plan = line.plan()
     section = line.file.service
     shared = bool(section.users or section.groups or section.tokens or section.listen)
@@ -50,13 +50,13 @@ def command(path: str, as_json: bool) -> int:
 
 
 def page(head: str, plan: Plan, assumed: Sequence[str], *, shared: bool = False) -> list[str]:
-    """Return what a person wants to know: a table of the groups, the waits, what would fit, and what is `assumed`.
+    """Return the report: a table of the groups, the waits, schedules that fit, and the `assumed` reply times.
 
-    `shared`: the file says which programs may use the line, so that it also prints what those can take of it.
+    `shared`: other programs may use the line, so the report includes their shares.
     """
     table = columns([HEAD, *(row(group) for group in plan.groups)], right=range(1, len(HEAD)))
-    verdict = "it fits" if plan.fits and not plan.advice else "it fits, barely" if plan.fits else "it does not fit"
-    share = f"the schedule asks for {plan.utilisation:.0%} of the line"
+    verdict = "it fits" if plan.fits and not plan.advice else "it barely fits" if plan.fits else "it does not fit"
+    share = f"the schedule needs {plan.utilisation:.0%} of the line"
     return [
         head,
         *(table if plan.groups else ["no poll groups"]),
@@ -69,13 +69,13 @@ def page(head: str, plan: Plan, assumed: Sequence[str], *, shared: bool = False)
 
 
 def waits_text(plan: Plan) -> Iterator[str]:
-    """Yield what to calculate with, and then the bounds of R9, which no line comes near."""
+    """Yield the typical waits, and then the bounds of R9, which real lines do not reach."""
     yield (
         f"a command waits up to {time_text(plan.typical_wait)} on a healthy line; "
         f"while a dead node is probed all waits are about {time_text(plan.dead_wait)} longer"
     )
     bounds = ", ".join(f"{priority.name.lower()} {time_text(plan.worst_waits[priority])}" for priority in SHOWN)
-    yield f"the bounds (R9), if every exchange took the longest that one can: {bounds}"
+    yield f"worst case (R9), if every exchange takes its longest possible time: {bounds}"
 
 
 def parts_text(plan: Plan) -> Iterator[str]:
@@ -83,11 +83,11 @@ def parts_text(plan: Plan) -> Iterator[str]:
     parts = ", ".join(f"{role} {part:.0%}" for role, part in line_parts().items())
     wait = time_text(plan.worst_waits[Priority.URGENT])
     yield (
-        f"while polls wait, all programs of a role together can take of the line: {parts}; a safe write or another "
+        f"while polls wait, all programs of a role together can use of the line: {parts}; a safe write or another "
         f"urgent write of the owner waits for the exchange on the wire, at most {wait}"
     )
     waits = ", ".join(f"{time_text(wait)} with {clients}" for clients, wait in program_waits(plan).items())
-    yield f"an urgent write of a program that has not used its part waits at most (by the number of programs): {waits}"
+    yield f"an urgent write of a program that has not used its share waits at most (by number of programs): {waits}"
 
 
 def program_waits(plan: Plan) -> dict[int, float]:
@@ -97,12 +97,12 @@ def program_waits(plan: Plan) -> dict[int, float]:
 
 
 def assumed_text(nodes: Sequence[str]) -> Iterator[str]:
-    """Yield a line that says whose reply times nobody has said, if there are such nodes."""
+    """Yield a line with the nodes whose reply times are assumed, if there are any."""
     if nodes:
         some = ", ".join(nodes[:SOME]) + (f" and {len(nodes) - SOME} more" if len(nodes) > SOME else "")
         yield (
-            f"reply times are assumed (half of late_after) for {some}: `busmaster doctor` measures them, and "
-            "`reply_time` says them"
+            f"reply times are assumed (half of late_after) for {some}; measure them with `busmaster doctor`, and "
+            "set `reply_time`"
         )
 
 
@@ -111,7 +111,7 @@ def losses_text(losses: Losses) -> str:
     shortest, longest = map(time_text, losses.windows)
     windows = f"a window of {shortest}" if shortest == longest else f"windows of {shortest} to {longest}"
     return (
-        f"with {losses.share:.0%} of all frames lost the schedule asks for {losses.documented:.0%} of the line; "
+        f"with {losses.share:.0%} of all frames lost the schedule needs {losses.documented:.0%} of the line; "
         f'with timing = "learned" ({windows}) for {losses.learned:.0%}'
     )
 

@@ -20,31 +20,31 @@ from busmaster.errors import InvalidCommand
 from busmaster.ext import read_file
 
 
-@click.command(short_help="Show the points of a file as a table, or take them from one.")
+@click.command(short_help="Show the points of a file as a table, or import them from one.")
 @file_argument()
-@click.option("--csv", "as_csv", is_flag=True, help="Print them as CSV.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print the points as CSV.")
 @click.option(
     "--from",
     "table",
     type=click.Path(exists=True, dir_okay=False, allow_dash=True),
     metavar="CSV",
-    help="Take them from this CSV into LINE.toml; - is standard input.",
+    help="Import the points of this CSV into LINE.toml; - is standard input.",
 )
 def command(path: str, as_csv: bool, table: str | None) -> int:
-    """Show the points of LINE.toml, one a line: what the file says of each, and the template or table it comes from. A
-    terminal that is narrower than this table shows them one below the other.
+    """Show the points of LINE.toml, one per line: their keys, and the template or table that defines them. If the
+    terminal is narrower than the table, each point is shown as a list.
 
-    Limits hold for the quantity, by whatever name: the column limited_by has the points whose limits hold for this one
-    too. It is told, not taken, as the column origin is.
+    Limits apply to the quantity, for all of its names: the column limited_by lists other points whose limits apply too.
+    The columns limited_by and origin are export-only.
 
-    With --csv as CSV, for a spreadsheet. With --from what such a CSV says is written into LINE.toml, and each change is
-    printed; comments and order stay. Rows add and change points, and none is taken away. Nothing is written unless all
-    rows are good; what is wrong is told by row and column.
+    With --csv, the table is printed as CSV, for a spreadsheet. With --from, such a CSV is written into LINE.toml, and
+    each change is printed; comments and order are kept. Rows add and change points, and never delete one. If a row has
+    an error, nothing is written, and the errors are printed with row and column.
     """
     if as_csv and table is not None:
-        raise click.UsageError("--csv and --from exclude each other: one is out, the other in")
+        raise click.UsageError("--csv exports and --from imports; leave out one of them")
     if table is not None:
-        # read to its end first: whoever edits it in a pipe may edit the file too
+        # read to its end first: a program in the same pipe may edit the file too
         data = _standard_input() if table == "-" else read_file(table)
         return take(load(path), path, "standard input" if table == "-" else table, data)
     file = load(path)
@@ -58,12 +58,12 @@ def command(path: str, as_csv: bool, table: str | None) -> int:
 def _standard_input() -> bytes:
     data = sys.stdin.buffer.read(LONGEST_FILE + 1)
     if len(data) > LONGEST_FILE:
-        raise InvalidCommand(f"standard input: a table of points has {LONGEST_FILE} bytes at most")
+        raise InvalidCommand(f"standard input has more than {LONGEST_FILE} bytes; a table of points must be shorter")
     return data
 
 
 def page(file: LineFile) -> Iterator[str]:
-    """Yield the lines of a table, with the columns of which something is said anywhere."""
+    """Yield the lines of a table, without columns that are empty."""
     texts = [
         {NODE: row.node, POINT: row.point, ITEM: row.point}
         | {LIMITED_BY: ", ".join(row.limited_by), ORIGIN: row.origin}
@@ -71,7 +71,7 @@ def page(file: LineFile) -> Iterator[str]:
         for row in rows(file)
     ]
     if not texts:
-        yield "no points: describe them in [nodes.NAME.points]"
+        yield "the file has no points; define them in [nodes.NAME.points]"
         return
     used = [column for column in COLUMNS if any(text.get(column) for text in texts)]
     table = list(
@@ -104,7 +104,7 @@ def print_csv(data: bytes) -> None:
 
 
 def take(file: LineFile, path: str, name: str, data: bytes) -> int:
-    """Write what a CSV of that name says into the file, tell what changes, and return the exit status."""
+    """Import a CSV of that name into the file, print the changes, and return the exit status."""
     try:
         taking = taken(file, name, data)
     except BadRows as bad:
@@ -115,7 +115,7 @@ def take(file: LineFile, path: str, name: str, data: bytes) -> int:
         write_beside(path, taking.text)
     emit(*map(str, taking.changes))
     count = len(taking.changes)
-    note(f"{path}: {count or 'no'} point{'' if count == 1 else 's'} changed{'' if count else ': it is as it was'}")
+    note(f"{path}: {count or 'no'} point{'' if count == 1 else 's'} changed")
     if taking.stay:
-        note(f"not in the CSV, and so as before: {', '.join(taking.stay)}")
+        note(f"not in the CSV, unchanged: {', '.join(taking.stay)}")
     return OK

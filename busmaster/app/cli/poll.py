@@ -25,15 +25,15 @@ from busmaster.app.service.remote import RemoteBus
 from busmaster.app.service.remote_group import RemoteGroup
 
 KEPT = 1_001
-"""Cycles of which the summary tells the periods."""
+"""Maximum number of cycles whose periods are in the summary."""
 
 
-@click.command(short_help="Read values of several nodes once a period.", cls=ItemCommand)
+@click.command(short_help="Read values of several nodes periodically.", cls=ItemCommand)
 @connected
 @nodes_option
-@click.option("--items", required=True, type=option_type(parse_items), metavar="ITEM,ITEM...", help="What to read.")
+@click.option("--items", required=True, type=option_type(parse_items), metavar="ITEM,ITEM...", help="Items to read.")
 @click.option(
-    "--period", required=True, type=option_type(parse_seconds), metavar="S", help="Seconds from cycle to cycle."
+    "--period", required=True, type=option_type(parse_seconds), metavar="S", help="Period of the cycles, in seconds."
 )
 @viewed
 def command(
@@ -64,9 +64,9 @@ async def poll(
 
 
 def ended(values: bool) -> int:
-    """Return the exit status of a poll that came to its end, and say so if it was in vain."""
+    """Return the exit status of a finished poll, and report if no value was received."""
     if not values:
-        note("no value came", Level.ERROR)
+        note("no value was received; check the port, the protocol and the nodes", Level.ERROR)
     return OK if values else FAILED
 
 
@@ -96,7 +96,7 @@ class Cycles:
             await anyio.to_thread.run_sync(emit_all, lines, abandon_on_cancel=True)
 
     def summarise(self) -> None:
-        """Print the summary on standard error; of nodes, and of how busy the line is, its owner tells."""
+        """Print the summary on standard error. Statistics of nodes and line are those of the line's owner."""
         if self._last is None:
             note("nothing was polled")
             return
@@ -108,15 +108,15 @@ class Cycles:
 
 
 async def poll_served(remote: RemoteBus, points: Sequence[Point[Any]], period: float, view: View) -> int:
-    """Have the program that owns the line poll, and print what it reads, until the view ends. Raises LineDown."""
+    """Poll through the program that owns the line, and print the values, until the view ends. Raises LineDown."""
     if wants_screen(view):
-        note("the live view of a line that another program owns is busmaster top; plain lines instead")
+        note("no live view of another program's line here, showing plain lines; use busmaster top")
     cycles = Cycles(remote, view)
     try:
         async with remote, late_nodes(remote):
             with anyio.move_on_after(view.seconds):
                 await cycles.show(remote.poll_group("poll", period=period, points=points))
-                remote.link.check()  # it ended without us: this says why
+                remote.link.check()  # the stream ended by itself: raises the reason
     finally:
         cycles.summarise()
     return ended(cycles.values)

@@ -79,14 +79,14 @@ def read_options() -> list[Offer]:
 
 
 def take_options(offered: Iterable[Offer], protocol: str, given: dict[str, Any]) -> dict[str, Any]:
-    """Take what is offered out of `given`, and return what was given. Raises UsageError for another kind's."""
+    """Remove the protocols' options from `given`, and return the set ones. Raises UsageError for another kind's."""
     taken = {}
     for option, names in offered:
         value = given.pop(option.name, None)
         if value in (None, False):
             continue
         if protocol not in names:
-            raise click.UsageError(f"--{option.name.replace('_', '-')} is for {' and '.join(names)} alone")
+            raise click.UsageError(f"--{option.name.replace('_', '-')} is only for {' and '.join(names)}; leave it out")
         taken[option.name] = value
     return taken
 
@@ -99,23 +99,23 @@ class NodeCommand(click.Command):
         return handle_options()
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """Return the command's own parameters, then what is offered, then --help."""
+        """Return the command's own parameters, then the protocols' options, then --help."""
         *own, show_help = super().get_params(ctx)
         return [*own, *(offer.parameter() for offer in self.offers()), show_help]
 
 
 class ItemCommand(NodeCommand):
-    """A command on items: its help says what they are, and where more is said of each."""
+    """A command on items: its help describes them, and refers to `busmaster items`."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write what an ITEM is, protocol by protocol, below the help."""
-        head = "ITEM, by protocol (`busmaster items PROTOCOL` says what each is):"
+        head = "ITEM, by protocol (`busmaster items PROTOCOL` describes each):"
         self.epilog = "\n".join(("\b", head, *item_lines()))
         super().format_epilog(ctx, formatter)
 
 
 def item_lines() -> Iterator[str]:
-    """Yield the lines that say what an ITEM is, of each kind of node."""
+    """Yield lines that describe ITEM for each kind of node."""
     margin = 4 + max(map(len, kinds()))
     for kind in kinds().values():
         yield from textwrap.wrap(

@@ -46,9 +46,10 @@ class ReachedLine(RemoteBus):
 
 
 def reach(connection: Connection) -> Bus | RemoteBus:
-    """Return the bus on PORT, or, where another program owns that line, the one that it serves.
+    """Return the bus on PORT or, if another program owns that line, the bus that it serves.
 
-    Says the latter on standard error unless PORT names that program. Raises UsageError for a capture of such a line.
+    The latter is reported on standard error unless PORT names that program. Raises UsageError for a capture of such a
+    line.
     """
     address = connection.port
     if not is_served(address):
@@ -58,20 +59,20 @@ def reach(connection: Connection) -> Bus | RemoteBus:
         address = owner.address
         tell_owner(owner)
     if connection.capture is not None:
-        raise click.UsageError(f"{address} is a line of another program: record it there, not by --capture")
+        raise click.UsageError(f"{address} is the line of another program; leave out --capture, and record it there")
     return ReachedLine(address, connection)
 
 
 def tell_owner(owner: Owner) -> None:
-    """Say on standard error through whom it goes."""
-    note(f"{owner.port} is owned by process {owner.pid}: asking through {owner.address}")
+    """Report on standard error which process owns the line."""
+    note(f"{owner.port} is owned by process {owner.pid}; using it through {owner.address}")
 
 
 def check_no_owner(endpoint: Endpoint) -> None:
     """Raise LineDown where another program owns the line of a port: a serial server would let in two masters."""
     owner = owner_of(endpoint)
     if owner is not None:
-        hint = "end that first: two masters on one line garble each other"
+        hint = "stop that process first: two masters on one line garble each other's frames"
         raise LineDown(f"{owner.port} is owned by process {owner.pid}", hint=hint)
 
 
@@ -95,7 +96,7 @@ def device_of(name: str, *, by_tcp: bool) -> set[Hashable]:
 
 
 def check_settings(connection: Connection, about: Mapping[str, Any]) -> None:
-    """Raise UsageError for settings of the line that were said, and are not the owner's."""
+    """Raise UsageError for given line settings that differ from the owner's."""
     wanted = None if is_served(connection.port) else connection.endpoint().settings
     said = set(parse_qs(connection.port.partition("?")[2]))
     baud = wanted.baudrate if wanted is not None and "baudrate" in said else connection.baud
@@ -107,7 +108,10 @@ def check_settings(connection: Connection, about: Mapping[str, Any]) -> None:
     ]
     if differs:
         has = f"{about['baudrate']} {about['framing']}" + (" with an echo" if about["echo"] else "")
-        raise click.UsageError(f"process {about['process']} owns {about['line']} at {has}, not {', '.join(differs)}")
+        raise click.UsageError(
+            f"process {about['process']} owns {about['line']} with {has}, not {', '.join(differs)}; "
+            "leave out these settings"
+        )
 
 
 def token_for(address: str) -> str | None:

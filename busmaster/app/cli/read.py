@@ -53,7 +53,7 @@ def command(connection: Connection, node: int | None, items: tuple[str, ...], as
 async def read(
     connection: Connection, address: int, items: tuple[str, ...], how: dict[str, Any], as_json: bool
 ) -> None:
-    """Read the items of one node and print each; all are checked before the first is asked for."""
+    """Read the items of one node and print each. All are checked before the first request."""
     bus = reach(connection)
     handle = connection.open_handle(bus, address)
     points = [handle.point(item) for item in items]
@@ -77,7 +77,9 @@ def read_of_file(connection: Connection, names: tuple[str, ...], as_json: bool) 
     owner = owner_of(file.port)
     if owner is not None:
         if connection.capture is not None:
-            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+            raise click.UsageError(
+                f"{owner.port} is the line of another program; leave out --capture, and record it there"
+            )
         tell_owner(owner)
         until_ended(read_points, ConfiguredLine(file, outputs=False), connect(owner.address), names, as_json)
         return
@@ -87,7 +89,7 @@ def read_of_file(connection: Connection, names: tuple[str, ...], as_json: bool) 
 
 
 async def read_points(line: ConfiguredLine, bus: Bus | RemoteBus, names: tuple[str, ...], as_json: bool) -> None:
-    """Read points of a line over `bus` and print each; all are checked before the first is asked for."""
+    """Read points of a line over `bus` and print each. All are checked before the first request."""
     points = [line.point(name) for name in names]
     other = None if bus is line.bus else bus
     handles = {point.where: line.handle(point.where, other) for point in points}

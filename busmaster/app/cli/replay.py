@@ -17,16 +17,16 @@ CHANGED = 1
 COUNTED = ("same", "changed", "unjudged")
 
 
-@click.command(short_help="Read a capture again, by the readers of today.")
+@click.command(short_help="Decode a capture again, and show differences.")
 @click.argument("capture", type=click.Path(exists=True, dir_okay=False))
 @json_option
 def command(capture: str, as_json: bool) -> int:
-    """Read again what a capture has recorded, and say what comes out otherwise than it was recorded.
+    """Decode a capture with this version, and show differences from the recorded results.
 
-    A line for each exchange that has changed, then how many there were. The exit status is 1 if any has. What no
-    reader was asked about is not judged: bytes that the port called damaged, say, or an exchange that was cut off.
-    A file that is cut off, as its recorder was killed, is read up to there, and that is said on standard error.
-    With --json every exchange is an object, changed or not, and so are the counts behind them.
+    The command prints a line for each exchange that has changed, then the counts. The exit status is 1 if any has
+    changed. Exchanges without a recorded result are not judged, for example damaged bytes or an incomplete exchange.
+    If the file is incomplete, because its recorder was killed, it is read up to that place, and a message is printed.
+    With --json, each exchange is an object, changed or not, and the counts are the last object.
     """
     counts: Counter[str] = Counter()
     try:
@@ -48,18 +48,18 @@ def command(capture: str, as_json: bool) -> int:
 
 
 def whole_packets(file: BinaryIO) -> Iterator[Packet]:
-    """Yield the packets up to where the file is cut off, if it is. Raises CaptureError for one that is no capture."""
+    """Yield the packets, up to the end of an incomplete file. Raises CaptureError for a file that is not a capture."""
     packets = 0
     try:
         for packet in read_packets(file):
             packets += 1
             yield packet
     except CutOff as error:
-        note(f"{file.name}: {error}, behind packet {packets}: what is before is replayed")
+        note(f"{file.name}: {error}, after packet {packets}; only the packets before are replayed")
 
 
 def fields(one: Replayed) -> dict[str, Any]:
-    """Return an exchange as a JSON object: what was recorded, and what comes out now."""
+    """Return an exchange as a JSON object, with the recorded and the present result."""
     return {
         "packet": one.packet,
         "time": utc(one.micros / 1e6, "microseconds"),
@@ -73,14 +73,14 @@ def fields(one: Replayed) -> dict[str, Any]:
 
 
 def changed_text(one: Replayed) -> str:
-    """Return the line of an exchange that has changed: what was recorded, and what comes out now."""
+    """Return the line of an exchange that has changed, with the recorded and the present result."""
     moment = utc(one.micros / 1e6, "microseconds")
     node = "" if one.node is None else f"node {one.node}: "
     return f"packet {one.packet}, {moment}, {node}{one.command}: was {one.recorded}, is {one.now}"
 
 
 def summary_text(counts: Counter[str]) -> str:
-    """Return the line that says how many exchanges there were, and how many have changed."""
+    """Return the line with the numbers of all and of changed exchanges."""
     total = counts.total()
     text = f"{total} exchange{'' if total == 1 else 's'}: {counts['same']} the same, {counts['changed']} changed"
     return text + (f", {counts['unjudged']} not judged" if counts["unjudged"] else "")

@@ -1,4 +1,4 @@
-"""`busmaster run`: poll what a file says, with its outputs."""
+"""`busmaster run`: poll the groups of a file, and feed its outputs."""
 
 from __future__ import annotations
 
@@ -31,33 +31,33 @@ from busmaster.errors import InvalidCommand
 SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
 WORTH_SAYING = 0.005
-"""Share of the line that learned reply times would spare below which nothing is said of them."""
+"""Share of the line that learned reply times must save to be suggested."""
 FAREWELL = 2.0
 """Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
 
 
-@click.command(short_help="Poll what a file says, with its outputs.")
+@click.command(short_help="Poll the groups of a file, and feed its outputs.")
 @file_argument()
 @port_option
 @capture_option
 @viewed
 def command(path: str, port: str | None, capture: str | None, view: View) -> int:
-    """Poll the groups of LINE.toml until a signal ends it, and feed the outputs that it enables.
+    """Poll the groups of LINE.toml until a signal arrives, and feed the enabled outputs.
 
-    On a terminal a live table; else, or with --plain, a line for each value; with --json one for each cycle. A summary
-    on standard error ends it: of groups, of nodes, and of what each output has written and dropped. There each write
-    from outside is told too, with what became of it. An output that is slow or down never holds up the line. A port
-    that is missing is waited for. SIGHUP has the file read again.
+    On a terminal, the command shows a live table. Otherwise, or with --plain, it prints a line for each value, and with
+    --json for each cycle. Standard error gets each write from outside with its result, and at the end a summary of
+    groups, nodes and outputs. A slow or failed output never delays the line. If the port is missing, the command waits
+    for it. SIGHUP reloads the file.
 
-    When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
-    confirmed; else 0 after SIGTERM, 130 after Ctrl-C, and 128 and its number after another signal.
+    At the end, whatever the reason, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
+    confirmed; else 0 after SIGTERM, 130 after Ctrl-C, and 128 plus its number after another signal.
     """
-    with Hangups() as hangups:  # first of all: SIGHUP ends a process that does not hear it
+    with Hangups() as hangups:  # first of all: by default SIGHUP ends a process
         return run(path, port, capture, view, hangups)
 
 
 def run(path: str, port: str | None, capture: str | None, view: View, hangups: Hangups) -> int:
-    """Run the line of a file until it is told to end, and return the exit status."""
+    """Run the line of a file until a signal, and return the exit status."""
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
@@ -87,12 +87,12 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
             stopped = isinstance(ended, SystemExit) and ended.code == 128 + signal.SIGTERM
             if running.left_safely and not stopped:
                 raise
-            status = OK  # how a service is stopped is no failure of it
+            status = OK  # SIGTERM is the normal end of a service
         return status if running.left_safely else FAILED
 
 
 class Running:
-    """One line that runs as a file says, until it is told to end. `left_safely` says whether its safe state holds."""
+    """One line of a file that runs until a signal. `left_safely`: whether its safe state was confirmed."""
 
     def __init__(self, line: ConfiguredLine, path: str, view: View, hangups: Hangups, ending: Ending | None) -> None:
         self.line = line
@@ -106,7 +106,7 @@ class Running:
         self._manager = ServiceManager()
 
     async def run(self) -> int:
-        """Run the line until it is told to end, send its safe state, and return the exit status."""
+        """Run the line until a signal, send its safe state, and return the exit status."""
         entered = False
         self.line.outputs.tell = self._tell_of_output
         service = service_of(self.line)  # now: it keeps what happens as the line is opened
@@ -139,22 +139,22 @@ class Running:
                 try:
                     await anyio.sleep_forever()
                 finally:
-                    # at once: what is shown may take its time to end, and so may an output that a new file replaces
+                    # at once: the screen, or an output that a new file replaces, may take time to end
                     await self._leave()
 
         return await follow(self.watch, beside)
 
     def _say_what_is_polled(self) -> None:
         if not self.line.groups:
-            note("nothing is polled: the file has no [groups.NAME]", Level.WARNING)
+            note("nothing is polled, because the file has no poll group; add [groups.NAME]", Level.WARNING)
         if self.line.safe_state:
             writes = (f"{write.point.key} = {number_text(write.value)}" for write in self.line.safe_state.writes)
-            note(f"safe state: when this ends, {', '.join(writes)} within {self.line.safe_state.within:g} s")
+            note(f"safe state at the end: {', '.join(writes)} within {self.line.safe_state.within:g} s")
         else:
-            note("no safe state: when this ends, nodes keep what was written to them last (see [safe])")
+            note("no safe state: at the end, nodes keep the values that were written last (see [safe])")
 
     async def _say_what_learning_would_gain(self) -> None:
-        """Say once what learned reply times would spare of the line, where a node has none."""
+        """Report once how much of the line learned reply times would save, if a node has none."""
         if self.line.groups and any(node.could_learn for node in self.line.file.nodes.values()):
             losses = (await self.line.bus.plan()).losses
             if losses.documented - losses.learned >= WORTH_SAYING:
@@ -166,9 +166,9 @@ class Running:
             await self._read_again()
 
     async def _read_again(self) -> None:
-        """Go on as the file says now, and with whatever device has the port's name.
+        """Apply the changed file, and reopen the port if its name now belongs to another device.
 
-        A file that is wrong is told, and the line goes on as it was.
+        An error in the file is reported, and the line continues without changes.
         """
         self._manager.reloading()
         ext.accept_device(self.line.bus)
@@ -177,19 +177,19 @@ class Running:
             await self.line.take(file)
             self.line.authorisation.take_secrets(secrets)
         except (InvalidCommand, OSError) as error:
-            note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
+            note(f"reload failed, nothing was changed: {error}", Level.ERROR)
         else:
             if self.watch.service is not None:
                 self.watch.service.line.title = file.title
             self.watch.replace_groups(self.line.groups.values())
-            note(f"{self._path} was read again", Level.NOTICE)
+            note(f"{self._path} was reloaded", Level.NOTICE)
             self._say_what_is_polled()
         self._manager.ready()
 
     def _checked_file(self) -> tuple[LineFile, dict[str, bytes]]:
         """Load the file and its tokens, and check them.
 
-        Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
+        Raises OSError, and InvalidCommand with line and key for an error in the file.
         """
         file = load(self._path)
         # made for its complaints alone: `take` wants a file of which a line can be made
@@ -208,7 +208,7 @@ class Running:
     def _why(self) -> str:
         """Return what ends the run."""
         number = self._ending.number if self._ending is not None else 0
-        return signal.Signals(number).name if number else "the end of the run"
+        return signal.Signals(number).name if number else "end of run"
 
     async def _leave(self) -> None:
         """Send the safe state, once: nothing else is written any more."""
@@ -220,14 +220,14 @@ class Running:
             outcomes = await self.line.safe_state.enter(self.line.authorisation, self._why())
             self.left_safely = tell_unsafe(outcomes) == OK
             if self.left_safely:
-                note(f"the safe state is confirmed: {', '.join(outcomes)}", Level.NOTICE)
+                note(f"safe state confirmed: {', '.join(outcomes)}", Level.NOTICE)
 
 
 def output_text(counts: OutputStatistics) -> str:
-    """Return the line that says what an output has written and dropped, and what it is down with."""
+    """Return the line with the counts of an output, and its error if it is down."""
     text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
     if counts.suppressed:
-        text += f", {counts.suppressed} suppressed as no news"
+        text += f", {counts.suppressed} suppressed"
     if counts.spilled:
-        text += f", {counts.spilled} kept on disk for the next time"
+        text += f", {counts.spilled} kept on disk for the next run"
     return f"{text}, down: {counts.error}" if counts.error else text

@@ -31,15 +31,15 @@ from busmaster.events import BusEvent, PortFailed, Stream
 def command(path: str, port: str | None, capture: str | None) -> int:
     """Send the writes that [safe] in LINE.toml lists, urgently, read each back, and print `POINT ok`.
 
-    Nothing is polled. The outputs keep a record of the writes, once those are over. What was not confirmed in the
-    file's time is named on standard error, and the exit status is 1. A port that cannot be opened is waited for in that
-    time, and named with the reason. The writes are sent even where --capture cannot record them.
+    Nothing is polled. Afterwards the outputs log the writes. Points that were not confirmed within the file's time are
+    printed on standard error, and the exit status is 1. If the port cannot be opened, the command prints the reason and
+    retries during that time. The writes are sent even if --capture cannot record them.
 
-    Where another busmaster owns the line, that sends them, if its file says the same; the line goes on afterwards.
+    If another busmaster owns the line and has the same [safe], it sends the writes, and the line continues afterwards.
     """
     file = load(path)
     if not file.safe.writes:
-        raise click.UsageError(f"{path} has no safe state: its writes stand in [safe]")
+        raise click.UsageError(f"{path} has no safe state; define its writes in [safe]")
     endpoint = other_port(file, port)
     where = endpoint or file.port
     owner = owner_of(where)
@@ -48,14 +48,16 @@ def command(path: str, port: str | None, capture: str | None) -> int:
         if owner is None:
             return until_ended(leave, line)
         if capture is not None:
-            note(f"{owner.port} is a line of another program: it is recorded there, not by --capture", Level.WARNING)
+            note(
+                f"{owner.port} is the line of another program; leave out --capture, and record it there", Level.WARNING
+            )
         tell_owner(owner)
         return until_ended(leave_through, connect(owner.address, safe_only=True), line.safe_state.values)
 
 
 @contextmanager
 def recorded(capture: str | None, endpoint: Endpoint) -> Iterator[Recorder | None]:
-    """Yield what records the line, as `capturing` does; None, having said why, where that cannot be: a stop goes on."""
+    """Yield the recorder of `capturing`; None, after a message, if recording is not possible. The stop continues."""
     with ExitStack() as recording:
         recorder = None
         try:
@@ -84,12 +86,12 @@ async def leave(line: ConfiguredLine) -> int:
     try:
         await keep(line.audit(note), records)
     except InvalidCommand as error:
-        note(f"no record is kept of what was written: {error}", Level.WARNING)
+        note(f"these writes are not in the audit log: {error}", Level.WARNING)
     return status
 
 
 async def tell_of_port(events: Stream[BusEvent]) -> None:
-    """Say on standard error why the port cannot be opened, until the bus is closed."""
+    """Report on standard error why the port cannot be opened, until the bus is closed."""
     async for event in events:
         if isinstance(event, PortFailed):
             note(event_text(event), Level.ERROR)
@@ -107,5 +109,5 @@ def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:
     """Name each point that was not confirmed on standard error, and return the exit status."""
     unsafe = {name: error for name, error in outcomes.items() if error is not None}
     for name, error in unsafe.items():
-        note(f"the safe state of {name} is not confirmed: {error}", Level.CRITICAL)
+        note(f"safe state of {name} not confirmed: {error}", Level.CRITICAL)
     return FAILED if unsafe else OK

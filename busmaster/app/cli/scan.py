@@ -24,24 +24,24 @@ from busmaster.registry import protocols
 SILENCE = 0.1
 """Seconds behind the last bytes after which the line knows whose they were, with time to spare."""
 STRANGERS = 16
-"""How many nodes that do not answer are asked in another protocol."""
+"""Maximum number of silent nodes that are tried in another protocol."""
 
 
-@click.command(short_help="Find the nodes that answer.", cls=NodeCommand)
+@click.command(short_help="Find the nodes that reply.", cls=NodeCommand)
 @connected
 @nodes_option
 @json_option
 def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool) -> None:
-    """Ask every node of PORT once and print a line for each that answers: `NODE` and what it answered.
+    """Send one request to every node of PORT, and print a line for each that replies: `NODE` and its reply.
 
-    All addresses of the protocol are asked unless --nodes names some. On standard error it says which of those that do
-    not answer are only late, and which answer in another protocol that may share the line.
+    All addresses of the protocol are tried unless --nodes names some. Standard error lists nodes that reply late, or in
+    another protocol that may share the line.
     """
     until_ended(scan, connection, nodes_to_ask(connection.profile, nodes), as_json)
 
 
 async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:
-    """Ask each address once, and print what answers, behind a bar of the progress."""
+    """Send one request to each address, and print the replies, with a progress bar."""
     from busmaster.app.cli.progress import Bar  # before the line is opened; it takes a fifth of the time of --help
 
     bus = reach(connection)
@@ -76,13 +76,13 @@ async def in_other_protocols(bus: Bus | RemoteBus, profile: Profile, silent: Seq
         for address in [address for address in silent if address in other.profile.addresses][:STRANGERS]:
             if await ask(bus.node(other.profile, address)) is not None:
                 name = other.kinds[0].name
-                yield f"{other.profile.label(address)} answers in {other.profile.title}: use --protocol {name}"
+                yield f"{other.profile.label(address)} replies in {other.profile.title}; use --protocol {name}"
 
 
 async def ask(node: Requester) -> tuple[object, str] | None:
-    """Ask a node once, and return the value and what happened in words; None if nothing was heard of it.
+    """Send one request to a node, and return the value and the result in words; None if it is silent.
 
-    It is asked again where its answer was garbled, or could have been the late one of a node before it.
+    The request is repeated if the reply was garbled, or could have been a late reply of a node before it.
     """
     outcome = await ask_once(node)
     if isinstance(outcome, GarbledReply):
@@ -93,10 +93,10 @@ async def ask(node: Requester) -> tuple[object, str] | None:
 
 
 async def ask_once(node: Requester) -> tuple[object, str] | GarbledReply | None:
-    """Ask a node, and return the value and what happened in words, what was garbled, or None for silence."""
+    """Send a request to a node, and return the value and the result in words, garbled bytes, or None for silence."""
     probe = node.profile.probe
     try:
-        # behind all that other programs ask of the line: a node that is not there takes its whole reply window
+        # after the requests of other programs: a missing node takes its whole reply window
         value = await node.request(probe, retries=0, priority=Priority.BACKGROUND)
     except (NoReply, NodeDown):
         return None

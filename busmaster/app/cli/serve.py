@@ -16,12 +16,12 @@ from busmaster.app.cli.run import run
 @port_option
 @capture_option
 @seconds_option
-@click.option("--read-only", is_flag=True, help="No MQTT command or program writes to a node.")
+@click.option("--read-only", is_flag=True, help="Reject writes from MQTT commands and programs.")
 def command(path: str, port: str | None, capture: str | None, seconds: float | None, read_only: bool) -> int:
     """Do what `busmaster run` does with LINE.toml, and print nothing but what happens, on standard error.
 
     Other programs read and write by its socket, which is named there: `connect` in Python, `busmaster read` and
     `busmaster write` with its PORT, and whatever speaks JSON-RPC over WebSocket. `busmaster status` lists it.
     """
-    with Hangups() as hangups:  # first of all: SIGHUP ends a process that does not hear it
+    with Hangups() as hangups:  # first of all: by default SIGHUP ends a process
         return run(path, port, capture, View(seconds, read_only=read_only, silent=True), hangups)

@@ -20,7 +20,7 @@ def secrets_of(file: LineFile) -> dict[str, bytes]:
 
 
 def service_of(line: ConfiguredLine) -> Service | None:
-    """Return what is to serve the line to other programs; None where its file does not want that."""
+    """Return the service of the line for other programs; None if its file disables that."""
     section = line.file.service
     if not section.enabled:
         return None
@@ -39,9 +39,9 @@ def service_of(line: ConfiguredLine) -> Service | None:
 
 @asynccontextmanager
 async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Service | None]:
-    """Serve a line, and yield what serves it; None for a line that cannot be served, which runs all the same.
+    """Serve a line, and yield its service; None if that is not possible. The line runs in any case.
 
-    Says where it is served if it is to `tell`.
+    With `tell`, the addresses are printed.
     """
     if service is None:
         yield None

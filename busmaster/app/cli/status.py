@@ -18,7 +18,7 @@ from busmaster.app.service.values import utc
 from busmaster.errors import BusError
 
 ANSWER_WITHIN = 2.0
-"""Seconds in which a program that owns a line has to say how it is."""
+"""Seconds within which the owner of a line must report its state."""
 NOT_FOR_US = "not for this user"
 REFUSED = {
     "refused_connections": "connections refused",
@@ -28,24 +28,25 @@ REFUSED = {
 """What the owner has counted, and how it is named."""
 
 
-@click.command(short_help="List this user's lines that run.")
+@click.command(short_help="List the running lines of this user.")
 @json_option
 def command(as_json: bool) -> int:
-    """List the lines that programs of this user serve, and those of the system in /run/busmaster: name, port, process,
-    programs that use it, how busy it is, or that it is offline, and how many of its nodes are up. The exit status is 1
-    if one does not answer; one that is not for this user is listed as such. Connections that were refused, and
-    logins that failed, are named on standard error.
+    """List the lines that programs of this user serve, and those of the system in /run/busmaster.
+
+    Each line is printed with its name, port, process, number of connected programs, utilisation or "offline", and
+    number of nodes that are up. The exit status is 1 if a process does not reply. Lines that this user cannot access
+    are marked. Refused connections and failed logins are reported on standard error.
     """
     return until_ended(status, as_json)
 
 
 async def status(as_json: bool) -> int:
-    """Ask every line how it is, print that, and return the exit status."""
+    """Request the state of every line, print it, and return the exit status."""
     lines = await asyncio.gather(*map(ask, owners()))
     if as_json:
         emit_all(json_line(**line) for line in lines)
     elif not lines:
-        note("no line of this user is served: start busmaster run LINE.toml")
+        note("no running line of this user; start one with: busmaster run LINE.toml")
     else:
         emit(*columns([("NAME", "PORT", "PROCESS", "PROGRAMS", "BUSY", "NODES UP"), *map(cells, lines)], {2, 3, 4, 5}))
     for line in () if as_json else lines:
@@ -55,7 +56,7 @@ async def status(as_json: bool) -> int:
 
 
 async def ask(owner: Owner) -> dict[str, Any]:
-    """Return how a line is, or why its owner does not say so."""
+    """Return the state of a line, or why its owner does not report it."""
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
     line |= {"tcp": None, "programs": None, "utilisation": None, "state": None}
     line |= dict.fromkeys(REFUSED)
@@ -75,7 +76,7 @@ async def ask(owner: Owner) -> dict[str, Any]:
         if isinstance(error.__cause__, PermissionError):
             line["error"] = NOT_FOR_US
         else:
-            line["error"] = error.what if isinstance(error, BusError) else "it does not answer"
+            line["error"] = error.what if isinstance(error, BusError) else "no reply from its process"
     return line
 
 

@@ -1,6 +1,6 @@
-"""What systemd is told of a service, by datagrams: that it is ready, that it lives, that it reloads, that it stops.
+"""Notifies systemd, by datagrams, that a service is ready, is alive, reloads or stops.
 
-The protocol is a few lines (sd_notify): NAME=VALUE, a line each, to the socket that NOTIFY_SOCKET names.
+The protocol (sd_notify) is one NAME=VALUE per line, sent to the socket that NOTIFY_SOCKET names.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import anyio
 from busmaster import Bus, Health, LineState, ext
 
 AT_LEAST = 0.1
-"""Seconds from one sign of life to the next, whatever was asked for."""
+"""Shortest time in seconds between two watchdog messages, independent of the configured interval."""
 
 
 class ServiceManager:
-    """Tells systemd, or nobody where there is none. Nothing that goes wrong with it holds up or ends anything.
+    """Notifies systemd, if there is one. Failures of the notification never delay or end the program.
 
-    `interval` is the seconds within which systemd wants a sign of life, 0 for none.
+    `interval`: seconds within which systemd expects a watchdog message, 0 for none.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -32,7 +32,7 @@ class ServiceManager:
         if self._socket is not None:
             self._socket.setblocking(False)  # a manager that does not read holds up no line
         micros = environment.get("WATCHDOG_USEC", "")
-        # a child inherits what was meant for its parent: the process id tells
+        # a child inherits the parent's variable: compare the process id
         wanted = micros.isdecimal() and environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.interval = int(micros) / 1e6 if wanted and path else 0.0
 
@@ -46,19 +46,19 @@ class ServiceManager:
                 pass
 
     def ready(self) -> None:
-        """Say that the service does what it is for; also after `reloading`."""
+        """Report that the service is ready; also after `reloading`."""
         self.tell(READY=1)
 
     def reloading(self) -> None:
-        """Say that the service reads its file again, until it is `ready`."""
+        """Report that the service reloads its file, until it is `ready`."""
         self.tell(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
 
     def stopping(self) -> None:
-        """Say that the service ends, in order."""
+        """Report that the service stops in an orderly way."""
         self.tell(STOPPING=1)
 
     def close(self) -> None:
-        """Close the socket; nothing is told any more."""
+        """Close the socket; nothing is sent any more."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -75,7 +75,7 @@ class ServiceManager:
 
 
 class Movement:
-    """Whether a line does what it is to do: exchanges go over it, not only the loop round."""
+    """Watches whether a line works: exchanges take place, not only iterations of the loop."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -83,10 +83,10 @@ class Movement:
         self._since = bus.now()
 
     def goes_on(self, patience: float) -> bool:
-        """Tell whether there was an exchange in the last `patience` seconds, or in two periods if those are longer.
+        """Return whether there was an exchange in the last `patience` seconds, or in two periods if those are longer.
 
-        A line has no reason to move while its port is away (it is opened again, and that is told), while nothing is
-        polled, or while every node is down or suspended.
+        No exchange is expected while the port is lost (reopening is reported separately), while nothing is polled, or
+        while every node is down or suspended.
         """
         now = self._bus.now()
         exchanges = ext.line_statistics(self._bus).exchanges

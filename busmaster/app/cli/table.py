@@ -84,7 +84,7 @@ class Table(ScrollView, can_focus=True):
         self.call_after_refresh(self._keep_in_sight)
 
     def render_line(self, y: int) -> Strip:
-        """Draw one line of what is in sight."""
+        """Draw one visible line."""
         index = y + self.scroll_offset.y
         if index >= len(self.rows):
             return Strip.blank(self.size.width, self.rich_style)

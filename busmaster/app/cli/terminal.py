@@ -19,7 +19,7 @@ def printable(text: str) -> str:
 
 
 def made_printable(told: Any) -> Any:
-    """Return what was said with nothing in its texts that a terminal would obey."""
+    """Return a copy of `told` without control characters in its texts."""
     match told:
         case str():
             return printable(told)

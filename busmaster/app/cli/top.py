@@ -30,10 +30,10 @@ TERMINAL_LOOKED_AT = 1.0
 """Seconds between two looks at whether the terminal is still there."""
 
 
-@click.command(short_help="Show a line that another program owns, live.")
+@click.command(short_help="Show a line of another program, live.")
 @click.argument("line", required=False, metavar="[LINE|unix:PATH|PORT]")
-@click.option("--read-only", is_flag=True, help="No key writes to a node.")
-@click.option("--of-owner", is_flag=True, hidden=True, help="It is the view of the program that owns the line.")
+@click.option("--read-only", is_flag=True, help="Reject writes from keys.")
+@click.option("--of-owner", is_flag=True, hidden=True, help="Run as the view of the program that owns the line.")
 def command(line: str | None, read_only: bool, of_owner: bool) -> int:
     """Show the points, groups and nodes of a line as they change, until q or Ctrl-C. The line goes on.
 
@@ -46,7 +46,7 @@ def command(line: str | None, read_only: bool, of_owner: bool) -> int:
 
 
 def what_is_missing() -> str:
-    """Return what is to be installed for the live view, "" for nothing."""
+    """Return the missing package of the live view as text, "" if there is none."""
     extras = {"textual": "tui", "websockets": "service"}
     missing = [extra for module, extra in extras.items() if find_spec(module) is None]
     return f"an extra: pip install 'busmaster[{','.join(missing)}]'" if missing else ""
@@ -57,19 +57,19 @@ def address_of(line: str | None) -> str:
     if line is None:
         running = [owner for owner in owners() if os.access(owner.socket, os.W_OK)]
         if not running:
-            raise LineDown("no line of this user is served", hint="start busmaster run LINE.toml")
+            raise LineDown("no running line of this user", hint="start one with: busmaster run LINE.toml")
         if len(running) > 1:
             names = ", ".join(owner.name for owner in running)
-            raise click.UsageError(f"several lines run: say which, one of {names}")
+            raise click.UsageError(f"several lines are running; name one of {names}")
         return running[0].address
     if is_served(line):
         return line
     if not is_line_file(line):
         owner = find_owner(line) or owner_of(endpoint(line, defaults=ANY_RATE))
-        return line if owner is None else owner.address  # for what is said of a name that nobody has
+        return line if owner is None else owner.address  # for the error message about an unknown name
     owner = find_owner(line_name(os.path.basename(line).removesuffix(".toml"))) or owner_of(load(line).port)
     if owner is None:
-        raise LineDown(f"no program of this user serves the line of {line}", hint=f"start busmaster run {line}")
+        raise LineDown(f"no running line of {line}", hint=f"start it with: busmaster run {line}")
     return owner.address
 
 
@@ -92,9 +92,7 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
         if tasks[0].done():
             await tasks[0]
         if not (sys.stdin.isatty() and sys.stdout.isatty()):
-            raise click.UsageError(
-                "top draws on a terminal: for values in a file or a pipe see busmaster poll and read"
-            )
+            raise click.UsageError("top needs a terminal; for values in a file or a pipe use busmaster poll or read")
         screen = Screen(following.picture, following, leave="end the run" if of_owner else "leave")
 
         def show_state() -> None:
@@ -104,7 +102,7 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
             screen.picture, screen.read_only = following.picture, following.read_only
             screen.take_picture()
             if of_owner and screen.away:
-                screen.exit(FAILED)  # the terminal is given back, then it is said why
+                screen.exit(FAILED)  # the terminal is restored before the reason is printed
 
         following.on_state(show_state)
         following.on_picture(lambda method, _: screen.take_picture() if method == "frame" else None)
@@ -124,7 +122,7 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
 
 
 async def hang_up(screen: Screen) -> None:
-    """End the screen when its terminal is gone: nothing that is read there says so."""
-    while os.isatty(sys.stdin.fileno()):  # noqa: ASYNC110  nobody tells it
+    """End the screen when its terminal is closed: reads do not report that."""
+    while os.isatty(sys.stdin.fileno()):  # noqa: ASYNC110  there is no event for it
         await asyncio.sleep(TERMINAL_LOOKED_AT)
     screen.exit(FAILED)

@@ -27,15 +27,15 @@ from busmaster.events import AlarmChanged, BusEvent, LineChange, LineChanged, No
 from busmaster.statistics import LearnedTimes
 
 LINE = ""
-"""Stands for the line itself among what is in trouble."""
+"""Key of the line itself in the set of current faults."""
 
 
 class Watch:
-    """What is told of a bus while its groups are polled. Times are in seconds since it was made.
+    """Shows and reports the polling of a bus. Times are in seconds since this object was created.
 
-    `view` says how it is shown, `authorisation` is what the writes of the screen pass. `steady`: that nobody can print
-    any more does not end it. `of_file`: a LINE.toml says what is polled. It hears what happens to the bus from the
-    start on, before that is entered too.
+    `view`: the form of the output. `authorisation`: checks the writes of the screen. `steady`: failures of standard
+    output do not end it. `of_file`: the groups are those of a LINE.toml. Events of the bus are received from the start,
+    also before it is entered.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Watch:
             tasks.start_soon(print_cycles, self, group)
 
     async def listen(self) -> None:
-        """Tell on standard error what happens to the bus and matters, until cancelled."""
+        """Report important events of the bus on standard error, until cancelled."""
         async for event in self._heard:
             level = self._level(event)
             if (text := event_text(event)) and level is not None and self.may_print():
@@ -102,9 +102,9 @@ class Watch:
                 note(text, level)
 
     def _level(self, event: BusEvent) -> Level | None:
-        """Return how much an event matters to whoever is not looking: a loss, and its end, once each.
+        """Return the level at which an event is logged: the start and the end of a fault, once each.
 
-        None stands for the rest.
+        None for other events.
         """
         match event:
             case PortFailed():
@@ -145,14 +145,14 @@ class Watch:
             note(text, level)
 
     def may_print(self) -> bool:
-        """Tell whether a line may be printed on standard error: it must not tear the picture that is drawn there."""
+        """Return whether a line may be printed on standard error without damage to the screen."""
         return not (shown_on_screen(self.view) and sys.stderr.isatty())
 
     def summarise(self) -> None:
         """Print the summary on standard error: cycles, missed, achieved period, utilisation; a line for each node."""
         counts = ext.line_statistics(self.bus)
         if self.bus.state is LineState.RESYNCHRONISING and not (counts.exchanges or counts.unexpected_bytes):
-            note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
+            note("no request was sent: a new line first waits for replies to an earlier master; let it run longer")
         if text := loss_text(self.bus):
             note(text, Level.WARNING)
         for group in self.groups:
@@ -173,7 +173,7 @@ class Watch:
             if text := learned_text(bus_node.statistics().learned):
                 note(f"{bus_node.label}: {text}")
         if text := uart.damage_text(uart.damage(counts.damaged, counts.breaks, counts.driver)):
-            note(f"uart: {text}; `busmaster doctor` says what to look for")
+            note(f"uart: {text}; run `busmaster doctor` for advice")
 
 
 def loss_text(bus: Bus) -> str:
@@ -181,12 +181,14 @@ def loss_text(bus: Bus) -> str:
     losses, lost = ext.line_statistics(bus).losses, bus.condition
     if not (losses or lost.is_lost):
         return ""
-    times = f"lost {losses} time{'s' * (losses != 1)}, " if losses else "never connected, "
-    return f"line: {times}for {ext.lost_seconds(bus):.1f} s" + (f"; still lost: {lost.reason}" if lost.is_lost else "")
+    times = f"{losses} disconnect{'s' * (losses != 1)}, " if losses else "never connected, "
+    return f"line: {times}offline for {ext.lost_seconds(bus):.1f} s" + (
+        f"; still offline: {lost.reason}" if lost.is_lost else ""
+    )
 
 
 def learned_text(learned: Iterable[LearnedTimes]) -> str:
-    """Return what was learned of a node's reply times: the window of each kind of command that is trusted."""
+    """Return the learned windows of a node: one for each kind of command with enough replies."""
     windows = ", ".join(
         f"{times.kind}{' (packet)' * times.packet} {times.window * 1000:.2f} ms" for times in learned if times.trusted
     )
@@ -210,7 +212,7 @@ class Clock(Protocol):
 
 
 def json_cycle(watch: Clock, snapshot: Snapshot) -> str:
-    """Return a cycle as one JSON object: its times are in seconds since the start, but for `time`, when it was over."""
+    """Return a cycle as one JSON object: times are seconds since the start, but `time` is the time of day."""
     return json_line(**cycle_fields(snapshot, watch.since), time=utc(snapshot.wall_at(snapshot.finished)))
 
 
@@ -247,7 +249,7 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     """
     view = watch.view
     if wants_screen(view) and (missing := what_is_missing()):
-        note(f"the live view needs {missing}; plain lines instead")
+        note(f"the live view needs {missing}; showing plain lines")
     status = OK
 
     async def show(tasks: TaskGroup) -> None:
@@ -257,8 +259,8 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
         status = await draw(watch.service.address)
         if status == FAILED and watch.output is not None:
             status = OK
-            watch.view = replace(view, plain=True)  # what happens is told on standard error from now on
-            note("the screen is gone; polling goes on without it", Level.WARNING)
+            watch.view = replace(view, plain=True)  # events are reported on standard error from now on
+            note("the terminal was closed; polling continues without it", Level.WARNING)
         else:
             tasks.cancel_scope.cancel()
 
@@ -266,8 +268,8 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
         if shown_on_screen(view) and watch.service is None:
             try:
                 watch.service = await stack.enter_async_context(served_here(watch.authorisation, watch.title))
-            except (OSError, InvalidCommand) as error:  # no folder for it, say: the line runs all the same
-                note(f"there is no live view: {error}; plain lines instead", Level.WARNING)
+            except (OSError, InvalidCommand) as error:  # for example without a folder for it: the line runs in any case
+                note(f"no live view: {error}; showing plain lines", Level.WARNING)
                 watch.view = view = replace(view, plain=True)
         try:
             with anyio.move_on_after(view.seconds):
@@ -284,10 +286,10 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
 
 
 def wants_screen(view: View) -> bool:
-    """Tell whether there is a terminal on both sides, and nobody who would rather have it otherwise."""
+    """Return whether input and output are a terminal, and no option selects another form."""
     return not (view.plain or view.as_json or view.silent) and sys.stdout.isatty() and sys.stdin.isatty()
 
 
 def shown_on_screen(view: View) -> bool:
-    """Tell whether a screen is wanted, and what it needs is there."""
+    """Return whether a screen is wanted, and its package is installed."""
     return wants_screen(view) and not what_is_missing()

@@ -19,15 +19,15 @@ HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A
 NEEDED = ("starlette", "uvicorn", "websockets")
 
 
-@click.command(short_help="Serve a page and a REST API over a line that another program owns.")
+@click.command(short_help="Serve a page and a REST API for a line of another program.")
 @interface_options(BIND)
-@click.option("--token-file", metavar="FILE", help="Who may write: a name and its token on each line.")
+@click.option("--token-file", metavar="FILE", help="Users who may write: a name and a token on each line.")
 @click.option(
     "--host",
     "hosts",
     metavar="NAME",
     multiple=True,
-    help="A name under which a proxy passes requests on, without a port. A write then needs a token. Repeatable.",
+    help="Host name, without a port, of a proxy in front of the page. A write then needs a token. Repeatable.",
 )
 @click.option(
     "--history",
@@ -44,20 +44,20 @@ def command(
 ) -> int:
     """Show a line in browsers: values with trends, health, every exchange on the wire, events; and write its points.
 
-    LINE is the name that `busmaster status` lists, its LINE.toml or its port; without it, the one line that runs. The
-    line goes on whatever becomes of the page, and the page waits for a line whose owner is away. /openapi.json says
-    what programs may ask. Beyond this machine (--bind 0.0.0.0:8420) nobody writes without a token, and what is said
-    can be read on the way: put a proxy with TLS before it, whose name is said with --host, or come by ssh -L.
+    LINE is a name in `busmaster status`, a LINE.toml or a port. It is optional if only one line is running. The line
+    does not depend on the page, and the page waits for a line that is not running. /openapi.json describes the REST
+    API. If other machines can connect (--bind 0.0.0.0:8420), a write needs a token, and the traffic is not encrypted.
+    Use a proxy with TLS, and name it with --host, or connect with ssh -L.
     """
     if any(find_spec(module) is None for module in NEEDED):
-        raise click.UsageError("the page needs an extra: pip install 'busmaster[web]'")
+        raise click.UsageError("the web page is not installed; pip install 'busmaster[web]'")
     from busmaster.app.interfaces.web import serve
     from busmaster.app.outputs.history import HistoryFile
 
     listen, secrets = place_of(bind), {} if token_file is None else read_tokens(token_file)
     for host in hosts:
         if not HOST_NAME.fullmatch(host):
-            raise click.UsageError(f"--host: {host!r} is not the name of a host, like plant.example")
+            raise click.UsageError(f"--host: {host!r} is not a host name; write it like plant.example")
     followed = following(line, read_only=read_only)
     if history is not None and not Path(history).exists():
         note(f"--history: there is no file {history} yet", Level.WARNING)

@@ -30,19 +30,19 @@ from busmaster.ext import Handle, Send, WriteOptions
 from busmaster.registry import find
 
 Pairs = Sequence[Assignment]
-"""What is written, in its order: items, or points of a file, and their values."""
+"""The writes in their order: items, or points of a file, and their values."""
 
 
 @click.command(short_help="Write values of one node, or of a file's points.", cls=ItemCommand)
 @partial(connected, or_file=True)
 @node_option
 @click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]|ITEM=@FILE...")
-@click.option("--verify", is_flag=True, help="Read back and compare.")
+@click.option("--verify", is_flag=True, help="Read each value back and compare.")
 @click.option(
     "--decimals",
     type=Whole(min=0),
     metavar="N",
-    help="How many of the last digits on the line are decimals, where it carries no decimal point: 1 for 1.17=-47.6.",
+    help="Number of decimals, for a protocol without a decimal point on the line: 1 for 1.17=-47.6.",
 )
 @json_option
 def command(
@@ -55,24 +55,26 @@ def command(
 ) -> None:
     """Write to one node on PORT, in the order given, and print `ITEM ok` for each.
 
-    Several values go to ITEM and those after it. With @FILE they are those of a text file, such as a cam table, and are
-    written in the background of other traffic: numbers with commas, spaces or line ends between them. All values are
-    checked before the first is sent; the first that fails ends it, with those before it written.
+    Several values go to ITEM and the items after it. @FILE is a text file with the values, such as a cam table:
+    numbers, separated by commas, spaces or line ends. They are written in the background of other traffic. All values
+    are checked before the first is sent. The first that fails ends the command; those before it stay written.
 
     With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit. The file's limits
-    hold, and its outputs keep a record of each write, or of why it was refused. Where another busmaster owns the line,
-    its limits hold, and its outputs keep the record.
+    apply, and its outputs record each write, or why it was rejected. If another busmaster owns the line, its limits
+    apply, and its outputs keep the record.
     """
     pairs = [parsed(parse_assignment, text) for text in assignments]
     if not is_line_file(connection.port):
         if decimals is not None and not find(connection.protocol).takes_decimals:
-            raise click.UsageError(f"{connection.protocol} carries the decimal point itself: leave --decimals out")
+            raise click.UsageError(f"{connection.protocol} sends the decimal point itself; leave out --decimals")
         until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
         return
     file = load(connection.port)
     if (owner := owner_of(file.port)) is not None:
         if connection.capture is not None:
-            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+            raise click.UsageError(
+                f"{owner.port} is the line of another program; leave out --capture, and record it there"
+            )
         tell_owner(owner)
         until_ended(write_points_through, ConfiguredLine(file, outputs=False), owner.address, pairs, verify, as_json)
         return
@@ -129,7 +131,7 @@ async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs,
 
 
 def tell(name: str, as_json: bool, **fields: Any) -> None:
-    """Print that what is called so has been written, as a line or as JSON with these fields."""
+    """Print that `name` has been written, as a line or as JSON with these fields."""
     emit(json_line(**fields, ok=True, time=utc(time.time())) if as_json else f"{name} ok")
 
 
@@ -140,7 +142,7 @@ async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
 
 
 def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> Wish:
-    """Return what a person wants to have written; without a point, to what is none of the line."""
+    """Return the user's write request; without a point if the target is not a point of the line."""
     value = values[0] if len(values) == 1 else tuple(values)
     return Wish(interface="command line", by="busmaster write", name=name, point=point, value=value)
 

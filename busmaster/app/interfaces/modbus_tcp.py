@@ -732,7 +732,7 @@ class Answers:
         write, read = ("write_coils", "read_bits") if request.table == "coil" else ("write_registers", "read_registers")
         what = f"client {peer}: unit {unit}, {len(request.values)} from {request.table} {request.first}"
         try:
-            # Without the read of what it changes, all points of the unit would be stale until their next cycle.
+            # Without the read that matches the write, all points of the unit would be stale until their next cycle.
             changed = _modbus_commands()[read](request.first, len(request.values), request.table)
             await self._run(unit, Priority.COMMAND, write, request.first, request.values, touches=changed)
         except ExceptionReply as refused:

@@ -283,7 +283,7 @@ def _as_in_the_file(said: dict[str, Any]) -> dict[str, Any]:
 
 
 def _range(request: Request) -> tuple[float, float, int]:
-    """Return begin, end and limit of a request for history. Raises HTTPException for what is none."""
+    """Return begin, end and limit of a request for history. Raises HTTPException for a wrong value."""
     query = request.query_params
     end = _number(query, "to", time.time())
     begin = _number(query, "from", end - DEFAULT_RANGE)

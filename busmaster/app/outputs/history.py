@@ -1,7 +1,7 @@
 """The past values of a point, read from a database that the output `sqlite` writes, by a program that does not own it.
 
-A few samples are returned as they are. Of many, the range is divided into equal parts, and each part is summed up in
-one pass over its samples: 400 000 samples take about a second, 2.5 microseconds each.
+A few samples are returned unchanged. If there are more, the range is divided into equal parts, and one pass over the
+samples summarises each part. 400 000 samples take about a second, 2.5 microseconds each.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class HistoryFile:
         self._path = path
 
     def read(self, key: str, unit: str, begin: float, end: float, limit: int) -> History:
-        """Return what was recorded of a point from `begin` to `end`, seconds since 1970; it blocks.
+        """Return the recorded values of a point from `begin` to `end`, seconds since 1970; it blocks.
 
         `limit` is the largest number of samples or parts. Samples in another unit than `unit` are left out: they are
         numbers of another scale. Raises TimeoutError after `HISTORY_WITHIN`, and OSError where the database cannot be

@@ -329,7 +329,7 @@ class MqttOutput(SpillingOutput):
                 yield self._value(point, self._bus.as_of_now(point, sample) if current else sample)
 
     def _announce_value(self, point: Point[Any], sample: Sample[Any]) -> Iterator[Outgoing]:
-        """Yield what Home Assistant must know of a point before its first value, which shows what it is."""
+        """Yield the announcement of a point for Home Assistant, before its first value, which shows its type."""
         if self._home is not None and point.key not in self._announced and sample.error is None:
             self._announced.add(point.key)
             for config in self._home.value(point, sample.value):

@@ -11,7 +11,7 @@ LONGEST_SHOWN = 200
 """Maximum number of characters of each part of an audit entry, such as a value or an error."""
 
 RAW_COMMAND = "raw command"
-"""What the record of a write names in place of a point, where there is none: its value says the rest."""
+"""Name of a write in the audit log if no point matches. The value describes the write."""
 
 
 class Outcome(Enum):

@@ -93,7 +93,7 @@ def test_a_standard_error_that_takes_nothing_holds_up_nobody_and_what_is_lost_is
             write(authorisation, f"5/{number}")
         printed.goes_on.set()
     assert [line.split()[1] for line, _ in printed.lines[:-1]] == ["5/0", "5/1", "5/2", "5/3"]
-    assert printed.lines[-1] == ("audit: 2 writes are not listed here: nobody took the lines", Level.WARNING)
+    assert printed.lines[-1] == ("audit: 2 writes are not listed here; standard error was blocked", Level.WARNING)
 
 
 def test_the_log_is_as_before_when_it_has_ended() -> None:

@@ -81,10 +81,10 @@ def test_a_line_on_a_pseudo_terminal_is_measured_and_printed(busmaster: Command)
     done = busmaster("bench", *HCP2, "--nodes", "1-2", "--seconds", "0.3", "--priorities", "command=1,urgent=1")
     assert (done.status, done.err) == (
         0,
-        "busmaster: measuring for 0.3 s; Ctrl-C ends it and prints what was measured\n",
+        "busmaster: measuring for 0.3 s; Ctrl-C ends it and prints the result so far\n",
     )
     assert done.lines[0] == "hcp2, 2 nodes, 57600 baud 8N1, replies after 2 ms, emulated on a pseudo-terminal"
-    assert done.lines[1].startswith("2 callers, each as fast as values come (command 1, urgent 1); no poll group")
+    assert done.lines[1].startswith("2 callers, each without pauses (command 1, urgent 1); no poll group")
     rows = [line.split()[:2] for line in done.lines[3:7]]
     assert [row[0] for row in rows] == ["node", "node", "urgent", "command"]
     assert done.lines[2].split()[2:] == ["COUNT", "MEAN", "p50", "p90", "p99", "p99.9", "max"]
@@ -96,7 +96,7 @@ def test_a_line_on_a_pseudo_terminal_is_measured_and_printed(busmaster: Command)
 def test_errors_and_missed_cycles_are_printed_and_no_value_is_a_failure(busmaster: Command) -> None:
     dead = busmaster(*VIRTUAL, "--fault", "dead=1")
     assert dead.status == 1
-    assert "no value came" in dead.err
+    assert "no value was received" in dead.err
     assert dead.lines[-1].startswith("missed cycles: 0; errors: NoReply ")
     slow = busmaster(*VIRTUAL, "--reply-delay", "50", "--callers", "0", "--period", "0.025", "--budget", "missed=0")
     assert slow.status == 1
@@ -228,12 +228,12 @@ def test_a_file_that_is_no_report_cannot_be_compared(
         ((), "--protocol"),
         (("--protocol", "hcp3"), "no such protocol"),
         ((*HCP2, "--nodes", "999"), "no protocol has a node 999"),
-        ((*HCP2, "--seconds", "0"), "a time is above 0"),
+        ((*HCP2, "--seconds", "0"), "a time must be above 0"),
         ((*HCP2, "--seconds", "1e6"), "3600 s at most"),
         ((*HCP2, "--callers", "-1"), "--callers"),
         ((*HCP2, "--callers", "1001"), "--callers"),
-        ((*HCP2, "--every", "0"), "a time is above 0"),
-        ((*HCP2, "--period", "-1"), "a time is above 0"),
+        ((*HCP2, "--every", "0"), "a time must be above 0"),
+        ((*HCP2, "--period", "-1"), "a time must be above 0"),
         ((*HCP2, "--priorities", "hurry"), "no such priority 'hurry'"),
         ((*HCP2, "--priorities", "urgent=x"), "a share is a whole number"),
         ((*HCP2, "--priorities", "urgent=0"), "one of them is above 0"),
@@ -244,15 +244,15 @@ def test_a_file_that_is_no_report_cannot_be_compared(
         ((*HCP2, "--budget", "urgent.p99=1"), "nothing measured has the name 'urgent'"),
         ((*HCP2, "--budget", "cycle.p99=1"), "nothing measured has the name 'cycle'"),
         ((*HCP2, "--budget", "7.p99=1"), "nothing measured has the name '7'"),
-        ((*HCP2, "--budget", "p99=2x"), "is for --compare"),
-        ((*HCP2, "--echo"), "--echo is for a PORT"),
-        ((*HCP2, "--address-step", "2"), "is for msc alone"),
+        ((*HCP2, "--budget", "p99=2x"), "needs --compare"),
+        ((*HCP2, "--echo"), "--echo needs a PORT"),
+        ((*HCP2, "--address-step", "2"), "is only for msc"),
         (("/dev/x", *HCP2), "hcp2 needs a node"),
-        (("/dev/x", *HCP2, "--nodes", "1", "--virtual"), "--virtual is for an emulated line"),
-        (("/dev/x", *HCP2, "--nodes", "1", "--fault", "lost=1"), "--fault is for an emulated line"),
-        (("/dev/x", *HCP2, "--nodes", "1", "--reply-delay", "2"), "--reply-delay is for an emulated line"),
+        (("/dev/x", *HCP2, "--nodes", "1", "--virtual"), "--virtual needs an emulated line"),
+        (("/dev/x", *HCP2, "--nodes", "1", "--fault", "lost=1"), "--fault needs an emulated line"),
+        (("/dev/x", *HCP2, "--nodes", "1", "--reply-delay", "2"), "--reply-delay needs an emulated line"),
         (("unix:/x", *HCP2, "--nodes", "1"), "is a line of another program"),
-        (("--compare", "a.json", "b.json", *HCP2), "--compare measures nothing: leave out"),
+        (("--compare", "a.json", "b.json", *HCP2), "--compare does not measure; leave out"),
         (("--compare", "a.json"), "compare"),
     ],
 )

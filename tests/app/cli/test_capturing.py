@@ -38,4 +38,4 @@ def test_a_full_disk_is_said_at_the_end(capfd: pytest.CaptureFixture[str]) -> No
     with capturing("/dev/full", port="COM1") as recorder:
         assert recorder is not None
         recorder.overheard(1.0, bytes.fromhex("07 30 32 02 30 31 05 04"))
-    assert "the capture ends early: /dev/full: No space left on device" in capfd.readouterr().err
+    assert "capture stopped: /dev/full: No space left on device" in capfd.readouterr().err

@@ -75,7 +75,7 @@ def test_a_refusal_names_the_command(busmaster: Command, controllers: TcpServer)
 @pytest.mark.parametrize(
     ("assignment", "complaint"),
     [
-        ("1=abc", "'abc' is no number"),
+        ("1=abc", "'abc' is not a number"),
         ("1=nan", "finite"),
         ("1=1e30", "20 characters"),
         ("1", "ITEM=VALUE"),
@@ -97,33 +97,36 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
     ("arguments", "complaint"),
     [
         (("raed", "PORT"), "did you mean 'read'?"),
-        (("read", "PORT", "1"), "say what is spoken there: --protocol P, or a LINE.toml"),
+        (("read", "PORT", "1"), "protocol missing; use --protocol P, or a LINE.toml"),
         (("scan", "PORT"), "missing option '--protocol'"),
         (("read", "PORT", "--protocol", "hcp3", "1"), "no such protocol 'hcp3'; did you mean 'hcp'?"),
-        (("read", "PORT", *HCP2, "1"), "hcp2 needs a node: one of 0-255"),
+        (("read", "PORT", *HCP2, "1"), "hcp2 needs a node address, 0-255"),
         (("read", "PORT", *HCP2, "--node", "256", "1"), "256"),
         (("read", "PORT", "--protocol", "hcp", "--node", "16", "1"), "address 16 does not exist"),
-        (("read", "PORT", "--protocol", "dc104", "--node", "1", "1"), "dc104 has no addresses"),
+        (("read", "PORT", "--protocol", "dc104", "--node", "1", "1"), "dc104 has no node addresses"),
         (("read", "PORT", *HCP2, "--node", "1"), "missing argument 'ITEM...'"),
         (("read", "PORT", *HCP2, "--node", "1", "axis0.positoin"), "did you mean 'axis0.position'?"),
-        (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "0"), "a time is above 0"),
-        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and ei-bisynch"),
+        (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "0"), "a time must be above 0"),
+        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is only for ct-ansi and ei-bisynch"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
         (("read", "rfc2217://host", *HCP2, "--node", "1", "1"), "is not of the form rfc2217://HOST:PORT"),
         (("read", "host:5020", *HCP2, "--node", "1", "1"), "write a TCP port as socket://host:5020"),
         (("read", "PORT", *HCP2, "--node", "one", "1"), "'one' is not a valid whole number"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "9e9"), "at most 60000 ms"),
         (("read", "PORT", "--protcol", "hcp2", "1"), "no such option '--protcol': did you mean '--protocol'?\n"),
-        (("scan", "PORT", "--protocol", "mentor", "--nodes", "1,0"), "means all of them"),
-        (("poll", "PORT", *HCP2, "--nodes", "8-1", "--items", "1", "--period", "1"), "upwards: 1-8"),
+        (("scan", "PORT", "--protocol", "mentor", "--nodes", "1,0"), "is the broadcast address"),
+        (
+            ("poll", "PORT", *HCP2, "--nodes", "8-1", "--items", "1", "--period", "1"),
+            "the range 8-1 is descending; write 1-8",
+        ),
         (("poll", "PORT", *HCP2, "--nodes", "1;2", "--items", "1", "--period", "1"), "like 1-8,255"),
         (("poll", "PORT", *HCP2, "--nodes", "1", "--items", ",", "--period", "1"), "at least one item"),
-        (("poll", "PORT", *HCP2, "--nodes", "1", "--items", "1", "--period", "-1"), "a time is above 0"),
+        (("poll", "PORT", *HCP2, "--nodes", "1", "--items", "1", "--period", "-1"), "a time must be above 0"),
         (("emulate", *HCP2, "--tcp", "5020"), "HOST:PORT"),
-        (("emulate", *HCP2, "--pty", "--tcp", "127.0.0.1:0"), "not both"),
+        (("emulate", *HCP2, "--pty", "--tcp", "127.0.0.1:0"), "exclude each other"),
         (("emulate", *HCP2, "--fault", "losst=1"), "did you mean 'lost'?"),
         (("emulate", *HCP2, "--reply-delay", "5-x"), "as 2 or 50-100"),
-        (("emulate", "--protocol", "mentor", "--nodes", "0-3"), "means all of them"),
+        (("emulate", "--protocol", "mentor", "--nodes", "0-3"), "is the broadcast address"),
     ],
 )
 def test_wrong_usage_is_one_line_that_helps_and_status_2(
@@ -208,7 +211,7 @@ def test_poll_that_ends_without_a_value_ends_with_1(busmaster: Command, controll
     options = ("--nodes", "99", "--items", "1", "--period", "0.05", "--seconds", "0.2", "--json")
     polled = busmaster("poll", controllers.path, *HCP2, *options)
     assert polled.status == 1
-    assert "no value came" in polled.err
+    assert "no value was received" in polled.err
     assert "p50" not in polled.err, "there is no latency of a node that never answered"
 
 

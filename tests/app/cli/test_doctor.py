@@ -118,7 +118,7 @@ def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended()
         "learning",
     ]
     assert (
-        findings.on("node 1").what == "answers after 2.2 / 2.2 / 2.2 ms (least / median / p99 of 25): read element 1: 0"
+        findings.on("node 1").what == "replies after 2.2 / 2.2 / 2.2 ms (least / median / p99 of 25): read element 1: 0"
     )
     assert findings.on("windows").what.endswith("set are 50 / 100 / 150 ms (late_after / window / max_reply_delay)")
 
@@ -169,13 +169,13 @@ def test_where_another_master_is_heard_nothing_is_sent() -> None:
     request = bytes.fromhex("07 30 35 02 30 31 05 03")  # HCP2: read element 1 of node 5
     findings = examined(line_of("hcp2", [Chatterbox(request), hcp2(1)]), (1,))
     assert findings[-1] is findings.on("silence")
-    assert "somebody speaks already, so nothing was sent" in findings[-1].what
+    assert "another master is active, so nothing was sent" in findings[-1].what
 
 
 def test_noise_is_described_and_the_nodes_are_asked_all_the_same() -> None:
     line = line_of("hcp2", [Chatterbox(bytes(5)), hcp2(1)])
     findings = examined(line, (1,))
-    assert findings.on("silence").what.startswith("5 bytes came unexpected: 00 00 00 00 00 (zeros: ")
+    assert findings.on("silence").what.startswith("5 unexpected bytes were received: 00 00 00 00 00 (zeros: ")
     assert "node 1" in {finding.topic for finding in findings}
 
 
@@ -191,7 +191,7 @@ def test_an_echo_is_found_and_what_was_declared_is_checked(present: bool, declar
 
 def test_an_echo_that_differs_from_what_was_sent_is_shown() -> None:
     line = line_of("hcp2", [], echo=Echo(corrupt=1.0))
-    assert "after 00 55 00 came " in examined(line, (1,)).on("echo").what
+    assert "after 00 55 00, these bytes were received: " in examined(line, (1,)).on("echo").what
 
 
 # Nodes in trouble
@@ -228,13 +228,13 @@ def test_where_all_nodes_are_garbled_the_line_is_suspected() -> None:
 def test_a_node_that_sometimes_does_not_answer_is_said_so() -> None:
     findings = examined(line_of("hcp2", [hcp2(5, lost=0.3)]), (5,))
     assert findings.wrong == {"node 5"}
-    assert "requests, although it lives: read element 1: 0" in findings.on("node 5").what
+    assert "requests, although it is alive: read element 1: 0" in findings.on("node 5").what
 
 
 def test_a_named_node_that_is_not_there_is_named_and_the_others_are_measured() -> None:
     findings = examined(line_of("hcp2", [hcp2(5)]), (5, 9))
     assert findings.wrong == {"node 9"}
-    assert findings.on("node 9").what == "does not answer"
+    assert findings.on("node 9").what == "does not reply"
 
 
 def test_a_port_that_floods_is_examined_all_the_same(busmaster: Command) -> None:
@@ -243,7 +243,7 @@ def test_a_port_that_floods_is_examined_all_the_same(busmaster: Command) -> None
         thread.start()
         done = busmaster("doctor", f"socket://127.0.0.1:{server.getsockname()[1]}")
     assert done.status == 1
-    assert "bytes came unexpected" in done.out
+    assert "unexpected bytes were received" in done.out
 
 
 def flood(server: socket.socket) -> None:
@@ -257,14 +257,14 @@ def flood(server: socket.socket) -> None:
 def test_where_nobody_answers_that_is_one_finding() -> None:
     findings = examined(line_of("hcp2", [hcp2(5)]), (6, 7))
     assert findings.wrong == {"nodes", "settings"}
-    assert findings.on("nodes").what == "no answer from nodes 6, 7 at 57600 8N1"
-    assert findings.on("settings").what == "nodes 6, 7: no answer with 20 other settings either"
+    assert findings.on("nodes").what == "no reply from nodes 6, 7 at 57600 8N1"
+    assert findings.on("settings").what == "nodes 6, 7: no reply with 20 other settings either"
 
 
 def test_what_learned_windows_would_come_to_is_said() -> None:
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.020))]), (5,))
-    assert findings.on("learning").what.startswith("learned windows would be 32 ms at most: a lost reply would hold up")
-    assert "in place of 150 ms" in findings.on("learning").what
+    assert findings.on("learning").what.startswith("learned windows would be 32 ms at most; a lost reply would occupy")
+    assert "instead of 150 ms" in findings.on("learning").what
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
     assert "no shorter than the one that is set" in findings.on("learning").what
 
@@ -272,10 +272,18 @@ def test_what_learned_windows_would_come_to_is_said() -> None:
 @pytest.mark.parametrize(
     ("milliseconds", "wrong", "advice"),
     [
-        (4, False, "timing = { window = 0.015, max_reply_delay = 0.025 } in LINE.toml would waste less on dead nodes"),
-        (30, False, "timing = { window = 0.095, max_reply_delay = 0.145 } in LINE.toml would waste less on dead nodes"),
+        (
+            4,
+            False,
+            "timing = { window = 0.015, max_reply_delay = 0.025 } in LINE.toml would waste less time on dead nodes",
+        ),
+        (
+            30,
+            False,
+            "timing = { window = 0.095, max_reply_delay = 0.145 } in LINE.toml would waste less time on dead nodes",
+        ),
         (34, False, ""),
-        (70, False, "counted late: late_after = 110 ms would fit"),
+        (70, False, "counted late; late_after = 110 ms would fit"),
         (120, True, "--timeout 365"),
     ],
 )
@@ -385,7 +393,7 @@ def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_i
     absent = busmaster("doctor", "usb:A500XYZ")
     assert (by_serial.status, by_path.status) == (0, 0), by_serial.out + by_path.out
     assert f"ok    name        {server.path} is FTDI A500ABC, which usb:A500ABC finds again\n" in by_serial.out
-    assert "-> name it usb:A500ABC: " in by_path.out
+    assert "-> name it usb:A500ABC, " in by_path.out
     assert (value.status, value.out) == (0, "1 0\n")
     assert absent.status == 1
     assert f"usb:A500XYZ is not plugged in: connected: usb:A500ABC ({server.path})" in absent.out
@@ -420,11 +428,11 @@ def test_where_low_latency_is_asked_for_the_latency_timer_is_judged_as_the_openi
     assert "add ?low_latency=1" in plain.out
     assert "?low_latency=1 may" in plain.out
     assert "?low_latency=1" not in asked.out
-    assert f"its low-latency flag is {'set' if obeys else 'not set, though low_latency=1 asked for it'}\n" in asked.out
+    assert f"its low-latency flag is {'set' if obeys else 'not set, although low_latency=1 was given'}\n" in asked.out
     [after] = [line for line in asked.lines if " latency " in line]
     assert ("1 ms" if obeys else "16 ms") in after
     assert after.startswith("ok" if obeys else "FAIL")
-    assert ("low_latency=1 did not shorten it: write 1 to" in asked.out) is not obeys
+    assert ("low_latency=1 did not shorten it; write 1 to" in asked.out) is not obeys
     assert asked.out.count("gathers received bytes") == 1
 
 
@@ -434,7 +442,7 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
     done = busmaster("doctor", controllers.path, *HCP2, "--nodes", "8,77", "--capture", str(file))
     assert done.status == 1
     assert "the adapter checks do not apply to a TCP port" in done.out
-    assert "FAIL  node 77     does not answer\n" in done.out
+    assert "FAIL  node 77     does not reply\n" in done.out
     assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to fix\n"
     with file.open("rb") as capture:
         packets = list(read_packets(capture))
@@ -449,7 +457,7 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
 def test_without_a_protocol_no_node_is_asked(busmaster: Command, controllers: TcpServer) -> None:
     done = busmaster("doctor", controllers.path)
     assert done.status == 0
-    assert "no node was asked" in done.out
+    assert "no request was sent" in done.out
 
 
 @pytest.mark.parametrize("port", ["/dev/absent", "/dev/null", "socket://127.0.0.1:1"])
@@ -477,9 +485,9 @@ def test_while_another_program_has_the_port_it_is_not_even_opened(busmaster: Com
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("PORT", "--nodes", "1"), "--nodes needs a --protocol"),
-        (("PORT", "--protocol", "mentor", "--nodes", "0-3"), "means all of them"),
-        (("PORT", "--protocol", "dc104", "--nodes", "1"), "has no addresses"),
+        (("PORT", "--nodes", "1"), "--nodes needs the protocol"),
+        (("PORT", "--protocol", "mentor", "--nodes", "0-3"), "is the broadcast address"),
+        (("PORT", "--protocol", "dc104", "--nodes", "1"), "has no node addresses"),
         (("PORT?baud=3",), "did you mean 'baudrate'?"),
         (("PORT", "--protocol", "hcp4"), "no such protocol 'hcp4'; did you mean 'hcp'?"),
     ],
@@ -509,8 +517,8 @@ def test_a_wrong_rate_is_found_and_the_port_is_left_as_it_was(busmaster: Command
         done = doctor_of_a_paced(server, busmaster)
         assert rate_of(server.path) == termios.B57600
     assert done.status == 1
-    assert "no answer from node 1 at 57600 8N1" in done.out
-    assert "node 1 answers at 9600 8N1\n" in done.out
+    assert "no reply from node 1 at 57600 8N1" in done.out
+    assert "node 1 replies at 9600 8N1\n" in done.out
     assert "add ?baudrate=9600&bytesize=8&parity=N to the port" in done.out
 
 
@@ -520,7 +528,7 @@ def test_where_no_rate_helps_it_is_said_what_was_tried(busmaster: Command, monke
     monkeypatch.setattr(examination, "FRAMINGS", ())
     with serve_pty(line_of("hcp2", [], paced=False)) as server:
         done = doctor_of_a_paced(server, busmaster)
-    assert "no answer with 2 other settings either" in done.out
+    assert "no reply with 2 other settings either" in done.out
 
 
 def doctor_of_a_paced(server: PtyServer, busmaster: Callable[..., Ended]) -> Ended:

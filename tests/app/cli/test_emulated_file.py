@@ -137,7 +137,7 @@ def test_emulate_says_where_the_file_asks_for_what_no_device_has(tmp_path: Path)
 
 
 def test_a_line_behind_rfc_2217_is_emulated_only_on_a_port_that_is_named() -> None:
-    with pytest.raises(click.UsageError, match="does not speak RFC 2217; use --tcp or --pty"):
+    with pytest.raises(click.UsageError, match="does not support RFC 2217; use --tcp or --pty"):
         own_port(Rfc2217Port("server", 4001, baudrate=9600))
     assert own_port(TcpPort("server", 4001)) == (None, ("server", 4001))
 

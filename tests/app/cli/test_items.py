@@ -89,8 +89,8 @@ def test_the_bits_are_searched_too(busmaster: Command) -> None:
     [
         (("microflx",), "no such protocol 'microflx'; did you mean 'microflex'?"),
         (("profibus",), "no such protocol 'profibus'; there are ct-ansi, dc104, "),
-        (("microflex", "bus_voltagee"), "microflex has nothing with 'bus_voltagee'; did you mean 'bus_voltage'?"),
-        (("hcp", "speed"), "hcp has nothing with 'speed'; there are 1-5, 6-99"),
+        (("microflex", "bus_voltagee"), "microflex has no item with 'bus_voltagee'; did you mean 'bus_voltage'?"),
+        (("hcp", "speed"), "hcp has no item with 'speed'; there are 1-5, 6-99"),
         ((), "missing argument 'PROTOCOL'"),
     ],
 )
@@ -109,7 +109,7 @@ def test_a_protocol_that_documents_nothing_says_what_an_item_is(
     monkeypatch.setattr(items, "find", lambda name: replace(find(name), documented=()))
     shown = busmaster("items", "dc104")
     assert (shown.status, shown.out) == (0, "")
-    assert shown.err == "busmaster: dc104: no item has a meaning of its own; write a parameter, 1 to 255\n"
+    assert shown.err == "busmaster: dc104: its documents define no items; use a parameter, 1 to 255\n"
 
 
 def test_the_help_of_items_says_where_more_is_said(busmaster: Command) -> None:

@@ -96,8 +96,8 @@ def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
         process.send_signal(number)
         _, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, force(winder)) == (status, 15)
-    assert "safe state: when this ends, winder/force = 1.5 within 1 s" in err
-    assert "the safe state is confirmed: winder/force" in err
+    assert "safe state at the end: winder/force = 1.5 within 1 s" in err
+    assert "safe state confirmed: winder/force" in err
     assert "busmaster: audit: winder/force = 1.5" in err
     assert f"by safe {number.name}" in err
 
@@ -112,7 +112,7 @@ def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:
         process.send_signal(signal.SIGINT)
         process.send_signal(signal.SIGQUIT)
         process.send_signal(signal.SIGHUP)
-        told(process, "was read again")
+        told(process, "was reloaded")
         process.terminate()
         process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
@@ -129,7 +129,7 @@ def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(
         process.send_signal(number)
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
-    assert "the safe state of winder/force is not confirmed: " in err
+    assert "safe state of winder/force not confirmed: " in err
 
 
 def test_safe_sends_the_safe_state_alone(busmaster: Command, path: Path, winder: TcpServer) -> None:
@@ -155,15 +155,15 @@ def test_safe_is_recorded_and_what_cannot_be_recorded_is_sent_all_the_same(
 @pytest.mark.parametrize(
     ("said", "error"),
     [
-        ('writes = { "winder/force" = 1 }', "may not be repeated"),
+        ('writes = { "winder/force" = 1 }', "is not repeatable"),
         ('writes = { "winder/axis0.idle" = 1 }', "read-only"),
         (
             'writes = { "winder/force" = 1, "winder/10" = 2 }\nrepeatable = ["winder/force", "winder/10"]',
             "same quantity",
         ),
-        ('writes = { "winder/force" = [1, 2] }', "is one value"),
-        ("within = 1", "a safe state is of writes"),
-        ('writes = { "winder/force" = 1 }\nrepeatable = ["winder/11"]', "not among the writes"),
+        ('writes = { "winder/force" = [1, 2] }', "must be one value"),
+        ("within = 1", "a safe state needs writes"),
+        ('writes = { "winder/force" = 1 }\nrepeatable = ["winder/11"]', "is not in writes"),
     ],
 )
 def test_what_cannot_be_a_safe_write_is_refused_when_the_file_is_read(
@@ -193,7 +193,7 @@ def test_safe_says_why_the_port_is_refused_and_names_each_point(
     first, *rest = outcome.err.splitlines()
     assert (outcome.status, outcome.out) == (1, "")
     assert first.startswith(f"busmaster: cannot connect: {reason}")
-    assert [line.partition(" is not")[0] for line in rest] == ["busmaster: the safe state of winder/force"]
+    assert [line.partition(" not")[0] for line in rest] == ["busmaster: safe state of winder/force"]
 
 
 @pytest.mark.slow
@@ -208,7 +208,7 @@ def test_safe_says_who_has_the_port_and_serves_it_to_nobody(busmaster: Command, 
             process.communicate(timeout=PATIENCE)
     assert outcome.status == 1
     assert f"{served.path} is in use by " in outcome.err
-    assert "the safe state of winder/force is not confirmed: " in outcome.err
+    assert "safe state of winder/force not confirmed: " in outcome.err
 
 
 def test_safe_without_a_safe_state_is_wrong_usage(busmaster: Command, path: Path) -> None:
@@ -224,15 +224,15 @@ def test_sighup_replaces_what_changed_and_leaves_the_rest_unbroken(path: Path) -
         text = path.read_text()
         path.write_text(text.replace("axis0.idle", "axis0.position"))
         process.send_signal(signal.SIGHUP)
-        told(process, "was read again")
+        told(process, "was reloaded")
         assert process.stdout is not None
         assert any("axis0.position" in line for line in process.stdout)
         path.write_text(text.replace("[nodes.winder]", "[nodes.winder"))
         process.send_signal(signal.SIGHUP)
-        assert "nothing of it taken" in told(process, "read again")
+        assert "nothing was changed" in told(process, "reload failed")
         path.write_text(text.replace("57600", "9600"))
         process.send_signal(signal.SIGHUP)
-        assert told(process, "read again").endswith("taken: other settings of the port need a restart\n")
+        assert told(process, "reload failed").endswith("nothing was changed: changes of the port need a restart\n")
         process.terminate()
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
@@ -293,7 +293,7 @@ def test_a_full_disk_under_standard_output_does_not_end_a_run(path: Path, winder
             [sys.executable, "-m", "busmaster", "run", str(path)],
             cwd=ROOT, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-    told(process, "standard output is down: No space left on device")
+    told(process, "standard output failed: No space left on device")
     process.terminate()
     process.communicate(timeout=PATIENCE)
     assert (process.returncode, force(winder)) == (0, 15)
@@ -325,7 +325,7 @@ def test_a_drawing_process_that_is_killed_does_not_end_a_run(path: Path, winder:
             pid for found in Path(f"/proc/{process}/task").glob("*/children") for pid in found.read_text().split()
         ]
         os.kill(int(screen), signal.SIGKILL)
-        terminal.until(lambda drawn: b"polling goes on without it" in drawn)
+        terminal.until(lambda drawn: b"polling continues without it" in drawn)
         terminal.process.terminate()
         assert terminal.status() == 0
         assert tcgetattr(terminal.slave) == terminal.before
@@ -373,7 +373,7 @@ def test_sighup_before_the_file_is_loaded_does_not_end_a_run(path: Path) -> None
         [sys.executable, "-c", EARLY, str(path)],
         cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
-        told(process, "was read again")
+        told(process, "was reloaded")
         polls(process)
         process.terminate()
         process.communicate(timeout=PATIENCE)
@@ -392,10 +392,10 @@ def test_a_spool_is_handed_over_at_sighup_and_a_damaged_one_is_told(path: Path, 
         polls(process)
         path.write_text(path.read_text() + "buffer = 1000\n")
         process.send_signal(signal.SIGHUP)
-        told(process, "was read again")
+        told(process, "was reloaded")
         path.write_text(path.read_text().replace("buffer = 1000", "buffer = 1001"))
         process.send_signal(signal.SIGHUP)
-        told(process, "was read again")
+        told(process, "was reloaded")
         process.terminate()
         _, err = process.communicate(timeout=PATIENCE)
     assert "does another process use it" not in err

@@ -80,7 +80,7 @@ async def test_the_picture_fits_and_says_what_the_owner_says(size: tuple[int, in
     assert {cell_len(line) for line in shown} == {width}
     assert "busmaster poll  /dev/ttyUSB0  57600 8N1" in shown[0]
     assert "0:01:01" in shown[0]
-    assert "53% busy  ready  2 waiting" in shown[1]
+    assert "53% busy  ready  2 queued" in shown[1]
     assert shown[2].startswith(" axes every 200 ms  missed 1  cycle 61")
     assert [words[:3] for words in rows] == [
         ["node", "1", "axis0.position"],
@@ -193,7 +193,7 @@ async def test_an_offline_line_is_not_up() -> None:
     async with drawn(tell(Picture(), *three_drives(), state="offline", losses=1)) as (screen, _, _):
         shown = "\n".join(lines(screen))
         assert [words[-1] for words in table(screen)] == ["offline"] * 3
-    assert "offline  2 waiting  lost 1 time" in shown
+    assert "offline  2 queued  1 disconnect" in shown
 
 
 @pytest.mark.asyncio
@@ -310,7 +310,7 @@ async def test_details_show_limits_and_the_last_exchange_of_a_point(size: tuple[
             shown = " ".join(" ".join(line.strip("│ ") for line in lines(screen)).split())
         await pilot.press("escape")
         assert len(screen.screen_stack) == 1
-    assert "node 5 outputs (5/outputs) value 3 V, asked for 0.1s ago" in shown
+    assert "node 5 outputs (5/outputs) value 3 V, requested 0.1s ago" in shown
     assert "limits written from 0 to 7; alarm high 5.5" in shown
     assert "exchange waited 4.0 ms behind 2, reply after 5.0 ms, whole after 8.0 ms" in shown
 
@@ -337,10 +337,10 @@ async def test_silence_of_the_owner_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         screen.heard -= 10
         screen.draw()
         await pilot.pause()
-        assert "no news for 1" in lines(screen)[0]
+        assert "no data for 1" in lines(screen)[0]
         screen.take_picture()
         await pilot.pause()
-        assert "no news" not in lines(screen)[0]
+        assert "no data" not in lines(screen)[0]
 
 
 @pytest.mark.asyncio
@@ -349,7 +349,7 @@ async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -
         screen.away = "no program serves /run/line.sock"
         screen.take_picture()
         await pilot.pause()
-        assert "its owner is away" in lines(screen)[0]
+        assert "its owner is not running" in lines(screen)[0]
         assert any("no program serves /run/line.sock" in line for line in lines(screen))
         assert len(table(screen)) == 1
         screen.away = ""

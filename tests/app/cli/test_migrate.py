@@ -51,5 +51,5 @@ def test_what_is_no_toml_is_an_error_with_its_line(busmaster: Command, path: Pat
     path.write_bytes(text.encode("latin-1"))
     refused = busmaster("migrate", str(path), "--write")
     assert refused.status == 2
-    assert f"{path}:1: this is no TOML" in refused.err
+    assert f"{path}:1: not valid TOML" in refused.err
     assert path.read_bytes() == text.encode("latin-1")

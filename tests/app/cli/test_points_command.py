@@ -74,7 +74,7 @@ def test_a_terminal_narrower_than_the_table_shows_the_points_one_below_the_other
 
 def test_a_file_without_points_says_so(busmaster: Command, path: Path) -> None:
     path.write_text('port = "/dev/ttyUSB0"\n[nodes.w]\nprotocol = "hcp2"\naddress = 5\n')
-    assert busmaster("points", str(path)).lines == ["no points: describe them in [nodes.NAME.points]"]
+    assert busmaster("points", str(path)).lines == ["the file has no points; define them in [nodes.NAME.points]"]
 
 
 @pytest.mark.slow
@@ -85,7 +85,7 @@ def test_out_and_in_again_the_file_is_not_even_written(path: Path) -> None:
     assert "°C".encode() in out.stdout
     back = process(path, "--from", "-", given=out.stdout)
     assert (back.returncode, back.stdout) == (0, b"")
-    assert back.stderr.decode() == f"busmaster: {path}: no points changed: it is as it was\n"
+    assert back.stderr.decode() == f"busmaster: {path}: no points changed\n"
     after = path.stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
@@ -112,7 +112,7 @@ def test_what_changes_is_shown_and_what_the_csv_has_not_stays(busmaster: Command
     assert shown.status == 0
     assert shown.lines == ["w/position: factor 0.001 -> 0.01", "d6-7/speed_reference: maximum none -> 80"]
     assert shown.err.startswith(
-        f"busmaster: {path}: 2 points changed\nbusmaster: not in the CSV, and so as before: w/status, "
+        f"busmaster: {path}: 2 points changed\nbusmaster: not in the CSV, unchanged: w/status, "
     )
     assert path.read_text() == (
         LINE.replace("0.001", "0.01").replace(
@@ -130,14 +130,14 @@ def test_a_bad_row_writes_nothing_and_each_is_told(busmaster: Command, path: Pat
     told = shown.err.splitlines()
     assert len(told) == 2
     assert told[0].startswith(f"busmaster: {table}: row 3, column item: no such ")
-    assert told[1] == f"busmaster: {table}: row 4, column maximum: it has a decimal comma: write 1.5, not 1,5"
+    assert told[1] == f"busmaster: {table}: row 4, column maximum: 1,5 has a decimal comma; write 1.5"
     assert path.read_text() == LINE
 
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--csv", "--from", "-"), "--csv and --from exclude each other"),
+        (("--csv", "--from", "-"), "--csv exports and --from imports; leave out one of them"),
         (("--from", "none.csv"), "'none.csv' does not exist"),
     ],
 )

@@ -130,7 +130,7 @@ def test_dc104_takes_no_node_and_raw_16_bit_values(busmaster: Command) -> None:
             assert busmaster("write", server.path, *dc104, wrong).status == 2
         assert busmaster("scan", server.path, *dc104).lines == ["0 read parameter 1: 65535"]
         brief = busmaster("poll", server.path, *dc104, "--items", "1", "--period", "0.1", "--seconds", "0.05")
-        assert "nothing was asked: a new line rests" in brief.err
+        assert "no request was sent: a new line first waits" in brief.err
         assert brief.lines == []
 
 
@@ -170,4 +170,4 @@ def test_decimals_of_a_write_are_said_with_it(mentor: Command) -> None:
 def test_decimals_are_refused_where_the_line_carries_the_point(msc: Command) -> None:
     done = msc("write", "2008=1.5", "--decimals", "1")
     assert done.status == 2
-    assert "leave --decimals out" in done.err
+    assert "leave out --decimals" in done.err

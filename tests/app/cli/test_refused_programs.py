@@ -119,7 +119,7 @@ def test_who_guesses_tokens_of_the_page_is_slowed_down_counted_and_reported(
     ):
         try:
             port = int(told(interface, "the page is at").rpartition(":")[2].strip().strip("/"))
-            told(interface, "is followed")
+            told(interface, "connected to line")
             place = {"path": "/api/points/fast/winder/force", "method": "PUT", "body": '{"value": 3}'}
             while status_of(port, WRITER, "127.0.0.1", **place) != 200:
                 pass  # until the page knows the points

@@ -79,14 +79,14 @@ def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(lin
 
 def test_what_an_output_was_spared_is_told_apart_from_what_it_lost() -> None:
     counts = OutputStatistics("csv", "written", 3, 1, 0, "", suppressed=5)
-    assert output_text(counts) == "csv: 3 written, 1 dropped, 5 suppressed as no news"
+    assert output_text(counts) == "csv: 3 written, 1 dropped, 5 suppressed"
 
 
 def test_run_says_that_a_file_without_groups_polls_nothing(busmaster: Command, line: Path) -> None:
     line.write_text(line.read_text().partition("[groups")[0])
     ran = busmaster("run", str(line), "--seconds", "0.1", "--plain")
     assert (ran.status, ran.out) == (0, "")
-    assert "nothing is polled: the file has no [groups.NAME]" in ran.err
+    assert "nothing is polled, because the file has no poll group; add [groups.NAME]" in ran.err
 
 
 def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None:
@@ -97,7 +97,7 @@ def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None
     assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "quality", "error", "late"}
 
 
-SPARED = "busmaster: with 1% of all frames lost the schedule asks for "
+SPARED = "busmaster: with 1% of all frames lost the schedule needs "
 UNLEARNED = TEXT.replace('timing = "learned"', "")
 FEW = UNLEARNED.replace("period = 0.02", "period = 60").replace("period = 0.1", "period = 60")
 
@@ -199,17 +199,17 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert (outcome.status, outcome.err) == (0, "")
     assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
-    assert outcome.lines[4].startswith("it fits: the schedule asks for ")
+    assert outcome.lines[4].startswith("it fits: the schedule needs ")
     healthy, dead = re.findall(r"([\d.]+) ms", outcome.lines[5])
     assert float(healthy) < float(dead) < 200  # a maximum reply delay of HCP2, not a bound that no line comes near
-    assert outcome.lines[6].startswith("the bounds (R9), if every exchange took the longest that one can: urgent ")
+    assert outcome.lines[6].startswith("worst case (R9), if every exchange takes its longest possible time: urgent ")
     assert outcome.lines[-2].startswith("reply times are assumed (half of late_after) for ")
-    assert outcome.lines[-1].startswith("with 1% of all frames lost the schedule asks for ")
+    assert outcome.lines[-1].startswith("with 1% of all frames lost the schedule needs ")
     assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
 
 
 @pytest.mark.parametrize(
-    ("nodes", "named"), [(8, "d1, d2, d3, d4, d5, d6, d7, d8:"), (11, "d1, d2, d3, d4, d5, d6, d7, d8 and 3 more:")]
+    ("nodes", "named"), [(8, "d1, d2, d3, d4, d5, d6, d7, d8"), (11, "d1, d2, d3, d4, d5, d6, d7, d8 and 3 more")]
 )
 def test_plan_names_some_nodes_without_a_reply_time_and_counts_the_others(
     nodes: int, named: str, busmaster: Command, tmp_path: Path
@@ -220,7 +220,7 @@ def test_plan_names_some_nodes_without_a_reply_time_and_counts_the_others(
         '[groups.g]\nperiod = 5\npoints = ["d1/1"]\n'
     )
     outcome = busmaster("plan", str(path))
-    assert outcome.lines[-2].startswith(f"reply times are assumed (half of late_after) for {named} ")
+    assert outcome.lines[-2].startswith(f"reply times are assumed (half of late_after) for {named}; ")
 
 
 def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: Command, line: Path) -> None:
@@ -277,7 +277,7 @@ def test_emulate_puts_no_link_under_dev_and_goes_where_it_is_told(tmp_path: Path
 def test_what_the_file_says_is_not_said_again(busmaster: Command, line: Path) -> None:
     outcome = busmaster("emulate", str(line), "--protocol", "hcp2")
     assert (outcome.status, outcome.out) == (2, "")
-    assert "the file says protocol, nodes and baud rate" in outcome.err
+    assert "the file defines protocol, nodes and baud rate; leave out the options for these" in outcome.err
     assert "--protocol P" in busmaster("emulate").err
 
 

@@ -38,7 +38,7 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, thr
         ran = busmaster("write", three_controllers.path, *HCP2, "--node", "2", "1=123.456", "--verify")
         assert (ran.status, ran.out) == (0, "1 ok\n")
         port = three_controllers.path.removeprefix("socket://")
-        assert ran.err == (f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n")
+        assert ran.err == (f"busmaster: {port} is owned by process {process.pid}; using it through {address}\n")
         ran = busmaster("read", address, *HCP2, "--node", "2", "1")
         assert (ran.status, ran.out, ran.err) == (0, "1 123.456\n", "")
         ran = busmaster("read", three_controllers.path.replace("127.0.0.1", "localhost"), *HCP2, "--node", "2", "1")
@@ -95,7 +95,7 @@ def test_options_that_differ_from_the_owners_are_wrong_usage(
         for options, complaint in (
             (("--baud", "9600"), "not 9600 baud"),
             (("--echo",), "not with an echo"),
-            (("--capture", "x.pcapng"), "not by --capture"),
+            (("--capture", "x.pcapng"), "leave out --capture, and record it there"),
         ):
             ran = busmaster("read", three_controllers.path, *HCP2, *options, "--node", "2", "1")
             assert (ran.status, ran.out) == (2, "")
@@ -108,7 +108,9 @@ def test_options_that_differ_from_the_owners_are_wrong_usage(
 
 def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
     port = three_controllers.path.removeprefix("socket://")
-    assert busmaster("status").err == "busmaster: no line of this user is served: start busmaster run LINE.toml\n"
+    assert (
+        busmaster("status").err == "busmaster: no running line of this user; start one with: busmaster run LINE.toml\n"
+    )
     with started("run", "--plain", str(file)) as process:
         assert process.stdout is not None
         process.stdout.readline()  # it polls, and so is served
@@ -154,7 +156,10 @@ def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command:
             timeout=PATIENCE,
         )
     assert ran.returncode == 1
-    assert f"is owned by process {process.pid}; end that first: two masters on one line garble each other" in ran.stderr
+    assert (
+        f"is owned by process {process.pid}; stop that process first: two masters on one line garble each other"
+        in ran.stderr
+    )
 
 
 @pytest.mark.slow
@@ -170,7 +175,7 @@ def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_sa
             timeout=PATIENCE,
         )
     assert "no other program can use this line: " in ran.stderr
-    assert f"is served already by process {process.pid}" in ran.stderr
+    assert f"is already served by process {process.pid}" in ran.stderr
 
 
 @pytest.mark.slow
@@ -244,7 +249,7 @@ def test_the_audit_is_true_of_a_program_that_was_killed_as_it_wrote(
 def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command, file: Path) -> None:
     text = file.read_text()
     for said, complaint in (
-        ('group = "no-such-group"', "there is no group 'no-such-group' on this machine"),
+        ('group = "no-such-group"', "the group 'no-such-group' does not exist on this machine"),
         ('mode = "rw"', "a mode is octal"),
         ("port = 5020", "port"),
         ("share = 0.01", "must be 0.1 to 10, not 0.01"),
@@ -263,7 +268,7 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
 def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, address):
         port = three_controllers.path.removeprefix("socket://")
-        said = f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
+        said = f"busmaster: {port} is owned by process {process.pid}; using it through {address}\n"
         ran = busmaster("scan", three_controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "1000")
         assert (ran.status, [line.split()[0] for line in ran.lines]) == (0, ["2", "3"])
         assert ran.err.startswith(said)
@@ -349,26 +354,26 @@ tokens.hmi = {{ role = "write", allow_writes = ["winder/*"] }}
         [line] = (line for line in (json.loads(text) for text in busmaster("status", "--json").lines))
         address = line["tcp"]
         assert address.startswith("tcp://127.0.0.1:")
-        assert "wants a token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
+        assert "requires a token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
         monkeypatch.setenv("BUSMASTER_TOKEN", "a-token-of-the-logger-2")
         assert busmaster("read", address, *HCP2, "--node", "2", "1").out == "1 0\n"
         ran = busmaster("write", address, *HCP2, "--node", "1", "1=5")
         assert (ran.status, ran.out) == (2, "")
-        assert "token logger may read this line and not write" in ran.err
+        assert "token logger may read this line, but not write" in ran.err
         monkeypatch.setenv("BUSMASTER_TOKEN", "a-token-of-the-hmi-0001")
         assert busmaster("write", address, *HCP2, "--node", "1", "1=5").out == "1 ok\n"
         ran = busmaster("write", address, *HCP2, "--node", "2", "1=5")
         assert (ran.status, ran.out) == (2, "")
-        assert "token hmi may not write this: see allow_writes" in ran.err
+        assert "token hmi may not write this; see allow_writes" in ran.err
         ran = busmaster("read", address, *HCP2, "--baud", "9600", "--node", "2", "1")
         assert (ran.status, ran.out) == (2, "")
         assert "not 9600 baud" in ran.err
         tokens.write_text("hmi another-token-0003\n")
         process.send_signal(signal.SIGHUP)
         assert process.stderr is not None
-        while "was read again" not in process.stderr.readline():
+        while "was reloaded" not in process.stderr.readline():
             pass
-        assert "does not know this token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
+        assert "does not accept this token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
 
 
 def test_tokens_that_others_may_read_keep_a_line_from_starting(busmaster: Command, file: Path, tmp_path: Path) -> None:
@@ -378,7 +383,7 @@ def test_tokens_that_others_may_read_keep_a_line_from_starting(busmaster: Comman
     file.write_text(f'{file.read_text()}\n[service]\nlisten = "127.0.0.1:0"\ntoken_file = "{tokens}"\n')
     ran = busmaster("serve", str(file))
     assert ran.status == 2
-    assert f"service.token_file: others may read {tokens}, or change it: chmod 600 {tokens}" in ran.err
+    assert f"service.token_file: other users can read or change {tokens}; run chmod 600 {tokens}" in ran.err
     assert busmaster("plan", str(file)).status != 2  # no affair of those who only read the file
 
 
@@ -397,7 +402,7 @@ def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
         ran = busmaster("safe", str(file))
         assert (ran.status, ran.out) == (0, "winder/force ok\n")
         port = three_controllers.path.removeprefix("socket://")
-        assert ran.err == f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
+        assert ran.err == f"busmaster: {port} is owned by process {process.pid}; using it through {address}\n"
         assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 15\n"
         assert busmaster("write", address, *HCP2, "--node", "1", "10=30").status == 0
         other = file.with_name("other.toml")
@@ -469,7 +474,7 @@ def test_points_of_a_file_are_written_through_its_lines_owner(
     with owner("serve", str(file)) as (process, address):
         ran = busmaster("write", str(file), "winder/force=30", "winder/2=7", "--verify")
         assert (ran.status, ran.out) == (0, "winder/force ok\nwinder/2 ok\n")
-        assert f"is owned by process {process.pid}: asking through {address}" in ran.err
+        assert f"is owned by process {process.pid}; using it through {address}" in ran.err
         ran = busmaster("write", str(file), "winder/2=8", "winder/force=51")
         assert (ran.status, ran.out) == (2, "")
         assert busmaster("read", address, *HCP2, "--node", "1", "10", "2").lines == ["10 300", "2 7"]

@@ -90,7 +90,10 @@ def test_a_write_whose_audit_entry_cannot_be_kept_is_not_acknowledged(file: Path
                     await controller.write(10, 2)
                 other.execute("rollback")
             said = str(caught.value)
-            assert "it was written, but its audit entry is not on the disk: sqlite did not write it within 5 s" in said
+            assert (
+                "the value was written, but its audit entry is not on the disk: sqlite did not write it within 5 s"
+                in said
+            )
             assert "the value need not be written again" in said
             assert await controller.read(10) == 2
             await controller.write(10, 3)

@@ -72,7 +72,7 @@ def test_while_its_owner_is_away_it_says_so_and_goes_on_when_that_is_back(
     with owner("serve", str(file)) as (process, _), terminal("top", str(file)) as shown:
         draws(shown)
         process.send_signal(end)
-        shown.until(lambda drawn: b"its owner is away" in drawn)
+        shown.until(lambda drawn: b"its owner is not running" in drawn)
         shown.until(lambda drawn: said in drawn or b"no program serves" in drawn)
         shown.drawn = ON_SCREEN
         with owner("serve", str(file)):
@@ -163,8 +163,8 @@ def test_a_run_whose_view_cannot_be_served_prints_plain_lines(file: Path, tmp_pa
     long.mkdir()
     with terminal(str(long), "run", str(file), program=("-c", NOWHERE)) as shown:
         shown.until(lambda drawn: b"winder/force 0" in drawn)
-        assert b"there is no live view: " in shown.drawn
-        assert b"is too long for a socket" in shown.drawn
+        assert b"no live view: " in shown.drawn
+        assert b"use a shorter path for the socket" in shown.drawn
         shown.process.terminate()
         assert shown.status() == 0
 
@@ -183,7 +183,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_run_without_websockets_prints_plain_lines_and_says_what_to_install(file: Path) -> None:
     with terminal("run", str(file), program=("-c", WITHOUT)) as shown:
         shown.until(lambda drawn: b"winder/force 0" in drawn)
-        assert b"the live view needs an extra: pip install 'busmaster[service]'; plain lines instead" in shown.drawn
+        assert b"the live view needs an extra: pip install 'busmaster[service]'; showing plain lines" in shown.drawn
         shown.process.terminate()
         assert shown.status() == 0
 
@@ -198,12 +198,12 @@ def test_top_without_a_terminal_is_wrong_usage(file: Path) -> None:
     with owner("serve", str(file)), started("top", "slitter") as process:
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
-    assert err.startswith("busmaster: top draws on a terminal")
+    assert err.startswith("busmaster: top needs a terminal")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("line", "said"), [("nobody", "no program of this user serves 'nobody', "), ("unix:/nobody", "no program serves ")]
+    ("line", "said"), [("nobody", "no running line named 'nobody' "), ("unix:/nobody", "no program serves ")]
 )
 def test_that_there_is_no_such_line_is_said_before_that_there_is_no_terminal(line: str, said: str) -> None:
     with started("top", line) as process:
@@ -216,7 +216,7 @@ def test_that_there_is_no_such_line_is_said_before_that_there_is_no_terminal(lin
 def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(
     file: Path, tmp_path: Path, three_controllers: TcpServer
 ) -> None:
-    with pytest.raises(LineDown, match="start busmaster run"):
+    with pytest.raises(LineDown, match="busmaster run"):
         top.address_of(str(file))
     with owner("serve", str(file)) as (_, address):
         other_name = tmp_path / "other.toml"
@@ -232,10 +232,10 @@ def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(
 def test_top_names_the_lines_where_several_run_and_says_where_none_does(file: Path, tmp_path: Path) -> None:
     with terminal("top") as shown:
         assert shown.status() == 1
-        assert b"no line of this user is served; start busmaster run LINE.toml" in shown.drawn
+        assert b"no running line of this user; start one with: busmaster run LINE.toml" in shown.drawn
     with serve("hcp2", 1, 2, 3) as second:
         other = tmp_path / "winder.toml"
         other.write_text(SLITTER.replace("PORT", second.path).replace("FOLDER", str(tmp_path)))
         with owner("serve", str(file)), owner("serve", str(other)), terminal("top") as shown:
             assert shown.status() == 2
-            assert b"several lines run: say which, one of slitter, winder" in shown.drawn
+            assert b"several lines are running; name one of slitter, winder" in shown.drawn

@@ -92,10 +92,10 @@ async def test_a_watch_that_ends_too_early_says_why_nothing_was_asked_but_not_of
     async with Bus(MemoryPort(line)) as bus:
         watch = Watch(bus, "test", View())
         watch.summarise()
-        assert "nothing was asked: a new line rests" in capfd.readouterr().err
+        assert "no request was sent: a new line first waits" in capfd.readouterr().err
         bus._pump.data_received(b"?")
         watch.summarise()
-        assert "nothing was asked" not in capfd.readouterr().err
+        assert "no request was sent" not in capfd.readouterr().err
 
 
 @pytest.mark.asyncio
@@ -111,8 +111,7 @@ async def test_what_the_uart_found_wrong_ends_the_summary_if_there_was_anything(
         found = DriverErrors(framing=12, parity=0, breaks=1, overruns=0, buffer_overruns=2)
         watch.summarise()
         assert capfd.readouterr().err.splitlines()[-1] == (
-            "busmaster: uart: 12 framing errors, 1 break, 2 bytes lost in the driver; "
-            "`busmaster doctor` says what to look for"
+            "busmaster: uart: 12 framing errors, 1 break, 2 bytes lost in the driver; run `busmaster doctor` for advice"
         )
 
 

@@ -49,7 +49,7 @@ def test_it_is_killed_and_started_again_and_the_line_goes_on(file: Path) -> None
     with owner("serve", str(file)) as (process, address):
         for _ in range(3):
             with web(address) as (interface, client):
-                until_said(interface, "is followed")
+                until_said(interface, "connected to line")
                 said = client.get("/api/line").json()
                 assert (said["connected"], said["read_only"]) == (True, False)
         assert process.poll() is None
@@ -61,7 +61,7 @@ def test_it_opens_before_its_line_is_there_and_goes_on_when_that_is_killed(file:
         assert not client.get("/api/line").json()["connected"]
         for _ in range(2):
             with owner("serve", str(file)) as (process, _):
-                until_said(interface, "is followed")
+                until_said(interface, "connected to line")
                 assert client.get("/api/line").json()["connected"]
                 process.kill()
                 until_said(interface, "was lost")
@@ -70,7 +70,7 @@ def test_it_opens_before_its_line_is_there_and_goes_on_when_that_is_killed(file:
 @pytest.mark.slow
 def test_sigterm_ends_it_while_a_page_looks(file: Path) -> None:
     with owner("serve", str(file)) as (_, address), web(address) as (interface, client):
-        until_said(interface, "is followed")
+        until_said(interface, "connected to line")
         port = client.base_url.port
         assert port is not None
         request = (
@@ -91,7 +91,7 @@ def test_what_is_mistyped_is_one_line(busmaster: Command, tmp_path: Path) -> Non
     tokens.write_text("hmi 0123456789abcdef\n")
     tokens.chmod(0o644)
     ran = busmaster("web", "slitter", "--token-file", str(tokens))
-    assert (ran.status, "others may read" in ran.err) == (2, True)
+    assert (ran.status, "other users can read" in ran.err) == (2, True)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         ran = busmaster("web", "slitter", "--bind", f"127.0.0.1:{taken.getsockname()[1]}")
         assert (ran.status, "cannot be listened at" in ran.err) == (2, True)

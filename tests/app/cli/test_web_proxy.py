@@ -125,7 +125,7 @@ def test_behind_a_tls_proxy_the_page_its_stream_and_its_writes_work_under_its_na
     tokens.chmod(0o600)
     options = ("--host", "other.example", "--host", "Plant.Example", "--token-file", str(tokens))
     with owner("serve", str(file)) as (_, address), web(address, *options) as (interface, client):
-        until_said(interface, "is followed")
+        until_said(interface, "connected to line")
         with nginx(tmp_path, str(client.base_url)) as port:
             asker = Asker(tmp_path, port)
             status, text = asker.ask("GET", "/")
@@ -149,7 +149,7 @@ def test_behind_a_tls_proxy_the_page_its_stream_and_its_writes_work_under_its_na
 @pytest.mark.slow
 def test_with_a_name_of_a_proxy_nobody_writes_without_a_token(file: Path) -> None:
     with owner("serve", str(file)) as (_, address), web(address, "--host", NAME) as (interface, client):
-        until_said(interface, "is followed")
+        until_said(interface, "connected to line")
         answer = client.put(ONE, json={"value": 1.5})
         assert (answer.status_code, "without a token" in answer.json()["what"]) == (403, True)
         assert client.get("/api/line").json()["read_only"] is True
@@ -176,7 +176,7 @@ def test_idle_connections_beyond_the_descriptors_of_the_process_keep_nobody_out(
             interface, client = ends.enter_context(web(address))
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        until_said(interface, "is followed")
+        until_said(interface, "connected to line")
         place = (client.base_url.host, client.base_url.port or 0)
         for _ in range(400):
             ends.enter_context(socket.create_connection(place, PATIENCE))

@@ -106,7 +106,7 @@ def test_a_write_that_is_not_answered_is_on_record_as_that(busmaster: Command, p
 def test_what_the_file_says_is_not_said_again(busmaster: Command, path: Path, option: tuple[str, ...]) -> None:
     ran = busmaster("write", str(path), "winder/force=2", *option)
     assert ran.status == 2
-    assert f"says what is on the line: leave out {option[0]}" in ran.err
+    assert f"already defines the line; leave out {option[0]}" in ran.err
 
 
 def test_without_a_file_the_protocol_is_missed(busmaster: Command) -> None:
@@ -147,7 +147,7 @@ def test_no_broken_output_is_in_the_way_of_busmaster_safe(busmaster: Command, pa
     path.write_text(path.read_text().replace("line.sqlite", "none/line.sqlite"))
     ran = busmaster("safe", str(path))
     assert (ran.status, ran.out) == (0, "winder/force ok\n")
-    assert "no record is kept of what was written" in ran.err
+    assert "these writes are not in the audit log" in ran.err
     assert force(winder) == 15
     assert busmaster("write", str(path), "winder/force=2").status == 2
     assert force(winder) == 15
@@ -155,14 +155,14 @@ def test_no_broken_output_is_in_the_way_of_busmaster_safe(busmaster: Command, pa
 
 def test_a_record_that_no_output_takes_waits_on_disk_or_is_told(busmaster: Command, path: Path, tmp_path: Path) -> None:
     (tmp_path / "line.sqlite").mkdir()
-    assert "could not keep" not in busmaster("safe", str(path)).err
+    assert "incomplete" not in busmaster("safe", str(path)).err
     (tmp_path / "line.sqlite").rmdir()
     assert busmaster("write", str(path), "winder/force=2").status == 0
     assert [row[0] for row in audit(path)] == ["safe", "command line"]
     (tmp_path / "line.sqlite").unlink()
     (tmp_path / "line.sqlite").mkdir()
     path.write_text(path.read_text().replace("spill =", "# spill ="))
-    assert "sqlite could not keep the record of what was written: " in busmaster("safe", str(path)).err
+    assert "sqlite: the audit log is incomplete: " in busmaster("safe", str(path)).err
 
 
 @pytest.mark.asyncio

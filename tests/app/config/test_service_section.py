@@ -112,7 +112,7 @@ def test_what_is_no_point_that_could_be_written_is_refused_with_its_place(said: 
 @pytest.mark.parametrize(
     ("said", "complaint"),
     [
-        ('listen = "0.0.0.0:7420"', "service.listen: 0.0.0.0 is open to the network: give each program a token"),
+        ('listen = "0.0.0.0:7420"', "service.listen: 0.0.0.0 is reachable from the network; give each program a token"),
         ('listen = "plc"', "service.listen: a TCP address is written HOST:PORT"),
         ('token_file = "tokens"', "service.token_file: tokens need TCP; add an address"),
         ('tokens.hmi.role = "read"', "service.tokens.hmi: tokens are stored in a separate file"),

@@ -156,7 +156,7 @@ def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:
     [
         (("--read-only", "--allow", "*"), "--allow and --read-only exclude each other"),
         (("--bind", "0.0.0.0:0", "--allow", "*"), "needs --token-file"),
-        (("--certificate", __file__), "belong together"),
+        (("--certificate", __file__), "need each other"),
         (("--trusted", "."), "--trusted needs --certificate"),
         (("--bind", "here"), "--bind: a TCP address is written HOST:PORT"),
     ],

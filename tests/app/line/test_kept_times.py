@@ -209,7 +209,7 @@ def test_a_file_that_is_read_again_may_bring_back_a_node_and_its_times(text: str
 
 
 def test_a_place_without_a_folder_or_without_learning_is_refused(text: str) -> None:
-    with pytest.raises(InvalidCommand, match="there is no folder"):
+    with pytest.raises(InvalidCommand, match=r"the folder .* does not exist"):
         opened(text.replace("learned.json", "nowhere/learned.json"))
     with pytest.raises(
         InvalidCommand, match='has no effect, because reply times are not learned; add timing = "learned"'
