@@ -203,7 +203,7 @@ class Connection:
             return LineDown(f"cannot open {self.endpoint.name}: {error.strerror or str(error) or type(error).__name__}")
         cause = LineDown(
             f"cannot open {self.endpoint.name}: {type(error).__name__}: {error}",
-            hint="this is a bug: please report it with the text from the log",
+            hint="this is a bug; report it with the text from the log",
         )
         cause.__cause__ = error
         return cause

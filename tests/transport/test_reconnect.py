@@ -200,7 +200,7 @@ def test_r13_no_exception_ends_the_reconnecting_and_each_reason_is_told() -> Non
         ]
         assert causes[1].__cause__ is bug
         assert [cause.__cause__ is None for cause in causes] == [True, False, False, True, True, True]
-        assert causes[1].hint == "this is a bug: please report it with the text from the log"
+        assert causes[1].hint == "this is a bug; report it with the text from the log"
 
     run_in_virtual_time(fail())
 
