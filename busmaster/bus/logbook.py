@@ -44,20 +44,20 @@ class Logbook:
             self._write(event.change, level, f"the line is {event.change.value}{because}", now)
         elif isinstance(event, MaxReplyDelayRaised):
             text = (
-                f"{event.node.label} answered {event.age * 1000:.0f} ms after its request: "
-                f"its maximum reply delay is now {event.max_reply_delay * 1000:.0f} ms"
+                f"{event.node.label} replied after {event.age * 1000:.0f} ms; "
+                f"maximum reply delay raised to {event.max_reply_delay * 1000:.0f} ms"
             )
             self._write((event.node, MaxReplyDelayRaised), logging.WARNING, text, now)
         elif isinstance(event, MaxReplyDelayLowered):
             text = (
-                f"{event.node.label} has been prompt for an hour: "
-                f"its maximum reply delay is {event.max_reply_delay * 1000:.0f} ms again"
+                f"{event.node.label} has replied in time for an hour; "
+                f"maximum reply delay lowered to {event.max_reply_delay * 1000:.0f} ms"
             )
             self._write((event.node, MaxReplyDelayLowered), logging.INFO, text, now)
         elif isinstance(event, RepliesLate):
             text = (
-                f"{event.node.label} answers after {event.age * 1000:.0f} ms, later than its reply window of "
-                f"{event.window * 1000:g} ms: its values are late"
+                f"{event.node.label} replies after {event.age * 1000:.0f} ms, later than its reply window of "
+                f"{event.window * 1000:g} ms; its values are marked late"
             )
             self._write((event.node, RepliesLate), logging.WARNING, text, now)
         elif isinstance(event, PortFailed):

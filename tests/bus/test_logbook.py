@@ -55,12 +55,12 @@ def test_r14_unexpected_bytes_are_counted_and_not_logged_but_a_collision_is(line
 
 def test_r14_a_raised_max_reply_delay_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:
     Logbook("line").note(MaxReplyDelayRaised(Bench().node(3), 0.14, 0.224), PAUSE)
-    assert lines.messages == ["line: node 3 answered 140 ms after its request: its maximum reply delay is now 224 ms"]
+    assert lines.messages == ["line: node 3 replied after 140 ms; maximum reply delay raised to 224 ms"]
 
 
 def test_r14_a_max_reply_delay_that_comes_down_again_names_node_and_time(lines: pytest.LogCaptureFixture) -> None:
     Logbook("line").note(MaxReplyDelayLowered(Bench().node(3), 0.15), PAUSE)
-    assert lines.messages == ["line: node 3 has been prompt for an hour: its maximum reply delay is 150 ms again"]
+    assert lines.messages == ["line: node 3 has replied in time for an hour; maximum reply delay lowered to 150 ms"]
 
 
 def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(lines: pytest.LogCaptureFixture) -> None:

@@ -191,12 +191,12 @@ def event_text(event: BusEvent) -> str:
             return f"{event.node.label} is {event.after.value}, was {event.before.value}"
         case MaxReplyDelayRaised():
             return (
-                f"node {event.node.label} replied after {event.age * 1000:.0f} ms; "
+                f"{event.node.label} replied after {event.age * 1000:.0f} ms; "
                 f"maximum reply delay raised to {event.max_reply_delay * 1000:.0f} ms"
             )
         case RepliesLate():
             return (
-                f"node {event.node.label} replies after {event.age * 1000:.0f} ms, later than its reply window of "
+                f"{event.node.label} replies after {event.age * 1000:.0f} ms, later than its reply window of "
                 f"{event.window * 1000:g} ms; its values are marked late"
             )
         case LineChanged():

@@ -250,7 +250,7 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
     text = file.read_text()
     for said, complaint in (
         ('group = "no-such-group"', "the group 'no-such-group' does not exist on this machine"),
-        ('mode = "rw"', "a mode is octal"),
+        ('mode = "rw"', "a mode must be octal"),
         ("port = 5020", "port"),
         ("share = 0.01", "must be 0.1 to 10, not 0.01"),
     ):
@@ -409,7 +409,7 @@ def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
         other.write_text(file.read_text().replace('"winder/force" = 1.5', '"winder/force" = 2'))
         ran = busmaster("safe", str(other))
         assert (ran.status, ran.out) == (2, "")
-        assert "has the safe state winder/force = 1.5, and not winder/force = 2" in ran.err
+        assert "has the safe state winder/force = 1.5, not winder/force = 2" in ran.err
         assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 30\n"
         process.terminate()
         process.wait(PATIENCE)

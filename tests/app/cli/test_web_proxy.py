@@ -151,7 +151,7 @@ def test_with_a_name_of_a_proxy_nobody_writes_without_a_token(file: Path) -> Non
     with owner("serve", str(file)) as (_, address), web(address, "--host", NAME) as (interface, client):
         until_said(interface, "connected to line")
         answer = client.put(ONE, json={"value": 1.5})
-        assert (answer.status_code, "without a token" in answer.json()["what"]) == (403, True)
+        assert (answer.status_code, "needs a token" in answer.json()["what"]) == (403, True)
         assert client.get("/api/line").json()["read_only"] is True
         assert client.get("/", headers={"Host": NAME}).status_code == 200
         refused = client.get("/", headers={"Host": "elsewhere.example"})

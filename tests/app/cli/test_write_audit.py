@@ -74,7 +74,7 @@ def test_a_point_is_written_by_its_name_in_its_unit_and_that_is_on_record(
         ("winder/force=51", "above its maximum of 50"),
         ("winder/10=9", "below its minimum of 1"),
         ("winder/axis0.idle=1", "is read-only"),
-        ("winder/force=2,3", "does not take 2 values"),
+        ("winder/force=2,3", "does not accept 2 values"),
         ("winder/force=inf", "finite number"),
         ("winder/force=1e308", "1e+308 is too large"),
         ("winder/farce=2", "no such item 'farce'"),
@@ -112,7 +112,7 @@ def test_what_the_file_says_is_not_said_again(busmaster: Command, path: Path, op
 def test_without_a_file_the_protocol_is_missed(busmaster: Command) -> None:
     ran = busmaster("write", "/dev/null", "1=2")
     assert ran.status == 2
-    assert "--protocol P, or a LINE.toml in place of the port" in ran.err
+    assert "--protocol P, or a LINE.toml instead of the port" in ran.err
 
 
 @pytest.mark.slow

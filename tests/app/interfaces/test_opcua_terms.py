@@ -133,7 +133,7 @@ def test_who_may_write_is_who_shows_a_token_where_there_are_tokens_or_others_may
     assert Rules(secrets=secrets).refusal(known) == ""
     assert "anonymous" in Rules(secrets=secrets).refusal(anonymous)
     assert Rules().refusal(anonymous) == ""
-    assert "without a token" in Rules(is_local=False).refusal(anonymous)
+    assert "needs a token" in Rules(is_local=False).refusal(anonymous)
     assert Rules(secrets=secrets, is_local=False).refusal(known) == ""
 
 

@@ -148,7 +148,7 @@ async def test_a_write_passes_the_owners_authorisation_and_its_limits_hold(tmp_p
         assert (status, said["error"]) == (400, "InvalidCommand")
         assert "50" in said["what"]
         assert line.audit() == [("5/10", "written"), ("5/10", "refused")]
-        assert of.writes[0] == "5/10 = 12.5, asked by a page from 127.0.0.1: written"
+        assert of.writes[0] == "5/10 = 12.5, from a page from 127.0.0.1: written"
         assert len(of.writes) == 2
 
 
@@ -408,7 +408,7 @@ async def test_where_there_are_tokens_a_write_shows_one(tmp_path: Path, seen_at:
         assert (await put(of, 1, Authorization=f"Bearer {TOKEN}"))[0] == 200
         assert of.writes == [
             "1 failed login at web: 1 from 127.0.0.1",  # the others are reported a minute later
-            "5/10 = 1, asked by token hmi from 127.0.0.1: written",
+            "5/10 = 1, from token hmi from 127.0.0.1: written",
         ]
 
 
@@ -640,4 +640,4 @@ async def test_a_request_with_two_lengths_is_refused_and_its_connection_closed(t
         assert answer.startswith("HTTP/1.1 400 ")
         assert "connection: close" in answer.lower()
         assert answer.count("HTTP/1.1") == 1
-        assert "exclude each other" in answer
+        assert "must not have both" in answer

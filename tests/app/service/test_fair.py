@@ -95,7 +95,7 @@ def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path
         absent = Hcp2Controller(remote, ABSENT, timings=PATIENT)
         waiting = [asyncio.ensure_future(absent.read(1)) for _ in range(2 * MOST_UNDER_WAY)]
         await until(lambda: any(len(client.errands) == MOST_UNDER_WAY for client in line.service.clients))
-        with pytest.raises(NotStarted, match="of this program are not answered yet"):
+        with pytest.raises(NotStarted, match="of this program have no reply yet"):
             await Hcp2Controller(remote, 5).write(1, 7, finish_within=0.01)
         await given_up(waiting)
         assert await Hcp2Controller(remote, 5).read(1) == 0
