@@ -1,8 +1,8 @@
-"""A CAM table loaded into an MSC controller: in blocks of 32 values, verified, without holding up other traffic.
+"""Load a CAM table into an MSC controller: in blocks of 32 values, verified, while other traffic continues.
 
     python examples/cam_download.py [PORT]    such as /dev/ttyS0; without one, emulated
 
-With a PORT it OVERWRITES the data from address 3000 on of unit 3. Load a table while the program does not use it.
+With a PORT it OVERWRITES the data of unit 3 from address 3000 on. Load a table while no program uses it.
 """
 
 import math
@@ -23,9 +23,9 @@ def show(done: int, total: int) -> None:
 
 
 async def main(bus: BusLike) -> None:
-    # The address step is not in the manual: 4 where addresses count bytes. `find_address_step` finds it.
+    # The address step is not in the manual: it is 4 if addresses count bytes. `find_address_step` finds it.
     press = MscController(bus, 3, symbols={"cam": 3000}, address_step=4)
-    await press.load_cam("cam", TABLE, progress=show)  # what was written and what was verified both count
+    await press.load_cam("cam", TABLE, progress=show)  # writes and verifications both count
     print("the first values are", await press.read("cam", 8))
 
 

@@ -1,4 +1,4 @@
-"""CT-ANSI (Unidrive, Commander): parameters by menu and number, with the decimal points that the drive sends.
+"""CT-ANSI (Unidrive, Commander): parameters by menu and number, with the drive's decimal points.
 
     python examples/ct_ansi_hello.py [PORT]  such as /dev/ttyUSB0 or socket://10.0.0.5:4001; without one, emulated
 

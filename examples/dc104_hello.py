@@ -2,7 +2,7 @@
 
     python examples/dc104_hello.py [PORT]    such as /dev/ttyS0 or socket://10.0.0.5:4001; without one, emulated
 
-With a PORT it writes parameter 12 back to the value that it has.
+With a PORT it writes parameter 12 with its current value.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""A program that does not use asyncio: the bus lives in a thread of its own, and any other thread calls it and waits.
+"""A program without asyncio: the bus runs in a thread of its own, and other threads call it and wait.
 
     python examples/from_a_thread.py [PORT]    such as /dev/ttyUSB0; without one, emulated
 
@@ -25,7 +25,7 @@ def main(portal: BlockingPortal, bus: BusLike) -> None:
 
 
 def in_parallel(portal: BlockingPortal, controller: Hcp2Controller) -> list[float]:
-    """Several threads may ask at once: the bus puts their requests in a row."""
+    """Several threads can send requests at once: the bus sends them one after another."""
     with ThreadPoolExecutor() as threads:
         return list(threads.map(lambda channel: portal.call(controller.io.adc(channel).read), range(4)))
 

@@ -1,4 +1,4 @@
-"""HCP2: elements by number, the extended comms array by name, a value that is verified, and one that is refused.
+"""HCP2: elements by number, the extended comms array by name, a verified value, and a refused one.
 
     python examples/hcp2_hello.py [PORT]     such as /dev/ttyUSB0 or socket://10.0.0.5:4001; without one, emulated
 

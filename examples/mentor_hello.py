@@ -1,4 +1,4 @@
-"""Mentor II: parameters by menu and number, with their decimals, and one that the drive does not have.
+"""Mentor II: parameters by menu and number, with their decimals, and a missing parameter.
 
     python examples/mentor_hello.py [PORT]   such as /dev/ttyS0 or socket://10.0.0.5:4001; without one, emulated
 

@@ -1,4 +1,4 @@
-"""MicroFlex: enable a drive, turn its motor for a moment, and disable it whatever happens.
+"""MicroFlex: enable a drive, turn its motor for a moment, and always disable it.
 
     python examples/microflex_hello.py [PORT]    such as /dev/ttyUSB0 or socket://10.0.0.5:4001; without one, emulated
 
@@ -20,7 +20,7 @@ async def main(bus: BusLike) -> None:
     drive = MicroFlexDrive(bus, 7)
     print("firmware build", await drive.check_firmware())
     try:
-        status = await drive.enable()  # returns once the drive's status word says so
+        status = await drive.enable()  # returns when the drive's status word confirms it
         print("status:", status.name)
         await drive.set_speed_reference(10.0)
         for _ in range(4):

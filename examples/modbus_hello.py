@@ -1,4 +1,4 @@
-"""Modbus RTU: registers and numbers of one unit, a group of two units, and what an exception looks like.
+"""Modbus RTU: registers and numbers of one unit, a group of two units, and an exception reply.
 
     python examples/modbus_hello.py [PORT]   such as /dev/ttyUSB0 or socket://10.0.0.5:4001; without one, emulated
 

@@ -1,4 +1,4 @@
-"""MSC: data by the names of the controller's program, flags, and what the program is doing.
+"""MSC: data by the names of the controller's program, flags, and the program's status.
 
     python examples/msc_hello.py [PORT]      such as /dev/ttyS0 or socket://10.0.0.5:4001; without one, emulated
 

@@ -1,8 +1,8 @@
-"""Forty drives polled on one line, one of them dead: the others do not wait for it.
+"""Poll forty drives on one line, one of them dead: the others do not wait for it.
 
     python examples/polling_forty_drives.py [PORT]    such as /dev/ttyUSB0; without one, emulated
 
-Nothing is written.
+It writes nothing.
 """
 
 import logging

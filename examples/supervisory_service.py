@@ -1,14 +1,14 @@
-"""A supervisory service: HTTP and a websocket in front of a line. The bus lives as long as the application.
+"""A supervisory service: HTTP and a websocket for a line. The bus runs as long as the application.
 
-    python examples/supervisory_service.py          on an emulated line: asks itself everything once, and ends
+    python examples/supervisory_service.py          on an emulated line: requests each URL once, and ends
     python examples/supervisory_service.py PORT     serves nodes 1 to 4 of a real line on http://127.0.0.1:8000
 
     GET /health                             state of the line and of its nodes
     GET /nodes/2/axis0.position             a value, now
     PUT /nodes/2/1         {"value": 5}     write one
-    websocket /stream                       all positions, a message a cycle
+    websocket /stream                       all positions, one message per cycle
 
-Needs `pip install 'busmaster[examples]'`: starlette; uvicorn to serve, httpx2 to ask itself.
+Needs `pip install 'busmaster[examples]'`: starlette; uvicorn to serve, httpx2 for its own requests.
 """
 
 import sys
@@ -97,9 +97,9 @@ def point(request: Request) -> Point[Any]:
 
 
 def explain(_: Request, error: Exception) -> JSONResponse:
-    """Every error says in one sentence what happened and what to try."""
+    """Return an error with its cause and its hint."""
     match error:
-        case ValueError():  # InvalidCommand, or a body that is no JSON
+        case ValueError():  # InvalidCommand, or a body that is not JSON
             status = 400
         case Refused():
             status = 409

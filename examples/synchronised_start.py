@@ -1,8 +1,8 @@
-"""Several Mentor II drives started at the same moment: one telegram to all of them.
+"""Start several Mentor II drives at the same moment: one telegram to all of them.
 
     python examples/synchronised_start.py [PORT]    such as /dev/ttyS0; without one, emulated
 
-Nobody answers a broadcast, so each drive is asked afterwards whether it has heard it.
+Drives do not reply to a broadcast, so the program reads each drive afterwards to check that it received the value.
 
 With a PORT it gives drives 11, 12 and 13 a speed reference of 20 %: motors that are enabled TURN.
 """
@@ -22,7 +22,7 @@ SETTINGS = MentorDrive.profile.line  # 9600 7E1
 
 
 async def set_all(bus: BusLike, drives: list[MentorDrive], percent: float) -> None:
-    """One write to address 0; then a write of its own for whoever missed it."""
+    """Write to address 0, then separately to each drive that did not receive it."""
     await MentorDrive(bus, 0, decimals=DECIMALS).write(REFERENCE, percent)
     for drive in drives:
         if await drive.read(REFERENCE) != percent:

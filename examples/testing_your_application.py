@@ -1,9 +1,9 @@
-"""Testing an application of yours: on an emulated line, in virtual time, an hour in a fraction of a second.
+"""Test your application on an emulated line in virtual time: an hour in a fraction of a second.
 
     python examples/testing_your_application.py     or: python -m pytest examples/testing_your_application.py
 
-The application knows nothing of that: it is given a drive, and sleeps and polls as it does in the plant.
-`busmaster.testing.fixtures` has the same as pytest fixtures.
+The application is the same as in the plant: it gets a drive, sleeps and polls.
+`busmaster.testing.fixtures` provides the same as pytest fixtures.
 """
 
 import asyncio
