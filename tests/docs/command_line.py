@@ -40,6 +40,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("do winder@line.toml execute 1 200 25 --within 10", DRIVES),
     ),
     "poll": ((f"poll {LINE} --protocol hcp2 --nodes 1-4 --items 1,2 --period 0.2", CTRL_C),),
+    "trend": (
+        (f"trend {LINE} --protocol hcp2 5/axis0.position 5/axis0.velocity --seconds 4", RUN),
+        ("trend line.toml winder/axis0.position --period 0.1 --csv trend.csv", TERMINAL),
+    ),
     "scan": ((f"scan {LINE} --protocol hcp2 --nodes 1-8", RUN),),
     "discover": ((f"discover {LINE} --yes -o found.toml", LONG),),
     "emulate": (

@@ -35,6 +35,7 @@ COMMANDS = (
     "write",
     "do",
     "poll",
+    "trend",
     "scan",
     "discover",
     "emulate",

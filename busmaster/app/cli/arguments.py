@@ -23,6 +23,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 NOT_THE_FILES = (
     *("capture", "capture_files", "capture_mb", "verify", "as_json"),
     *("items", "output", "dry_run", "yes", "enabled", "undo", "within", "at_least"),
+    *("period", "csv_path", "span", "seconds", "plain"),
 )
 """Options that do not describe a line, and are permitted with a LINE.toml."""
 

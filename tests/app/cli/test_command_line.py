@@ -22,6 +22,8 @@ PROMISED = {
     " [--decimals N]",
     "do": "NODE@PORT|NODE@LINE.toml ACTION [NUMBER]... [--protocol P] [--within S] [--at-least S] [--json]",
     "poll": "PORT --protocol P [--nodes N-M,K] --items ITEM,ITEM... --period S [--seconds S] [--json] [--plain]",
+    "trend": "PORT|LINE.toml NODE/ITEM... [--protocol P] [--period S] [--csv FILE] [--span S] [--seconds S] [--plain]"
+    " [--json]",
     "scan": "PORT --protocol P [--nodes N-M,K] [--json]",
     "emulate": "[LINE.toml] [--protocol P] [--nodes N-M,K] [--pty [LINK]] [--tcp HOST:PORT] [--baud N] [--paced]"
     " [--reply-delay MS[-MS]] [--fault NAME=VALUE] [--seed N] [--seconds S]",
@@ -60,6 +62,7 @@ BESIDE = {
     "write": f"{CAPTURE} {NODE}",
     "do": f"{CAPTURE} {NODE}",
     "poll": f"{CAPTURE} {NODE} [--read-only]",
+    "trend": f"{CAPTURE} {NODE}",
     "scan": f"{CAPTURE} {NODE}",
     "run": f"{CAPTURE} [--port PORT]",
     "monitor": f"{CAPTURE} [--baud N]",
