@@ -126,7 +126,7 @@ class How(NamedTuple):
     csv_path: str | None
 
 
-# what is sampled
+# the sampled items
 
 
 class Row(NamedTuple):
@@ -155,7 +155,7 @@ class Trace:
     shown: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MOST_SHOWN))
 
     async def read(self) -> Any:
-        """Return its value. Raises BusError, and InvalidCommand for what is not one number."""
+        """Return its value. Raises BusError, and InvalidCommand if it is not one number."""
         value = self.point.value_of(await self.node.request(self.point.command, priority=Priority.BACKGROUND))
         if not isinstance(value, int | float):
             raise InvalidCommand(f"{self.name} is not one number but {value!r}: name one of its items")
@@ -208,7 +208,7 @@ class Sampler:
     def __init__(self, bus: Bus | RemoteBus, traces: Sequence[Trace], period: float | None) -> None:
         self.traces = traces
         self.rows: deque[Row] = deque()
-        """What has not been written yet."""
+        """Samples that are not written yet."""
         self._bus = bus
         self._period = period
         self.start = bus.now()
@@ -284,7 +284,7 @@ class Output:
             self._csv.close()
 
     def write(self, rows: Sequence[Row]) -> None:
-        """Print and write samples. Raises OSError if the file cannot be written, or nobody reads the lines."""
+        """Print and write samples. Raises OSError if the file cannot be written, or if the reader of the lines has gone."""
         if self._csv is not None:
             self._csv.write(csv_lines(map(cells, rows)))
             self._csv.flush()
@@ -378,7 +378,7 @@ def _print(text: str) -> None:
 
 
 def plotter(plain: bool) -> Any:
-    """Return plotext where a plot is wanted and there is a terminal; None else. Says which extra is missing."""
+    """Return plotext if a plot is wanted on a terminal, else None. Prints which extra is missing."""
     if plain or not sys.stdout.isatty():
         return None
     try:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.app.cli.parsing import Assignment
 from busmaster.app.cli.write import pass_on, prepare
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
@@ -219,7 +220,7 @@ def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
 def by_command_line(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         key = f"drive/{name or plant.kind.item}"
-        await pass_on(plant.line, *prepare(plant.line, key, (value,), False))
+        await pass_on(plant.line, *prepare(plant.line, Assignment(key, (value,)), False))
 
     return write
 
