@@ -284,7 +284,7 @@ class Output:
             self._csv.close()
 
     def write(self, rows: Sequence[Row]) -> None:
-        """Print and write samples. Raises OSError if the file cannot be written, or if the reader of the lines has gone."""
+        """Print and write samples. Raises OSError if the file or the reader of the lines is gone."""
         if self._csv is not None:
             self._csv.write(csv_lines(map(cells, rows)))
             self._csv.flush()
