@@ -110,6 +110,10 @@ def faults(message: Message) -> Iterator[str]:
         yield "has needless spaces"
     if re.search(r"\b(?:please|sorry|oops)\b", text, re.I):
         yield "has filler words"
+    if not text:
+        if not message.is_hint:  # an empty hint switches off that of the error class
+            yield "is empty"
+        return
     first = text.split()[0]
     if re.fullmatch(r"[A-Z][a-z]+", first) and first not in NAMES:
         yield f"begins with a capital: {first}"

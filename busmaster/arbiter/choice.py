@@ -137,9 +137,6 @@ class Choice:
         self._held_since = -inf
         """When the first request was sent before the one that is held back."""
         self._last_byte = -inf
-        # One object for all requests that need no further choice: making one costs time for every request (benchmark
-        # `turnaround`). The line uses it before it calls `next` again.
-        self._usual = Send.__new__(Send)
 
     def next(self, now: float, last_byte: float) -> Action:
         """Return the next action. `last_byte`: when the last byte was received, in seconds."""
@@ -171,10 +168,7 @@ class Choice:
         alike.node = node
         in_sync.last = answers
         in_sync.recent.append(answers)
-        usual = self._usual
-        usual.transaction = transaction
-        usual.exchange = exchange
-        return usual
+        return Send(transaction, exchange)
 
     def _carefully(self, first: Send, now: float, last_byte: float, too_many: bool = False) -> Send | WaitUntil:
         """Select as `next` does, while a reply is overdue or ambiguous, or `too_many` replies were alike."""

@@ -29,7 +29,9 @@ class NoChance(Chance):
     """Used if no random.Random was passed: raises an error as soon as randomness is needed."""
 
     def random(self) -> float:
-        raise ValueError("pass a random.Random(seed) to the Line: a delay or a fault on it is random")
+        raise ValueError(
+            "the Line has no source of chance for a random delay or fault; pass a random.Random(seed) to it"
+        )
 
     def uniform(self, a: float, b: float) -> float:
         return self.random()

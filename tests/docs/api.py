@@ -190,6 +190,8 @@ def _parameters(called: Any) -> str:
         signature = inspect.signature(called)
         if is_dataclass(called) and list(signature.parameters) == ["args", "named"]:  # old names are accepted too
             signature = Signature([_parameter(each) for each in fields(called) if each.init])
+        if getattr(getattr(called, "__init__", None), "__name__", "").startswith("_no_init"):
+            signature = Signature()  # `typing` replaces this `__init__` of protocols when the first instance is made
     except (TypeError, ValueError):
         return ""
     parts: list[str] = []

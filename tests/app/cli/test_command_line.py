@@ -68,7 +68,7 @@ BESIDE = {
     "monitor": f"{CAPTURE} [--baud N]",
     "doctor": f"{CAPTURE} {LINE}",
     "serve": f"{CAPTURE} [--port PORT] [--seconds S]",
-    "web": "[--token-file FILE] [--host NAME]",
+    "web": "[--token-file FILE] [--host NAME] [--history FILE]",
     "opcua": "[--allow POINT] [--token-file FILE] [--certificate FILE] [--key FILE] [--trusted FOLDER]",
     "modbus-tcp": "[--map FILE] [--print-map] [--type TYPE] [--last] [--allow POINT] [--pass-through]"
     " [--allow-unit ID] [--allow-from ADDRESS] [--idle SECONDS]",

@@ -91,14 +91,14 @@ def test_a_reset_cancels_the_errors(busmaster: Command, drive: TcpServer) -> Non
         ("7@PORT", ("reset", *MICROFLEX, "--within", "1"), "reset takes no --within"),
         ("7@PORT", ("enable", *MICROFLEX, "--at-least", "1"), "enable takes no --at-least"),
         ("7@PORT", ("enable", *MICROFLEX, "--wihtin", "1"), "no such option '--wihtin'"),
-        ("7@PORT", ("enable", *MICROFLEX, "--within", "0"), "a time is above 0"),
+        ("7@PORT", ("enable", *MICROFLEX, "--within", "0"), "a time must be above 0"),
         ("drive@PORT", ("enable", *MICROFLEX), "a node of a port is named by its address"),
         ("7", ("enable", *MICROFLEX), "a node is written"),
         ("11@PORT", ("enable", "--protocol", "mentor"), "mentor has no actions"),
         ("2@PORT", ("execute", "1", "--protocol", "hcp"), "execute needs --within S"),
         ("2@PORT", ("execute", "--protocol", "hcp", "--within", "1"), "execute is written execute COMMAND DATA..."),
-        ("2@PORT", ("execute", "0", "--protocol", "hcp", "--within", "1"), "0 is no command"),
-        ("2@PORT", ("execute", "1", "x", "--protocol", "hcp", "--within", "1"), "'x' is no number"),
+        ("2@PORT", ("execute", "0", "--protocol", "hcp", "--within", "1"), "0 is not a command"),
+        ("2@PORT", ("execute", "1", "x", "--protocol", "hcp", "--within", "1"), "'x' is not a number"),
         ("3@PORT", ("set-flag", "256", "--protocol", "msc"), "256"),
         ("3@PORT", ("set-flag", "1.5", "--protocol", "msc"), "1.5"),
     ],
@@ -194,7 +194,7 @@ def test_an_action_that_fails_is_on_record(busmaster: Command, file: Path, drive
 def test_what_the_file_says_is_not_said_again(busmaster: Command, file: Path, option: tuple[str, ...]) -> None:
     ran = busmaster("do", f"drive@{file}", "enable", *option)
     assert ran.status == 2
-    assert f"says what is on the line: leave out {option[0]}" in ran.err
+    assert f"already defines the line; leave out {option[0]}" in ran.err
 
 
 def test_a_node_that_the_file_does_not_have_is_named(busmaster: Command, file: Path) -> None:

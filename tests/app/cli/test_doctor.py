@@ -266,7 +266,7 @@ def test_what_learned_windows_would_come_to_is_said() -> None:
     assert findings.on("learning").what.startswith("learned windows would be 32 ms at most; a lost reply would occupy")
     assert "instead of 150 ms" in findings.on("learning").what
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
-    assert "no shorter than the one that is set" in findings.on("learning").what
+    assert "would not be shorter than the configured one" in findings.on("learning").what
 
 
 @pytest.mark.parametrize(

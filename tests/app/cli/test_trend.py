@@ -192,7 +192,7 @@ def test_an_item_that_the_node_does_not_have_ends_it(busmaster: Command) -> None
         (("one/10",), "written NODE/ITEM"),
         (("1/axis0.positoin",), "did you mean 'axis0.position'?"),
         (("256/1",), "256"),
-        (("1/1", "--period", "0"), "a time is above 0"),
+        (("1/1", "--period", "0"), "a time must be above 0"),
         (("1/1", "--csv", "HERE"), "is there already, and not overwritten"),
         ((), "missing argument"),
     ],

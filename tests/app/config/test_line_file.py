@@ -374,7 +374,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (f"{HEAD}[outputs.sqlit]\npath = 'x'", "line.toml:2: outputs.sqlit: no such key; did you mean 'sqlite'?"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\ngroups = ['g']", "line.toml:4: outputs.csv.groups[1]: no such group 'g'"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\nbuffer = 0", "line.toml:4: outputs.csv.buffer: must be 1 to"),
-        (f"{HEAD}[outputs.mqtt]\nprefix = 'a/#'", "line.toml:3: outputs.mqtt.prefix: a topic has neither"),
+        (f"{HEAD}[outputs.mqtt]\nprefix = 'a/#'", "line.toml:3: outputs.mqtt.prefix: a topic must not contain"),
         (f"{HEAD}[outputs.mqtt]\nqos = 2", "line.toml:3: outputs.mqtt.qos: must be 0 to 1, not 2"),
         (
             f"{HEAD}[emulator.faults]\nlosst = 1",
@@ -398,7 +398,7 @@ def test_an_error_names_file_line_and_key_and_what_would_do(text: str, complaint
 
 def test_what_an_output_cannot_do_is_said_where_the_file_asks_for_it(tmp_path: Path) -> None:
     text = f'{HEAD}{NODE}[outputs.csv]\npath = "{tmp_path}/none/x.csv"\n'
-    with pytest.raises(FileError, match=r"line\.toml:5: outputs\.csv: .*there is no folder"):
+    with pytest.raises(FileError, match=r"line\.toml:5: outputs\.csv: .*the folder .* does not exist; create it"):
         ConfiguredLine(parse(text))
 
 

@@ -279,8 +279,8 @@ def test_a_bit_that_was_not_named_is_guessed() -> None:
         ("modbus", '"holding:1:4"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a run, and"),
         ("msc", '"flags"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a set, and a gauge"),
         ("msc", '"2008:32"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a run, and a gauge"),
-        ("hcp2", '"10"', 'csv]\npath = "%Q-line.csv"', "csv: %Q-line.csv: %Q is no field of a date: use those of strf"),
-        ("hcp2", '"10"', 'mqtt]\nprefix = "a\\u0001"', "mqtt.prefix: a topic has neither"),
+        ("hcp2", '"10"', 'csv]\npath = "%Q-line.csv"', "csv: %Q-line.csv: %Q is not a field of a date; use strf"),
+        ("hcp2", '"10"', 'mqtt]\nprefix = "a\\u0001"', "mqtt.prefix: a topic must not contain"),
     ],
 )
 def test_an_output_that_cannot_take_a_point_says_so(kind: str, point: str, output: str, complaint: str) -> None:
