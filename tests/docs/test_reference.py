@@ -129,7 +129,12 @@ def test_bash_completes_a_command(environment: dict[str, str]) -> None:
 def test_the_wheel_brings_them_where_the_system_looks() -> None:
     built = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     folders = [ROOT / folder for folder, to in built["shared-data"].items() if folder == to]
-    files = {path.relative_to(ROOT / "share").as_posix() for folder in folders for path in folder.rglob("*") if path.is_file()}
+    files = {
+        path.relative_to(ROOT / "share").as_posix()
+        for folder in folders
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
     assert files == {
         "man/man1/busmaster.1",
         "bash-completion/completions/busmaster",
