@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import islice
 from operator import is_
 from types import TracebackType
@@ -404,19 +404,13 @@ def _address(node: NodeSection) -> tuple[str, int]:
     return node.profile.name, node.address
 
 
+TAKES_EFFECT = {"points", "template", "table"}
+"""Fields of a node whose changes take effect when the file is reloaded. Every other one needs a restart."""
+
+
 def _settings(node: NodeSection) -> tuple[object, ...]:
     decimals = decimals_of(node) if node.kind.takes_decimals else None
-    return (
-        node.name,
-        node.protocol,
-        node.address,
-        node.timings,
-        node.retries,
-        node.probe,
-        node.sync_reads,
-        node.options,
-        decimals,
-    )
+    return (decimals, *(getattr(node, each.name) for each in fields(node) if each.name not in TAKES_EFFECT))
 
 
 def _section(file: LineFile, name: str) -> PointSection | None:

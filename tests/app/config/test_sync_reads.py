@@ -74,7 +74,9 @@ def test_a_wrong_item_is_an_error_at_its_key(key: str, complaint: str) -> None:
     assert complaint in str(caught.value)
 
 
-@pytest.mark.parametrize("key", ['probe = "holding:1"', 'sync_reads = ["holding:1", "holding:2"]'])
-def test_another_probe_or_other_sync_reads_need_a_restart(key: str) -> None:
+@pytest.mark.parametrize(
+    "key", ['probe = "holding:1"', 'sync_reads = ["holding:1", "holding:2"]', "reply_time = 0.01", "retries = 1"]
+)
+def test_another_setting_of_a_node_needs_a_restart(key: str) -> None:
     with pytest.raises(InvalidCommand, match="changes of node 'press' need a restart"):
         check_same_line(parse(NODE), parse(f"{NODE}{key}\n"))
