@@ -50,10 +50,6 @@ class Pulled(EmulatedDc104):
         self._kind = None
         self.read.clear()
 
-    def reply(self, data: bytes, now: float, delay: float | None = None) -> float:
-        """Send nothing after the cable was pulled."""
-        return now if self.pulled.is_set() else super().reply(data, now, delay)
-
     def _handle(self, frame: bytes, now: float) -> None:
         if self.pulled.is_set():
             return
@@ -61,9 +57,10 @@ class Pulled(EmulatedDc104):
             self.read.append(frame[2])
         if frame[1] == self._kind:
             if self._left == 0:
+                if self._carried_out:
+                    self._write(frame[2], int.from_bytes(frame[3:5], "big"))
                 self.pulled.set()
-                if not self._carried_out:
-                    return
+                return
             self._left -= 1
         super()._handle(frame, now)
 

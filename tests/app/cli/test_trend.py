@@ -6,6 +6,7 @@ import csv
 import importlib.util
 import io
 import json
+import math
 import os
 import pty
 import re
@@ -75,6 +76,29 @@ async def test_it_samples_as_fast_as_the_line_allows() -> None:
         statistics = await bus.statistics()
         assert (statistics.busy - before) / (bus.now() - began) > 0.95
         assert all(trace.samples > 300 and trace.lost == 0 for trace in sampler.traces)
+
+
+@in_virtual_time
+async def test_the_lowest_and_the_highest_are_those_of_all_samples() -> None:
+    mint = EmulatedMint(1)
+    async with memory_bus(mint) as bus:
+        sampler = await sampler_of(bus, "1/10", period=0.1)
+        [trace] = sampler.traces
+        for value in (5.0, -3.0, 40.0, 2.0):
+            mint.preset("10", value)
+            await sampled(sampler, 0.35)
+        assert (trace.lowest, trace.highest, trace.last) == (-3.0, 40.0, 2.0)
+        assert ", lowest -3, highest 40, 0 lost" in trace.summary(1.4)
+        assert [value for _, value in trace.shown][:: len(trace.shown) // 4][:4] == [5.0, -3.0, 40.0, 2.0]
+
+
+def test_a_value_that_is_not_finite_is_counted_but_is_neither_lowest_nor_highest() -> None:
+    point = Hcp2Controller(memory_bus(), 1).point("10")
+    trace = Trace("1/10", point, point.node)
+    for since, value in enumerate((1.0, math.inf, -2.0, math.nan, -math.inf)):
+        trace.take(since, value)
+    assert (trace.samples, trace.lowest, trace.highest) == (5, -2.0, 1.0)
+    assert [value for _, value in trace.shown] == [1.0, -2.0]
 
 
 @in_virtual_time
