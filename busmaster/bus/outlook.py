@@ -40,7 +40,7 @@ class Outlook:
             yield from plan_steps(
                 [*groups, *more],
                 line=self._settings(),
-                receive_latency=self._endpoint.receive_latency,
+                receive_latency=self._delay(),
                 others=self._asked(),
                 could_merge=could_merge,
                 sharing=self._line.sharing,
@@ -58,13 +58,18 @@ class Outlook:
         bound = bounds(
             self._asked(),
             arbiter.byte_time,
-            self._endpoint.receive_latency,
+            self._delay(),
             polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
             sharing=self._line.sharing,
         )
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
         return bound.wait(priority, ahead=self._line.ahead(priority), patience=longest)
+
+    def _delay(self) -> float:
+        """Return the seconds by which the port can delay an exchange."""
+        # `send_delay` could be counted without its part in each silence, but R9's bound may only be too long.
+        return self._endpoint.receive_latency + getattr(self._endpoint, "send_delay", 0.0)
 
     def _settings(self) -> LineSettings:
         if self._endpoint.settings is not None:

@@ -56,6 +56,9 @@ class Endpoint(Protocol):
         endpoint may also have a method `folders()`, which returns the folders in which an entry appears, or its
         permissions change, when the device returns. Then the folders are watched, and `presence` is called after a
         change in them.
+
+        An endpoint whose port sends later than it gets the bytes has a property `send_delay`, in seconds, which R9's
+        bound includes.
         """
         ...
 

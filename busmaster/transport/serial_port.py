@@ -144,6 +144,11 @@ class SerialPort:
         """Return how RTS switches the transmitter; None if it does not."""
         return settings_of(self.rs485)
 
+    @property
+    def send_delay(self) -> float:
+        """Return the seconds for which each frame waits for the transmitter."""
+        return 0.0 if self.rts is None else self.rts.delay_before
+
     def presence(self) -> Hashable | None:
         """Return a value that changes when the node at the path (possibly a symlink) changes.
 

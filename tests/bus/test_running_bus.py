@@ -20,6 +20,8 @@ from busmaster.planning import PlannedGroup
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.transport.rs485 import Rs485
+from busmaster.transport.serial_port import SerialPort
 from tests.stories import cycles, on_a_bus
 
 # plans and bounds of the running bus
@@ -57,6 +59,16 @@ def test_a_plan_of_what_might_be_added() -> None:
         assert not (await bus.plan(greedy)).fits
 
     on_a_bus(story)
+
+
+def test_r9_the_worst_case_includes_the_time_for_which_a_port_holds_a_frame_back() -> None:
+    def hold(rs485: Rs485 | None) -> float:
+        bus = Bus(SerialPort("/dev/none", baudrate=57600, rs485=rs485))
+        Hcp2Controller(bus, 1)
+        return bus.worst_case_wait(Priority.URGENT)
+
+    assert hold(Rs485(delay_before=0.02)) >= hold(None) + 0.02
+    assert hold(Rs485(delay_after=0.02)) == hold(None), "it ends before the reply begins"
 
 
 def test_r9_the_worst_case_wait_of_the_line_at_hand() -> None:
