@@ -8,6 +8,7 @@ import re
 import signal
 import sqlite3
 import subprocess
+import sys
 import threading
 import time
 import tomllib
@@ -24,7 +25,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from jsonschema import Draft7Validator
 
-from tests.app.cli.conftest import Command, busmaster, serve, started
+from tests.app.cli.conftest import ENVIRONMENT, Command, busmaster, serve, started
 from tests.app.outputs.brokers import MOSQUITTO, needs_mosquitto
 from tests.app.outputs.cycles import until
 from tests.patience import PATIENCE
@@ -86,6 +87,8 @@ class Seen:
     metrics: str
     messages: dict[str, bytes]
     database: Path
+    health: int
+    """The exit status of the health check."""
 
 
 def replaced(text: str, *changes: tuple[str, str]) -> str:
@@ -124,10 +127,21 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
             command(mqtt, messages)
         until(lambda: 'busmaster_node_up{node="unwinder"} 0.0' in scraped(metrics))
         until(lambda: re.search(r"^busmaster_value\{", scraped(metrics), re.MULTILINE) is not None)
-        found = scraped(metrics)
+        found, health = scraped(metrics), health_check(ENVIRONMENT)
         line.send_signal(signal.SIGINT)
         line.wait(PATIENCE)
-        yield Seen(found, messages, folder / SQLITE["path"])
+        yield Seen(found, messages, folder / SQLITE["path"], health)
+
+
+def health_check(environment: dict[str, str]) -> int:
+    """Run the command of the image's health check, and return its exit status."""
+    text = re.sub(r"\\\n\s*", "", DOCKERFILE.read_text())
+    [check] = re.findall(r"^HEALTHCHECK .*?\bCMD (.*)$", text, re.MULTILINE)
+    path = f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"
+    ran = subprocess.run(
+        ["sh", "-c", check], check=False, env={**environment, "PATH": path}, capture_output=True, timeout=PATIENCE
+    )
+    return ran.returncode
 
 
 def scraped(port: int) -> str:
@@ -308,6 +322,12 @@ def test_the_image_runs_the_line_as_a_user_without_rights() -> None:
     assert json.loads(found["ENTRYPOINT"]) == ["busmaster"]
     assert json.loads(found["CMD"])[1] in mounted("busmaster")
     assert SERVICES["busmaster"]["cap_drop"] == ["ALL"]
+
+
+@pytest.mark.skipif(Path("/run/busmaster").exists(), reason="lines of the system run here")
+def test_the_health_check_succeeds_while_a_line_runs(seen: Seen, tmp_path: Path) -> None:
+    assert seen.health == 0
+    assert health_check({**ENVIRONMENT, "XDG_RUNTIME_DIR": str(tmp_path)}) == 1
 
 
 def test_no_file_names_a_registry() -> None:
