@@ -64,8 +64,8 @@ def test_a_plan_of_what_might_be_added() -> None:
 def test_r9_the_worst_case_includes_the_time_for_which_a_port_holds_a_frame_back() -> None:
     def hold(rs485: Rs485 | None) -> float:
         bus = Bus(SerialPort("/dev/none", baudrate=57600, rs485=rs485))
-        Hcp2Controller(bus, 1)
-        return bus.worst_case_wait(Priority.URGENT)
+        group = PlannedGroup("g", 1.0, [(Node.of(Hcp2Controller(bus, 1)).planned(), hcp2.Read(1))])
+        return asyncio.run(bus.plan(group)).worst_waits[Priority.URGENT]
 
     assert hold(Rs485(delay_before=0.02)) >= hold(None) + 0.02
     assert hold(Rs485(delay_after=0.02)) == hold(None), "it ends before the reply begins"
