@@ -157,3 +157,70 @@ def test_a_set_is_saved_compared_loaded_and_undone_with_lost_replies(
 def in_order(case: Case, entries: Mapping[str, Any]) -> list[str]:
     """The changed items in the order of the document."""
     return [item for item in entries if item in case.changed]
+
+
+# all menus of a Mentor II
+
+MENUS, NUMBERS = range(17), range(100)
+GAPS = {f"{menu}.{99 - menu:02d}" for menu in MENUS}
+"""Each costs some 0.4 s, the maximum reply delay: one in each menu."""
+STILL = {"1.17", "3.02", "11.11"}
+"""The speed reference, the speed that follows it, and the address: they are left as they are."""
+
+
+class FullMentor(EmulatedMentor):
+    """A Mentor II that has a parameter at every number but those in GAPS."""
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.hold(0)
+
+    def hold(self, start: int) -> None:
+        for number, item in enumerate(every_number()):
+            if item not in STILL:
+                self.preset(item, (number + start) % 2 if item == "4.26" else (number + start) % 1000)
+
+    @property
+    def values(self) -> dict[str, int]:
+        return {item: self.value(int(item.replace(".", "")), 0.0) for item in every_number()}
+
+
+def every_number() -> list[str]:
+    found = (f"{menu}.{number:02d}" for menu in MENUS for number in NUMBERS)
+    return [item for item in found if item not in GAPS]
+
+
+@pytest.mark.slow
+def test_all_menus_of_a_mentor_are_saved_compared_loaded_and_undone(busmaster: Command, tmp_path: Path) -> None:
+    drive = FullMentor(12)
+    link, file, undo = tmp_path / "line", tmp_path / "one.toml", tmp_path / "undo.toml"
+    node, options = f"12@{link}", ("--protocol", "mentor", *WINDOW)
+    menu_0 = [item for item in every_number() if item.endswith(".00")]
+    with serve_pty(Line(find("mentor").profile.line, [drive], chance=random.Random(1), paced=False), link) as server:
+        one = server.call(lambda line, now: drive.values)
+        saved = busmaster("params", "save", str(link), "12", "-o", str(file), *options)
+        assert saved.status == 0, saved.err
+        assert f"{len(one)} parameters of node 12; without {len(GAPS)} that the node does not have" in saved.err
+        assert {item: entry.value for item, entry in read_set(str(file)).set.entries.items()} == one
+        assert list(read_set(str(file)).set.entries) == every_number()
+
+        server.call(lambda line, now: drive.hold(1))
+        other = server.call(lambda line, now: drive.values)
+        changed = [item for item in every_number() if one[item] != other[item]]
+        compared = busmaster("params", "diff", str(file), node, *options, "--json")
+        assert compared.status == 1, compared.err
+        assert [json.loads(line)["item"] for line in compared.lines] == changed
+
+        loaded = busmaster("params", "load", str(file), node, "--yes", "--undo", str(undo), *options)
+        assert loaded.status == 0, loaded.err
+        held = server.call(lambda line, now: drive.values)
+        written = [line.removesuffix(" ok") for line in loaded.lines if line.endswith(" ok")]
+        assert held == one | {item: other[item] for item in changed if item not in written}
+        assert written[-len(menu_0) :] == menu_0  # the commands that store
+        assert written[: -len(menu_0)] == [item for item in changed if item in written and item not in menu_0]
+        assert set(changed) - set(written) == {"11.13"}  # a setting of the port
+        assert "11.13 (" in loaded.err
+
+        undone = busmaster("params", "load", str(undo), node, "--yes", *options)
+        assert undone.status == 0, undone.err
+        assert server.call(lambda line, now: drive.values) == other
