@@ -173,4 +173,4 @@ def test_a_capture_whose_process_was_killed_replays_up_to_there(
         said = capsys.readouterr()
         assert "0 changed" in said.out
         assert not said.out.startswith("0 exchanges")
-        assert "cut in mid-block, behind packet" in said.err
+        assert "cut in mid-block, after packet" in said.err

@@ -169,7 +169,7 @@ async def test_doctor_tries_other_rates_at_the_server(tmp_path: Path) -> None:
             while not any(finding.topic == "open" for finding in told):  # until the server listens
                 told.clear()
                 await examine(patient, told.append)
-    assert told[-1].what == "node 1: node 1 answers at 57600 8N1"
+    assert told[-1].what == "node 1: node 1 replies at 57600 8N1"
 
 
 @pytest.mark.asyncio

@@ -177,7 +177,7 @@ def test_what_modbus_tcp_refuses_is_counted_and_reported_by_the_owner(
         ExitStack() as stack,
     ):
         try:
-            port = int(told(interface, "clients find it at").rpartition(":")[2])
+            port = int(told(interface, "serving Modbus TCP at").rpartition(":")[2])
             counts = 'interface_refused_total{interface="modbus-tcp",kind='
             while len(zeros := counts_of(metrics, counts)) < 2:
                 pass  # until it has named itself to the owner

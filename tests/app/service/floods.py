@@ -394,7 +394,7 @@ async def modbus_tcp(
     assert started.stderr is not None
     url = ""
     while not url and (line := (await started.stderr.readline()).decode()):
-        place = line.partition("clients find it at ")[2].strip()
+        place = line.partition("serving Modbus TCP at ")[2].strip()
         url = f"modbus://{place}" if place else ""
     while not await modbus_answers(url):  # noqa: ASYNC110  nothing reports that it knows the nodes of the line
         await asyncio.sleep(0.1)

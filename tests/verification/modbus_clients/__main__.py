@@ -285,7 +285,7 @@ async def story(options: argparse.Namespace) -> tuple[list[Judged], Cycles, floa
                 "modbus-tcp", file, "--bind", "127.0.0.1:0", "--pass-through", *allowed, folder=folder
             ) as interface,
         ):
-            port = int((await await_text(interface, r"find it at 127\.0\.0\.1:(\d+)"))[1])
+            port = int((await await_text(interface, r"serving Modbus TCP at 127\.0\.0\.1:(\d+)"))[1])
             await ready(folder)
             quiet = [asyncio.ensure_future(_swallow(process)) for process in (owner, interface)]
             counting = asyncio.ensure_future(count_cycles(folder, cycles))
