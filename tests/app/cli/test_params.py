@@ -190,11 +190,16 @@ def every_number() -> list[str]:
     return [item for item in found if item not in GAPS]
 
 
-@pytest.mark.slow
-def test_all_menus_of_a_mentor_are_saved_compared_loaded_and_undone(busmaster: Command, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "lost", [pytest.param(0.0, marks=pytest.mark.slow), pytest.param(0.02, marks=pytest.mark.exhaustive)]
+)
+def test_all_menus_of_a_mentor_are_saved_compared_loaded_and_undone(
+    busmaster: Command, tmp_path: Path, lost: float
+) -> None:
     drive = FullMentor(12)
     link, file, undo = tmp_path / "line", tmp_path / "one.toml", tmp_path / "undo.toml"
     node, options = f"12@{link}", ("--protocol", "mentor", *WINDOW)
+    drive.faults = Faults(lost=lost)
     menu_0 = [item for item in every_number() if item.endswith(".00")]
     with serve_pty(Line(find("mentor").profile.line, [drive], chance=random.Random(1), paced=False), link) as server:
         one = server.call(lambda line, now: drive.values)

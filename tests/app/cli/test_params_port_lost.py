@@ -12,11 +12,13 @@ from pathlib import Path
 import pytest
 
 from busmaster.app.line.parameter_sets import read_set
+from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.protocols.dc104.device import READ, WRITE, EmulatedDc104
-from busmaster.registry import find
+from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Outcome, started
+from tests.app.cli.test_params import CASES, Case, preset
 from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
@@ -197,3 +199,78 @@ def test_a_load_that_loses_its_port_while_it_compares_has_written_nothing(bench:
     assert re.search(LOST, ran.err)
     assert bench.drive.values == before
     assert not Path(bench.path("undo")).exists()
+
+
+class CutLine(Line):
+    """A line whose port is lost with one of the host's frames: neither it nor a later one arrives."""
+
+    sent = 0
+    cut_at = 0
+
+    def __init__(self, case: Case, device: Device) -> None:
+        super().__init__(find(case.protocol).profile.line, [device], chance=random.Random(1), paced=False)
+        self.port_lost = threading.Event()
+
+    def send(self, data: bytes, now: float) -> None:
+        self.sent += 1
+        if self.sent == self.cut_at:
+            self.port_lost.set()
+        if not self.port_lost.is_set():
+            super().send(data, now)
+
+
+@pytest.mark.parametrize("protocol", ["mentor", "microflex", "msc"])
+def test_a_save_and_a_load_of_other_drives_go_on_after_the_port_was_lost(protocol: str, tmp_path: Path) -> None:
+    case, link = CASES[protocol], tmp_path / "line"
+    device = make_device(protocol, case.address)
+    preset(device, case.one)
+    if protocol == "msc":
+        device.preset("status", 0)  # a load is refused while the program runs
+    options = ("--protocol", protocol, "--timeout", "300", *case.options)
+    items = ("--items", ",".join(case.items)) if case.items else ()
+
+    def run(*arguments: str, cut_at: int = 0) -> tuple[Outcome, int]:
+        line = CutLine(case, device)
+        line.cut_at = cut_at
+        with serve_pty(line, link) as server, started(*arguments, *options) as process:
+            if cut_at:
+                assert line.port_lost.wait(PATIENCE)
+                server.close()
+            out, err = process.communicate(timeout=PATIENCE)
+        return Outcome(process.returncode, out, err), line.sent
+
+    def save(name: str, cut_at: int = 0) -> tuple[Outcome, int]:
+        where = (str(link), case.node, "-o", str(tmp_path / f"{name}.toml"))
+        return run("params", "save", *where, *items, cut_at=cut_at)
+
+    def load(undo: str, cut_at: int = 0) -> tuple[Outcome, int]:
+        files = (str(tmp_path / "whole.toml"), f"{case.node}@{link}", "--yes", "--undo", str(tmp_path / undo))
+        return run("params", "load", *files, cut_at=cut_at)
+
+    def values(name: str) -> dict[str, float]:
+        return {item: entry.value for item, entry in read_set(str(tmp_path / f"{name}.toml")).set.entries.items()}
+
+    whole, frames = save("whole")
+    assert whole.status == 0, whole.err
+    lost, _ = save("two", cut_at=frames // 2)
+    assert lost.status == 1
+    assert "two.toml.part; the same command continues there" in lost.err
+    again, rest = save("two")
+    assert again.status == 0, again.err
+    assert "were read before; continuing" in again.err
+    assert rest < frames
+    assert values("two") == values("whole")
+
+    preset(device, case.other)
+    loaded, frames = load("first undo")
+    assert loaded.status == 0, loaded.err
+    preset(device, case.other)
+    broken, _ = load("undo", cut_at=frames - len(case.changed))
+    assert broken.status == 1
+    done = {line.removesuffix(" ok") for line in broken.lines if line.endswith(" ok")}
+    for item in case.changed:
+        assert (item in done) != (f"busmaster: {item}: " in broken.err), item
+        assert item not in done or case.held(device, item) == case.one[item]
+    completed, _ = load("undo of the rest")
+    assert completed.status == 0, completed.err
+    assert {item: case.held(device, item) for item in case.one} == case.one
