@@ -17,7 +17,6 @@ from busmaster.arbiter.events import (
 )
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.bus.alarms import AlarmChanged, BusEvent
-from busmaster.contract.places import Rounding
 
 logger = logging.getLogger("busmaster")
 
@@ -78,10 +77,10 @@ class Logbook:
         """Log that a merge, or the line time of a protocol's exchange, raised an exception."""
         logger.error("%s: the exchanges of poll group %r could not be chosen", self._name, group, exc_info=error)
 
-    def rounded(self, node: NodeRecord, write: Rounding, now: float) -> None:
-        """Log that a write has sent a rounded value."""
-        text = f"{node.label}: {write.rounded}; round it, or declare the decimals of the parameter"
-        self._write((node, write.rounded.partition(" = ")[0]), logging.WARNING, text, now)
+    def rounded(self, node: NodeRecord, what: str, now: float) -> None:
+        """Log that a write has sent a rounded value: `what` is the text of its `Rounding`."""
+        text = f"{node.label}: {what}; round it, or declare the decimals of the parameter"
+        self._write((node, what.partition(" = ")[0]), logging.WARNING, text, now)
 
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:
         # R14: by node and state, so that a flapping node does not hide the messages of another one.

@@ -24,7 +24,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Quality, Sample
 from busmaster.bus.snapshots import Snapshot
-from busmaster.contract.places import Changing, Placed, Rounding
+from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from busmaster.planning import Sharing
 from busmaster.transport.pump import Pump
@@ -248,8 +248,9 @@ class SharedLine:
             # the same place can have another name, or be read in another run
             for place in write.command.changes(write.node.profile):
                 self._touched[write.touches[0], place] = when
-        if isinstance(write.command, Rounding) and write.command.rounded:
-            self.logbook.rounded(write.node, write.command, self.now())
+        # Not isinstance: that would calculate the text of a `Rounding` twice, for every write.
+        if text := getattr(write.command, "rounded", ""):
+            self.logbook.rounded(write.node, text, self.now())
         for told in self.on_touched:
             told(write.node, when)
 

@@ -121,10 +121,10 @@ class SerialPort:
             raise InvalidCommand("a USB adapter needs a serial number, such as usb:A500ABC")
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
-        # An adapter would switch its transmitter with the same line that is to stop it.
         if not isinstance(self.rs485, bool):
             # pyserial's settings have no value of their own: two ports with the same ones would differ.
             object.__setattr__(self, "rs485", settings_of(self.rs485))
+        # An adapter would switch its transmitter with the same line that is to stop it.
         if self.rtscts and self.rs485:
             raise InvalidCommand("rtscts and rs485 exclude each other: both drive the RTS line")
         LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)

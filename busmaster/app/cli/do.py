@@ -100,7 +100,7 @@ def action_of(target: Target, name: str) -> Action:
         return known[name]
     kind = target.kind.name
     if not known:
-        raise click.UsageError(f"{target.label}: {kind} has no actions: write its values with busmaster write")
+        raise click.UsageError(f"{target.label}: {kind} has no actions; write its values with busmaster write")
     raise click.UsageError(f"{target.label}: no such action {name!r}; {kind} has {', '.join(known)}")
 
 
@@ -112,7 +112,7 @@ def options_of(
     fixed = len(action.numbers) - some
     if len(values) < fixed or (len(values) > fixed and not some):
         wanted = " ".join((name, *action.numbers))
-        raise click.UsageError(f"{name} is written {wanted}, not with {len(values)} numbers")
+        raise click.UsageError(f"{len(values)} numbers do not fit; write: {wanted}")
     if action.needs_time and within is None:
         raise click.UsageError(f"{name} needs --within S: the longest time that it may take")
     given = {action.time: within, action.least: at_least}

@@ -23,6 +23,7 @@ from busmaster.ext import is_served, resolve
 TOKEN = "BUSMASTER_TOKEN"
 """Names the environment variable with the token for tcp://HOST:PORT: on the command line every user would see it."""
 FRAMING = ("bytesize", "parity", "stopbits")
+RECORD_THERE = "is the line of another program; leave out --capture, and record it there"
 
 
 class ReachedLine(RemoteBus):
@@ -52,15 +53,25 @@ def reach(connection: Connection) -> Bus | RemoteBus:
     line.
     """
     address = connection.port
-    if not is_served(address):
-        owner = owner_of(connection.endpoint())
-        if owner is None:
-            return connection.open_bus()
-        address = owner.address
+    if is_served(address):
+        if connection.capture is not None:
+            raise click.UsageError(f"{address} {RECORD_THERE}")
+        return ReachedLine(address, connection)
+    owner = owner_to_use(connection.endpoint(), connection.capture)
+    return connection.open_bus() if owner is None else ReachedLine(owner.address, connection)
+
+
+def owner_to_use(endpoint: Endpoint, capture: str | None) -> Owner | None:
+    """Return the program that owns a port, reported on standard error; None if none does.
+
+    Raises UsageError for a capture of the line of another program.
+    """
+    owner = owner_of(endpoint)
+    if owner is not None:
+        if capture is not None:
+            raise click.UsageError(f"{owner.port} {RECORD_THERE}")
         tell_owner(owner)
-    if connection.capture is not None:
-        raise click.UsageError(f"{address} is the line of another program; leave out --capture, and record it there")
-    return ReachedLine(address, connection)
+    return owner
 
 
 def tell_owner(owner: Owner) -> None:

@@ -17,7 +17,7 @@ from busmaster.app.cli.late import late_nodes
 from busmaster.app.cli.lines import is_line_file, load
 from busmaster.app.cli.output import emit, emit_all, json_line, json_value, name_fields, value_text
 from busmaster.app.cli.protocols import ItemCommand, Offer, read_options, take_options
-from busmaster.app.cli.reaching import owner_of, reach, tell_owner
+from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import utc
@@ -74,13 +74,7 @@ async def read(
 def read_of_file(connection: Connection, names: tuple[str, ...], as_json: bool) -> None:
     """Read points of a LINE.toml, through the program that owns its line if there is one."""
     file = load(connection.port)
-    owner = owner_of(file.port)
-    if owner is not None:
-        if connection.capture is not None:
-            raise click.UsageError(
-                f"{owner.port} is the line of another program; leave out --capture, and record it there"
-            )
-        tell_owner(owner)
+    if (owner := owner_to_use(file.port, connection.capture)) is not None:
         until_ended(read_points, ConfiguredLine(file, outputs=False), connect(owner.address), names, as_json)
         return
     with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:

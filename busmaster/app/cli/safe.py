@@ -14,7 +14,7 @@ from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.lines import file_argument, keep, load, other_port, port_option
 from busmaster.app.cli.output import Level, emit, note
-from busmaster.app.cli.reaching import owner_of, tell_owner
+from busmaster.app.cli.reaching import RECORD_THERE, owner_of, tell_owner
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.remote import RemoteBus, connect
@@ -48,9 +48,7 @@ def command(path: str, port: str | None, capture: str | None) -> int:
         if owner is None:
             return until_ended(leave, line)
         if capture is not None:
-            note(
-                f"{owner.port} is the line of another program; leave out --capture, and record it there", Level.WARNING
-            )
+            note(f"{owner.port} {RECORD_THERE}", Level.WARNING)
         tell_owner(owner)
         return until_ended(leave_through, connect(owner.address, safe_only=True), line.safe_state.values)
 

@@ -10,7 +10,7 @@ from busmaster import Bus, ext
 from busmaster.app.cli.arguments import Connection
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.lines import is_line_file, load
-from busmaster.app.cli.reaching import owner_of, reach, tell_owner
+from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.ext import Handle, is_decimal, meant
@@ -53,7 +53,7 @@ class Lines:
         if is_line_file(port):
             return self._of_file(connection, node)
         if node and not is_decimal(node):
-            raise click.UsageError(f"a node of a port is named by its address, not {node!r}")
+            raise click.UsageError(f"{node!r} is not an address; on a PORT, name the node by its address")
         address = connection.one_address(int(node) if node else None)
         bus = self.buses.get(port) or self.buses.setdefault(port, reach(connection))
         return Target(find(connection.protocol), bus, ext.plain_handle(connection.open_handle(bus, address)))
@@ -62,15 +62,11 @@ class Lines:
         port = connection.port
         if port not in self.files:
             file = load(port)
-            owner = owner_of(file.port)
-            if owner is not None and connection.capture is not None:
-                raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+            owner = owner_to_use(file.port, connection.capture)
             recording = capturing(connection.capture, port=file.port.name, echo=file.port.echo)
             recorder = click.get_current_context().with_resource(recording)
             self.files[port] = ConfiguredLine(file, outputs=False, tap=recorder)
             self.buses[port] = self.files[port].bus if owner is None else connect(owner.address)
-            if owner is not None:
-                tell_owner(owner)
         line, bus = self.files[port], self.buses[port]
         if node not in line.nodes:
             raise click.UsageError(f"{port} has no node {node!r}; {meant(node, line.nodes)}")
@@ -83,5 +79,5 @@ def split(text: str) -> tuple[str, str]:
     """Return the node and the port or file of NODE@PORT. Raises UsageError."""
     node, at, where = text.partition(AT)
     if not at or not where:
-        raise click.UsageError(f"a node is written {NODE_AT}, like winder@line.toml, not {text!r}")
+        raise click.UsageError(f"{text!r} is not a node; write it as {NODE_AT}, like winder@line.toml")
     return node, where

@@ -30,7 +30,7 @@ from busmaster.app.cli.lines import is_line_file, load
 from busmaster.app.cli.output import Level, emit_all, json_line, json_value, name_fields, note, value_text
 from busmaster.app.cli.parsing import option_type, parse_seconds
 from busmaster.app.cli.protocols import ItemCommand
-from busmaster.app.cli.reaching import owner_of, reach, tell_owner
+from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.cli.terminal import printable
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.cells import csv_lines, no_formula
@@ -97,7 +97,7 @@ def command(
     columns time (UTC), seconds (since the start), point, value, unit and error.
     """
     if csv_path is not None and os.path.exists(csv_path):
-        raise click.UsageError(f"{csv_path} is there already, and not overwritten: choose another name")
+        raise click.UsageError(f"{csv_path} exists and is not overwritten; choose another name")
     how = How(as_json, plain, span or SPAN, csv_path)
     names = tuple(dict.fromkeys(names))
     if not is_line_file(connection.port):
@@ -105,10 +105,7 @@ def command(
         traces = [trace_on_port(connection, bus, name) for name in names]
         return until_ended(trend, bus, traces, period, seconds, how)
     file = load(connection.port)
-    if (owner := owner_of(file.port)) is not None:
-        if connection.capture is not None:
-            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
-        tell_owner(owner)
+    if (owner := owner_to_use(file.port, connection.capture)) is not None:
         remote = connect(owner.address)
         line = ConfiguredLine(file, outputs=False)
         return until_ended(trend, remote, [trace_of_file(line, name, remote) for name in names], period, seconds, how)
@@ -158,7 +155,7 @@ class Trace:
         """Return its value. Raises BusError, and InvalidCommand if it is not one number."""
         value = self.point.value_of(await self.node.request(self.point.command, priority=Priority.BACKGROUND))
         if not isinstance(value, int | float):
-            raise InvalidCommand(f"{self.name} is not one number but {value!r}: name one of its items")
+            raise InvalidCommand(f"{self.name} is not one number but {value!r}; use an item with one value")
         return value
 
     def take(self, since: float, value: float) -> None:
@@ -187,7 +184,7 @@ def trace_on_port(connection: Connection, bus: Bus | RemoteBus, name: str) -> Tr
     node, slash, item = name.partition("/")
     if connection.profile.addressed:
         if not slash or not item or not is_decimal(node):
-            raise click.UsageError(f"a point of a port is written NODE/ITEM, like 5/1, not {name!r}")
+            raise click.UsageError(f"{name!r} is not a point; on a PORT, write NODE/ITEM, like 5/1")
         address = connection.one_address(int(node))
     else:
         item = name
@@ -413,7 +410,7 @@ async def trend(
                     note(trace.summary(elapsed))
     if any(trace.samples for trace in traces):
         return OK
-    note("no value came", Level.ERROR)
+    note("no value was received; see the errors above", Level.ERROR)
     return FAILED
 
 

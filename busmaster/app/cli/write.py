@@ -19,7 +19,7 @@ from busmaster.app.cli.lines import is_line_file, keep, load
 from busmaster.app.cli.output import emit, json_line, note
 from busmaster.app.cli.parsing import Assignment, Whole, parse_assignment, parsed
 from busmaster.app.cli.protocols import ItemCommand
-from busmaster.app.cli.reaching import owner_of, reach, tell_owner
+from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.authorisation import Wish
 from busmaster.app.service.record import WriteRecord
@@ -70,12 +70,7 @@ def command(
         until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
         return
     file = load(connection.port)
-    if (owner := owner_of(file.port)) is not None:
-        if connection.capture is not None:
-            raise click.UsageError(
-                f"{owner.port} is the line of another program; leave out --capture, and record it there"
-            )
-        tell_owner(owner)
+    if (owner := owner_to_use(file.port, connection.capture)) is not None:
         until_ended(write_points_through, ConfiguredLine(file, outputs=False), owner.address, pairs, verify, as_json)
         return
     with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:

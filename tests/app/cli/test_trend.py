@@ -198,7 +198,7 @@ def test_a_node_that_does_not_answer_is_no_value_and_status_1(busmaster: Command
     assert ran.status == 1
     assert all(" 99/1 - " in line for line in ran.lines)
     assert re.search(r"99/1: 0 samples, \d+ lost", ran.err)
-    assert "no value came" in ran.err
+    assert "no value was received" in ran.err
 
 
 def test_an_item_that_the_node_does_not_have_ends_it(busmaster: Command) -> None:
@@ -211,13 +211,13 @@ def test_an_item_that_the_node_does_not_have_ends_it(busmaster: Command) -> None
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("10",), "written NODE/ITEM, like 5/1, not '10'"),
-        (("1/",), "written NODE/ITEM"),
-        (("one/10",), "written NODE/ITEM"),
+        (("10",), "'10' is not a point; on a PORT, write NODE/ITEM"),
+        (("1/",), "on a PORT, write NODE/ITEM"),
+        (("one/10",), "on a PORT, write NODE/ITEM"),
         (("1/axis0.positoin",), "did you mean 'axis0.position'?"),
         (("256/1",), "256"),
         (("1/1", "--period", "0"), "a time must be above 0"),
-        (("1/1", "--csv", "HERE"), "is there already, and not overwritten"),
+        (("1/1", "--csv", "HERE"), "exists and is not overwritten"),
         ((), "missing argument"),
     ],
 )
