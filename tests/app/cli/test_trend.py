@@ -122,6 +122,19 @@ async def test_samples_that_the_line_is_too_slow_for_are_missed() -> None:
 
 
 @in_virtual_time
+async def test_nothing_is_read_while_the_samples_before_are_not_written() -> None:
+    async with memory_bus() as bus:
+        sampler = await sampler_of(bus, "1/10")
+        [trace] = sampler.traces
+        sampler.rows.extend([trend.Row(0.0, 0.0, trace)] * trend.MOST_WAITING)
+        await sampled(sampler, 1)
+        assert trace.samples == 0
+        assert len(sampler.take_rows()) == trend.MOST_WAITING
+        await sampled(sampler, 1)
+        assert trace.samples > 0
+
+
+@in_virtual_time
 async def test_a_node_that_is_gone_costs_samples_and_one_that_returns_is_sampled_again() -> None:
     mint = EmulatedMint(1)
     async with memory_bus(mint) as bus:

@@ -48,6 +48,10 @@ class Broker:
             self._process.wait(PATIENCE)
             self._process = None
 
+    def forget(self) -> None:
+        """Lose all messages, while it is stopped."""
+        (self._config.parent / "mosquitto.db").unlink(missing_ok=True)
+
     def _answers(self) -> bool:
         try:
             socket.create_connection(("127.0.0.1", self.port), PATIENCE).close()

@@ -149,6 +149,23 @@ async def test_entities_appear_before_their_values_and_are_retained(broker: Brok
     assert found == ["binary_sensor", "sensor", "sensor"]  # the line's state, and the two points
 
 
+@needs_mosquitto
+@pytest.mark.asyncio
+async def test_a_broker_that_has_lost_its_messages_gets_the_entities_again(broker: Broker) -> None:
+    async with emulated(Hcp2Controller, 5) as bus:
+        async with publishing(broker, bus, home_assistant="homeassistant") as output:
+            output.offer(cycle(1, 12.5, 2.0))
+            await settled(output)
+            broker.stop()
+            broker.forget()
+            broker.start()
+            output.offer(cycle(2, 13.5, 3.0))
+            await settled(output)
+        async with listening(broker, "homeassistant/sensor/#") as client:
+            kept = await heard(client, 2)
+    assert sorted(topic.rpartition("-2f-")[2] for topic, _, _ in kept) == ["1/config", "2/config"]
+
+
 async def heard_to_the_end(client: Any) -> list[tuple[str, Any, bool]]:
     """All messages up to the one by which the output takes its leave."""
     found: list[tuple[str, Any, bool]] = []
