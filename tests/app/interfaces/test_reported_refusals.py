@@ -22,6 +22,7 @@ class Owner:
         self.reported: list[tuple[str, str, dict[str, int]]] = []
         self.changed: Callable[[], None] = lambda: None
         self.remote = self
+        self.got = asyncio.Event()
 
     def on_state(self, changed: Callable[[], None]) -> None:
         self.changed = changed
@@ -30,6 +31,7 @@ class Owner:
         if not self.is_connected:
             raise LineDown("away")
         self.reported.append((interface, kind, dict(peers)))
+        self.got.set()
 
 
 @pytest.mark.asyncio
@@ -45,7 +47,7 @@ async def test_each_refusal_is_reported_once_and_kept_while_the_owner_is_away(mo
     owner.changed()
     assert owner.reported == [("modbus-tcp", "connections", {}), ("modbus-tcp", "requests", {"10.0.0.1": 2})]
     owner.reported.clear()
+    owner.got.clear()
     refusals.note("connections", "10.0.0.2")
-    while not owner.reported:
-        await asyncio.sleep(0.001)
+    await owner.got.wait()
     assert owner.reported == [("modbus-tcp", "connections", {"10.0.0.2": 1})]
