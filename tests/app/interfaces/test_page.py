@@ -261,7 +261,7 @@ async def test_when_the_owner_goes_it_says_so_and_when_it_is_back_all_is_well(br
                 await asyncio.to_thread(browser.until, READY)
                 assert await asyncio.to_thread(browser.run, "return document.getElementById('trouble').hidden")
             await asyncio.to_thread(browser.until, "document.documentElement.dataset.state === 'owner away'")
-            assert "what is shown is old" in await asyncio.to_thread(browser.text, "#trouble")
+            assert "the values are old" in await asyncio.to_thread(browser.text, "#trouble")
 
 
 @pytest.mark.parametrize(

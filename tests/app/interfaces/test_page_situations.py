@@ -75,5 +75,5 @@ async def test_a_person_reads_of_a_dead_drive_a_lost_line_and_an_owner_that_is_a
                 assert NONE_DOWN not in text
                 monkeypatch.setattr(MemoryPort, "open", opens)
                 await reads(browser, UP, NONE_DOWN, without=OFFLINE)
-        await reads(browser, "what is shown is old", "2 nodes offline", "owner away", OFFLINE, without=UP)
+        await reads(browser, "the values are old", "2 nodes offline", "owner away", OFFLINE, without=UP)
         assert browser.complaints() == []

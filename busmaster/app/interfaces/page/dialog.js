@@ -1,4 +1,4 @@
-// One point: what there is to know of it, and writing it, which is asked twice.
+// One point: its details, and the form that writes it after a confirmation.
 
 import { element } from "./element.js";
 import { shown } from "./line.js";
@@ -79,7 +79,7 @@ export class PointDialog {
     this.plot.colours = this.colours();
     this.plot.update(row, line);
     const facts = [["group", row.group], ["protocol", `${row.kind}, address ${row.address}`]];
-    if (this.details) facts.push(["asked as", this.details.command]);
+    if (this.details) facts.push(["command", this.details.command]);
     if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", alarms_text(this.details, row)]);
     if (row.error) facts.push(["last cycle", row.error + (this.details?.hint ? `; ${this.details.hint}` : "")]);
     const text = JSON.stringify(facts);
@@ -105,7 +105,7 @@ export class PointDialog {
   async submit() {
     if (!this.row || this.busy || by("go").hidden) return;
     const value = typed(field.value);
-    if (value === null) return this.outcome("Say which value is to be written.", "bad");
+    if (value === null) return this.outcome("Enter a value.", "bad");
     if (this.asked === null) {
       const wrong = beyond(value, this.details);
       if (wrong) return this.outcome(wrong, "bad");
@@ -124,7 +124,7 @@ export class PointDialog {
       const said = await answer.json();
       this.outcome(answer.ok ? `${value} ${row.unit} was written.` : said.what, answer.ok ? "good" : "bad");
     } catch {
-      this.outcome("The page's program did not answer: the write may have been sent. Read the value before you write again.", "bad");
+      this.outcome("The program of this page did not reply: the write may have been sent. Read the value before you write again.", "bad");
     } finally {
       this.busy = by("go").disabled = false;
       if (this.row) this.ask(null);
@@ -174,7 +174,7 @@ function limits_text(details, unit) {
 // The line refuses it all the same; here it is said before anything is sent.
 function beyond(value, details) {
   for (const limit of details?.limits ?? []) {
-    if (!limit.writable) return "The line's file says that this is not to be written.";
+    if (!limit.writable) return "The line's file does not permit writes to this point.";
     if (typeof value !== "number") continue;
     if (limit.minimum !== null && value < limit.minimum) return `${value} is below the limit of ${limit.minimum}.`;
     if (limit.maximum !== null && value > limit.maximum) return `${value} is above the limit of ${limit.maximum}.`;

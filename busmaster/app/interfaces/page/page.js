@@ -61,7 +61,7 @@ async function ask_what_may_be() {
     may = await (await fetch("/api/line")).json();
     asked_what_may_be = true;
     stale = true;
-  } catch { /* the door has gone: asked again when it is back */ }
+  } catch { /* the interface has gone: requested again when it is back */ }
 }
 
 function allowed() {
@@ -85,8 +85,8 @@ function may_show() {
 }
 
 function trouble() {
-  if (!connected) return "This page's program does not answer: what is shown is old. It is tried again.";
-  if (!line.state.connected) return `The line's program is away: what is shown is old. ${line.state.why}`;
+  if (!connected) return "The program of this page does not reply: the values are old. Reconnecting.";
+  if (!line.state.connected) return `The line's program is away: the values are old. ${line.state.why}`;
   if (line.frame?.state === "offline") return `The line is lost: nothing is read or written until its port is back. ${line.frame.why ?? ""}`;
   return "";
 }
@@ -117,7 +117,7 @@ function is_lost() {
   return !connected || !line.state.connected || line.frame?.state === "offline";
 }
 
-const HEALTH = { offline: "✕ offline", up: "✓ up", suspect: "? suspect", down: "✕ down", suspended: "‖ suspended", unknown: "… not asked yet" };
+const HEALTH = { offline: "✕ offline", up: "✓ up", suspect: "? suspect", down: "✕ down", suspended: "‖ suspended", unknown: "… no request yet" };
 
 function draw_nodes() {
   // a card is drawn again when its node changes, so the loss of line or owner is a change of the node
@@ -127,7 +127,7 @@ function draw_nodes() {
     item.className = health;
     const late = node.late ? `, ${node.late} late` : "";
     item.replaceChildren(element("b", `${node.label}: ${HEALTH[health] ?? health}`),
-      element("small", `${node.requests} asked, ${node.failed} failed${late}, p50 ${milliseconds(node.p50)}`));
+      element("small", `${node.requests} requests, ${node.failed} failed${late}, p50 ${milliseconds(node.p50)}`));
   }, "li");
 }
 

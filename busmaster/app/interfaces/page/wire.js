@@ -231,9 +231,9 @@ function kind_of(one) {
 
 function told(one, nodes) {
   const said = one.said.map(([when, who, hex]) => `${who === "master" ? "→" : "←"} +${milliseconds(when - one.begun)}  ${spelled(hex)}`);
-  if (!one.verdict) return [`unexpected: ${one.bytes} bytes that no request asked for`, ...said].join("\n");
+  if (!one.verdict) return [`unexpected: ${one.bytes} bytes without a request`, ...said].join("\n");
   const answer = one.verdict === "ok" ? one.result || "done" : `${one.verdict}: ${one.result}`;
-  const why = one.purpose ? `for ${one.purpose}` : "asked by a program";
+  const why = one.purpose ? `for ${one.purpose}` : "requested by a program";
   const first = one.said.find(([, who]) => who === "node");
   return [
     `${label_of(one, nodes)}: ${one.command} = ${answer}`,
