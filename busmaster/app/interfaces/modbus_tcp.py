@@ -47,7 +47,7 @@ EXAMPLE = "Example: busmaster modbus-tcp --allow 'drive*/speed_reference'"
 OWN_UNITS = (0, 255)
 """Unit ids of the server itself, by the Modbus TCP guide: with --pass-through only these have the points."""
 MOST_CONNECTIONS = 128
-"""One more closes the connection that has been without a request for the longest time."""
+"""One more closes another one, or is refused: see `ModbusTcpServer._make_room`."""
 MOST_PER_PEER = 32
 """Connections of one address: one more is refused."""
 IDLE = 120.0
@@ -805,21 +805,22 @@ class ModbusTcpServer:
         """The connections and their peers; the one without a request for the longest time first."""
         self._busy: set[asyncio.StreamWriter] = set()
         """Those whose request has no reply yet."""
+        self._replaced: dict[asyncio.StreamWriter, str] = {}
+        """Closed connections whose request has no reply yet, and their peers."""
         self._closed = LimitedReport(tell, self._closed_text)
 
     async def accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
         host = str((writer.get_extra_info("peername") or ("unknown",))[0])
         peer = peer_of(host)
-        if sum(other == peer for other in self._open.values()) >= MOST_PER_PEER:
+        # A replaced connection still counts: its request is still on the line.
+        if sum(other == peer for other in (*self._open.values(), *self._replaced.values())) >= MOST_PER_PEER:
             self._refuse(writer, peer, f"beyond {MOST_PER_PEER} of one address")
             return
+        if len(self._open) >= MOST_CONNECTIONS and not self._make_room(peer):
+            self._refuse(writer, peer, f"beyond {MOST_CONNECTIONS}: all have a request on the line")
+            return
         self._open[writer] = peer
-        if len(self._open) > MOST_CONNECTIONS:
-            # One whose request is on its way stays: closing it would not take the request from the line.
-            oldest = next(one for one in self._open if one not in self._busy)
-            why = f"beyond {MOST_CONNECTIONS}: the one idle for the longest time"
-            self._refuse(oldest, self._open.pop(oldest), why)
         writer.transport.set_write_buffer_limits(high=UNREAD)
         try:
             await self._serve(reader, writer, host)
@@ -831,7 +832,27 @@ class ModbusTcpServer:
             pass  # the client has left
         finally:
             self._open.pop(writer, None)
+            self._replaced.pop(writer, None)
             writer.transport.abort()
+
+    def _make_room(self, peer: str) -> bool:
+        """Close a connection for one more of this peer. Returns False if none may be closed.
+
+        First choice is the one without a request for the longest time. If all have a request on the line, the address
+        with the most connections gives one up, so that a few addresses cannot keep out all others.
+        """
+        idle = next((one for one in self._open if one not in self._busy), None)
+        if idle is not None:
+            self._refuse(idle, self._open.pop(idle), f"beyond {MOST_CONNECTIONS}: the one idle for the longest time")
+            return True
+        counts = Counter(self._open.values())
+        [(most, count)] = counts.most_common(1)
+        if count <= counts[peer] + 1:
+            return False
+        oldest = next(one for one, other in self._open.items() if other == most)
+        self._replaced[oldest] = self._open.pop(oldest)
+        self._refuse(oldest, most, f"beyond {MOST_CONNECTIONS}: one of the address with the most")
+        return True
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str) -> None:
         while True:

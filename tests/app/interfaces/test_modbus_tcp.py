@@ -295,7 +295,8 @@ class Echo:
         return pdu
 
 
-Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
+Connect = Callable[..., Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
+"""Takes the address from which it connects."""
 
 
 def with_server(
@@ -309,8 +310,8 @@ def with_server(
         note: Any = lambda *refusal: refused.append(refusal)  # noqa: E731
         served = ModbusTcpServer(replies, reports.append, note, **options)  # type: ignore[arg-type]
 
-        async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-            reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        async def connect(source: str = "127.0.0.1") -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+            reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname(), local_addr=(source, 0))
             opened.append(writer)
             return reader, writer
 
@@ -468,6 +469,72 @@ def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: p
             assert await reader.readexactly(len(frame(READ))) == frame(READ)
 
     with_server(story, Slow())
+
+
+def test_an_address_with_many_requests_on_the_line_makes_room_for_another_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 4)
+    monkeypatch.setattr(modbus_tcp, "MOST_PER_PEER", 4)
+    go_on = asyncio.Event()
+
+    class Slow(Echo):
+        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
+            reply = await super().reply(peer, unit, pdu)
+            await go_on.wait()
+            return reply
+
+    async def story(connect: Connect, echo: Echo, reports: list[str]) -> None:
+        async def requesting(source: str) -> asyncio.StreamReader:
+            reader, writer = await connect(source)
+            writer.write(frame(READ))
+            return reader
+
+        many = [await requesting("127.0.0.1") for _ in range(4)]
+        while echo.counts[1] < 4:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        few = [await requesting("127.0.0.2") for _ in range(2)]
+        assert [await is_closed(reader) for reader in many[:2]] == [True, True]
+        while echo.counts[1] < 6:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        for source in ("127.0.0.1", "127.0.0.2"):  # neither has two more than the other
+            assert await is_closed(await requesting(source))
+        go_on.set()
+        for reader in (*many[2:], *few):
+            assert await reader.readexactly(len(frame(READ))) == frame(READ)
+        assert "one of the address with the most" in reports[0]
+
+    with_server(story, Slow())
+
+
+def test_requests_of_replaced_connections_count_as_those_of_their_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(modbus_tcp, "MOST_PER_PEER", 2)
+    go_on = asyncio.Event()
+
+    class SlowUnit(Echo):
+        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
+            reply = await super().reply(peer, unit, pdu)
+            if unit == 1:
+                await go_on.wait()
+            return reply
+
+    async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
+        for source in ("127.0.0.1", "127.0.0.1", "127.0.0.2"):
+            (await connect(source))[1].write(frame(READ, unit=1))
+        while echo.counts[1] < 3:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        reader, writer = await connect("127.0.0.3")  # replaces one of 127.0.0.1
+        writer.write(frame(READ, unit=2))
+        await reader.readexactly(len(frame(READ)))
+        writer.close()
+        await writer.wait_closed()
+        beyond, writer = await connect("127.0.0.1")  # there is room, but two of its requests are on the line
+        writer.write(frame(READ, unit=2))
+        assert await is_closed(beyond)
+        go_on.set()
+
+    with_server(story, SlowUnit())
 
 
 # the command, beside an owner, by real clients
