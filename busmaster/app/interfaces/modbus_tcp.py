@@ -12,6 +12,7 @@ import io
 import ipaddress
 import math
 import struct
+import time
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -22,6 +23,7 @@ from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from math import inf
 from typing import Any, TypeAlias
+from weakref import WeakValueDictionary
 
 import click
 
@@ -58,6 +60,9 @@ UNREAD = 4096
 """Bytes of requests, and of replies, that are held for one connection: TCP makes the client wait for the rest."""
 FINISH_WITHIN = 3.0
 """Seconds in which a unit of the line must have replied. Many Modbus TCP clients wait no longer."""
+MOST_ON_LINE = 4
+"""Pass-through requests of one address on the line at once; the others wait. With 128 at once, a further client got no
+reply within FINISH_WITHIN. A line carries one at a time, so more would not make it faster."""
 OLD_AFTER, LEAST_AGE = 3, 1.0
 """Periods, and at least seconds, without a cycle after which a value is stale."""
 LOOK_EVERY = 0.25
@@ -649,6 +654,8 @@ class Answers:
         self._tell = tell
         self._refused = refused
         self._denied = LimitedReport(tell, _denied_text)
+        self._turns: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
+        """The pass-through requests of each address, while it has any."""
 
     async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
         """Return the reply to a request. Does not raise errors of the line, nor of the request."""
@@ -656,7 +663,7 @@ class Answers:
             request = request_of(pdu)
             to_unit = self._rules.pass_through and unit not in OWN_UNITS
             if isinstance(request, ReadRequest):
-                values = await self._read_unit(unit, request) if to_unit else self._read_points(request)
+                values = await self._read_unit(peer, unit, request) if to_unit else self._read_points(request)
                 return read_reply(pdu[0], values)
             await (self._write_unit(peer, unit, request) if to_unit else self._write_points(peer, request))
             return pdu[:5]
@@ -719,10 +726,10 @@ class Answers:
 
     # units of the line
 
-    async def _read_unit(self, unit: int, request: ReadRequest) -> list[int]:
+    async def _read_unit(self, peer: str, unit: int, request: ReadRequest) -> list[int]:
         kind = "read_bits" if request.table in BIT_TABLES else "read_registers"
         # Clients poll. As commands, reads of four clients took 28 % of the cycles from a group of the owner.
-        values = await self._run(unit, Priority.POLL, kind, request.first, request.count, request.table)
+        values = await self._run(peer, unit, Priority.POLL, kind, request.first, request.count, request.table)
         return [int(one) for one in values]
 
     async def _write_unit(self, peer: str, unit: int, request: WriteRequest) -> None:
@@ -734,24 +741,36 @@ class Answers:
         try:
             # Without the read that matches the write, all points of the unit would be stale until their next cycle.
             changed = _modbus_commands()[read](request.first, len(request.values), request.table)
-            await self._run(unit, Priority.COMMAND, write, request.first, request.values, touches=changed)
+            await self._run(peer, unit, Priority.COMMAND, write, request.first, request.values, touches=changed)
         except ExceptionReply as refused:
             self._tell(f"{what}: {cut(str(refused))}")
             raise
         self._tell(f"{what}: written")
 
-    async def _run(self, unit: int, priority: Priority, kind: str, *arguments: Any, touches: Any = None) -> Any:
+    async def _run(
+        self, peer: str, unit: int, priority: Priority, kind: str, *arguments: Any, touches: Any = None
+    ) -> Any:
         line = self._values.line
         if not line.is_connected:
             raise ExceptionReply(NO_REPLY, "the line's owner is away")
         if ("modbus", unit) not in line.picture.nodes:
             raise ExceptionReply(NO_PATH, f"the line has no Modbus RTU unit {unit}")
+        finish_by = time.monotonic() + FINISH_WITHIN
+        turns = self._turns.setdefault(peer_of(peer), asyncio.Semaphore(MOST_ON_LINE))
+        try:
+            async with asyncio.timeout(FINISH_WITHIN):
+                await turns.acquire()
+        except TimeoutError:
+            raise ExceptionReply(DEVICE_BUSY, "other requests of this address are on the line") from None
         try:
             command = _modbus_commands()[kind](*arguments)
             node = line.remote.find("modbus", unit)
-            return await node.request(command, touches=touches, priority=priority, finish_within=FINISH_WITHIN)
+            left = max(0.0, finish_by - time.monotonic())
+            return await node.request(command, touches=touches, priority=priority, finish_within=left)
         except (BusError, InvalidCommand) as error:
             raise ExceptionReply(code_of(error), str(error)) from None
+        finally:
+            turns.release()
 
     # refusals
 

@@ -809,6 +809,51 @@ def test_units_are_read_with_the_priority_of_polls_and_written_as_commands() -> 
     ]
 
 
+def test_an_address_has_few_requests_on_the_line_and_does_not_delay_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    on_line: list[int] = []
+    times: list[float] = []
+    most = 0
+
+    class Unit:
+        async def request(self, command: Any, *, finish_within: float, **_options: Any) -> Any:
+            nonlocal most
+            times.append(finish_within)
+            on_line.append(command.first)
+            most = max(most, len(on_line))
+            await go_on.wait()
+            on_line.remove(command.first)
+            return (command.first,)
+
+    line: Any = SimpleNamespace(
+        is_connected=True,
+        picture=SimpleNamespace(nodes={("modbus", 3): None}),
+        remote=SimpleNamespace(find=lambda _protocol, _unit: Unit()),
+    )
+
+    async def run() -> list[bytes]:
+        answers = Answers(Values(line), Rules(pass_through=True), lambda _: None)
+
+        def reading(peer: str, first: int) -> asyncio.Future[bytes]:
+            return asyncio.ensure_future(answers.reply(peer, 3, b"\x03" + struct.pack(">HH", first, 1)))
+
+        many = [reading("10.0.0.1", first) for first in range(10)]
+        await asyncio.sleep(0)
+        assert on_line == [0, 1, 2, 3]
+        another = reading("10.0.0.2", 99)
+        await asyncio.sleep(0)
+        assert on_line == [0, 1, 2, 3, 99]
+        monkeypatch.setattr(modbus_tcp, "FINISH_WITHIN", 0.0)
+        assert await reading("10.0.0.1", 50) == b"\x83\x06"  # its time is over before its turn
+        go_on.set()
+        return await asyncio.gather(*many, another)
+
+    go_on = asyncio.Event()
+    replies = asyncio.run(run())
+    assert [reply[-1] for reply in replies] == [*range(10), 99]
+    assert most == 5
+    assert all(0 < left < 3.0 for left in times), "the wait for the turn counts"
+
+
 def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_replies(file: Path) -> None:
     with (
         owner("serve", str(file)),
