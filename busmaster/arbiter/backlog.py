@@ -10,9 +10,11 @@ import heapq
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from itertools import count, islice
+from math import inf
 from typing import Protocol, TypeAlias
 
 from busmaster.arbiter.clients import Hold, LineClient, turn_of
+from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import BACKGROUND, PARKED, POLL, QUEUED, Phase, Priority, Transaction
 
@@ -312,6 +314,62 @@ def new_queues() -> Queues:
     return Fifo(), Fifo(), EarliestDeadlineFirst(), EarliestDeadlineFirst()
 
 
+class Delayed:
+    """The transactions of one line that may not be sent before a time of their own. Each has the phase PARKED.
+
+    A write also stays in its node's queue of writes, so that no later write overtakes it.
+    """
+
+    __slots__ = ("_deadlines", "_heap", "_order", "live")
+
+    def __init__(self, deadlines: Deadlines) -> None:
+        self._deadlines = deadlines
+        self._heap: list[tuple[float, int, Transaction]] = []
+        self._order = count()
+        self.live = 0
+        """Number of entries, including those that have ended in the meantime."""
+
+    def add(self, transaction: Transaction, until: float) -> None:
+        """Set a transaction aside until this time, in seconds."""
+        transaction.phase = PARKED
+        if self.live > SLACK:  # ended ones are removed in bulk
+            self._keep([entry for entry in self._heap if entry[2].phase is PARKED])
+        heapq.heappush(self._heap, (until, next(self._order), transaction))
+        self._changed()
+
+    def due(self, now: float) -> list[Transaction]:
+        """Remove and return the transactions that may be sent now, in order. Those that have ended are left out."""
+        due: list[Transaction] = []
+        while self._heap and self._heap[0][0] <= now:
+            due.append(heapq.heappop(self._heap)[2])
+        self._changed()
+        return [transaction for transaction in due if transaction.phase is PARKED]
+
+    def waiting_of(self, priority: Priority, client: LineClient | None) -> int:
+        """Return the number of delayed transactions of this class and client."""
+        who = turn_of(client)
+        return sum(t.priority is priority and turn_of(t.client) is who for _, _, t in self._heap if t.phase is PARKED)
+
+    def of(self, hold: Hold) -> list[Transaction]:
+        """Return the delayed transactions of a sequence."""
+        return [entry[2] for entry in self._heap if entry[2].client is hold and entry[2].phase is PARKED]
+
+    def drain(self) -> list[Transaction]:
+        """Remove and return all transactions, of which the writes are in a queue of writes too."""
+        left = [entry[2] for entry in self._heap if entry[2].phase is PARKED]
+        self._keep([])
+        return left
+
+    def _keep(self, entries: list[tuple[float, int, Transaction]]) -> None:
+        heapq.heapify(entries)
+        self._heap = entries
+        self._changed()
+
+    def _changed(self) -> None:
+        self.live = len(self._heap)
+        self._deadlines.delayed = self._heap[0][0] if self._heap else inf
+
+
 class Writes:
     """The writes of one line. `queues`: the unfinished writes of each node. Those behind the first of a client are
     parked.
@@ -354,8 +412,11 @@ class Writes:
         first = self.first_of(write.node, turn_of(write.client))
         assert first is not None
         # R7: they must keep their order, and the write of the higher class must not wait for a turn of the lower class.
-        if first.priority > write.priority and first.phase is QUEUED:
-            self.backlog.promote(first, write.priority)
+        if first.priority > write.priority:
+            if first.phase is QUEUED:
+                self.backlog.promote(first, write.priority)
+            elif first.phase is PARKED:  # it is delayed, and in no class queue
+                first.priority = write.priority
         if write.stop and first.phase is QUEUED:
             self.backlog.let_pass(first)
 

@@ -40,6 +40,8 @@ class Deadlines:
     """A dead node's next probe, or the end of a suspension."""
     hold = _Other()
     """A sequence has held the line for its maximum time."""
+    delayed = _Other()
+    """A transaction that had to wait may be sent."""
     sequence = _Other()
     """A sequence that had to wait for the owner's time may begin."""
 
@@ -49,7 +51,7 @@ class Deadlines:
         self.each: dict[str, float] = {}
         """All others, by name."""
         self.earliest_other = inf
-        self.schedule = self.expiry = self.failing = self.health = self.hold = self.sequence = inf
+        self.schedule = self.expiry = self.failing = self.health = self.hold = self.delayed = self.sequence = inf
 
 
 SLACK = 64

@@ -17,11 +17,11 @@ from itertools import count
 from math import inf
 from typing import Any
 
-from busmaster.arbiter.backlog import Backlog, Writes
+from busmaster.arbiter.backlog import Backlog, Delayed, Writes
 from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.counters import RESYNCHRONISING, LineCounters
 from busmaster.arbiter.deadlines import Deadlines, Expiries
-from busmaster.arbiter.eligibility import IF_PAID, OK, WAITS, Eligible, Rejected, eligibility, unpaid
+from busmaster.arbiter.eligibility import IF_PAID, OK, Eligibility, Rejected, Wait, eligibility, unpaid
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
 from busmaster.arbiter.health import DOWN, UP, NodeRecord
 from busmaster.arbiter.probes import NodeWatch, Probes
@@ -187,6 +187,7 @@ class Dispatcher:
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
         self.writes = Writes(self.backlog)
+        self.delayed = Delayed(deadlines)
         self.counters = counters
         self.fault: Callable[[], BusError] | None = None
         """Returns the error for all requests while the line is unusable; None while it is usable."""
@@ -222,7 +223,8 @@ class Dispatcher:
             self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
         # Parked writes are in no class queue, so the node's queue is counted as well.
         waiting = max(queue.live, len(self.writes.queues[node])) if changed else queue.live
-        if waiting >= self._capacity and (waiting := self.writes.waiting_of(transaction)) >= self._capacity:
+        waiting += self.delayed.live
+        if waiting >= self._capacity and (waiting := self._waiting_of(transaction)) >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return True
         if node.health is DOWN or now < node.suspended_until:
@@ -248,8 +250,7 @@ class Dispatcher:
         # A request on the wire runs until its reply or its deadline. Cancelling saves no line time (R6).
         transaction.wanted = False
         self.counters.cancelled += 1
-        if transaction.phase is QUEUED:
-            self.backlog.discard(transaction, PARKED)
+        self._unqueue(transaction)
         if transaction.phase is not ON_WIRE:
             self._release_stops(transaction)
             # It was paid when it was queued, and was not sent.
@@ -263,8 +264,8 @@ class Dispatcher:
             verdict = eligibility(transaction, now, self.writes, self.fault)
             if verdict is OK or (acted := self._act_on(verdict, transaction, now)) is OK:
                 return transaction
-            if acted is WAITS:
-                self.writes.park(transaction)
+            if isinstance(acted, Wait):
+                self._set_aside(transaction, acted)
             self.backlog.keep_turn(transaction)
         return None
 
@@ -272,7 +273,23 @@ class Dispatcher:
         """Return True if an URGENT request is queued."""
         return self.backlog.waiting(URGENT) > 0
 
-    def eligibility(self, transaction: Transaction, now: float) -> Eligible | Rejected:
+    def _set_aside(self, transaction: Transaction, verdict: Wait) -> None:
+        """Take a transaction that must wait out of its class queue."""
+        if verdict.until < inf:
+            self.delayed.add(transaction, verdict.until)
+        else:
+            self.writes.park(transaction)
+
+    def _unqueue(self, transaction: Transaction) -> None:
+        """Take a transaction that is queued out of its class. One that is set aside already is in no class."""
+        if transaction.phase is QUEUED:
+            self.backlog.discard(transaction, PARKED)
+
+    def _waiting_of(self, transaction: Transaction) -> int:
+        """Return how many requests count against the limit of a new one: those of its client in its class."""
+        return self.writes.waiting_of(transaction) + self.delayed.waiting_of(transaction.priority, transaction.client)
+
+    def eligibility(self, transaction: Transaction, now: float) -> Eligibility:
         """Return whether a transaction may be sent now. Changes nothing."""
         return eligibility(transaction, now, self.writes, self.fault)
 
@@ -280,12 +297,12 @@ class Dispatcher:
         """Return True if a queued read can replace a sync read: it may be sent, and its node is not DOWN."""
         return read.node.health is not DOWN and self.eligibility(read, now) is OK
 
-    def _admitted(self, transaction: Transaction, now: float) -> Eligible | None:
-        """Return OK or WAITS, or end the transaction and return None. A request to a dead node is charged to the probe
-        budget."""
+    def _admitted(self, transaction: Transaction, now: float) -> Eligibility | None:
+        """Return OK or when it may be sent, or end the transaction and return None. A request to a dead node is charged
+        to the probe budget."""
         return self._act_on(self.eligibility(transaction, now), transaction, now)
 
-    def _act_on(self, verdict: Eligible | Rejected, transaction: Transaction, now: float) -> Eligible | None:
+    def _act_on(self, verdict: Eligibility, transaction: Transaction, now: float) -> Eligibility | None:
         if verdict is IF_PAID:
             cost = transaction.node.max_reply_delay
             if self.probes.spare(cost, now):
@@ -340,8 +357,7 @@ class Dispatcher:
                 continue
             if write.priority is not stop.priority or isinstance(write.client, Hold):
                 continue
-            if write.phase is QUEUED:
-                self.backlog.discard(write, PARKED)
+            self._unqueue(write)
             write.phase = ON_WIRE  # not sent itself; ends together with this one
             write.attempts, write.started = 1, now
             alike.append(write)
@@ -495,7 +511,7 @@ class Dispatcher:
         hold = hold or backlog.hold
         if hold is not None:
             # Failed and not sent without the hold: other requests would come between the halves of the sequence.
-            for transaction in backlog.end_hold(hold, now):
+            for transaction in [*backlog.end_hold(hold, now), *self.delayed.of(hold)]:
                 self._end(transaction, now, hold_ended(transaction, hold))
             self.writes.wake(hold.node, hold.client)
 
@@ -510,7 +526,8 @@ class Dispatcher:
         """Remove all queued transactions and fail them with the current fault: one batch now, the others in
         `fail_more`."""
         assert self.fault is not None
-        self.failing.add(take_out(self.writes.queues.values(), self.backlog), self.fault())
+        waiting = take_out(self.writes.queues.values(), self.backlog) + self.delayed.drain()
+        self.failing.add(waiting, self.fault())
         self.fail_more(now)
 
     def handle_timeout(self, now: float, unread: bool) -> None:
@@ -525,6 +542,9 @@ class Dispatcher:
             self.expire(now)
         if now >= deadlines.hold:
             self.end_hold(now)
+        if now >= deadlines.delayed:
+            for transaction in reversed(self.delayed.due(now)):  # each goes to the front
+                self.backlog.push_front(transaction)
         if now >= deadlines.sequence:
             deadlines.sequence = inf  # if the line is free, it calls the backlog next
 
@@ -552,8 +572,7 @@ class Dispatcher:
                 # the next request.
                 self.events.append(Overdue(transaction, too_late(transaction, now, held=self.is_held())))
                 continue
-            if transaction.phase is QUEUED:
-                self.backlog.discard(transaction, PARKED)
+            self._unqueue(transaction)
             self._end(transaction, now, too_late(transaction, now, held=self.is_held()))
 
     # polls
@@ -649,8 +668,7 @@ class Dispatcher:
             if write.phase is ON_WIRE:
                 write.superseded = True  # the attempt continues, but is not retried behind the write that overtakes it
             elif above is None or write.priority > above:
-                if write.phase is QUEUED:
-                    self.backlog.discard(write, PARKED)
+                self._unqueue(write)
                 self._end(write, now, make_error(Superseded, why, write))
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:

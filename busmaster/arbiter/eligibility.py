@@ -1,5 +1,7 @@
 """Decides whether a transaction may be sent now (R6, R7, R11, R12). No other place decides this.
 
+A rule that rejects or delays requests is one condition here. docs/adding-a-rule.md shows how to add one.
+
 It is called when a request arrives, when a poll is due, when a transaction is next, and when a read may go before it.
 Two decisions are made elsewhere: whose turn it is and whether a sequence may begin (`Backlog`), and whether the reply
 could be mistaken for an overdue one (`Choice`).
@@ -9,7 +11,8 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
-from typing import NamedTuple
+from math import inf
+from typing import NamedTuple, TypeAlias
 
 from busmaster.arbiter.backlog import Writes
 from busmaster.arbiter.health import DOWN
@@ -24,16 +27,24 @@ UNANSWERED = "not responding: the request was not sent, retrying in the backgrou
 
 
 class Eligible(enum.Enum):
-    """A transaction that continues: it may be sent now or later."""
+    """A transaction that may be sent now."""
 
     OK = "ok"
     IF_PAID = "if paid"
     """Its node is DOWN: it is sent if the probe budget pays for it, else it fails."""
-    WAITS = "waits"
-    """An earlier write of its client to its node is unfinished (R7)."""
 
 
-OK, IF_PAID, WAITS = Eligible
+OK, IF_PAID = Eligible
+
+
+class Wait(NamedTuple):
+    """A transaction that is evaluated again at this time, in seconds. Until then it is in no class queue."""
+
+    until: float
+
+
+BEHIND_WRITE = Wait(inf)
+"""An earlier write of its client to its node is unfinished (R7). Its end ends the wait."""
 
 
 class Rejected(NamedTuple):
@@ -42,9 +53,12 @@ class Rejected(NamedTuple):
     error: BusError
 
 
+Eligibility: TypeAlias = Eligible | Wait | Rejected
+
+
 def eligibility(
     transaction: Transaction, now: float, writes: Writes, fault: Callable[[], BusError] | None = None
-) -> Eligible | Rejected:
+) -> Eligibility:
     """Return whether the transaction may be sent now. Changes nothing. `fault` returns why the line is unusable."""
     node = transaction.node
     if fault is not None:
@@ -55,7 +69,7 @@ def eligibility(
     ):
         return Rejected(too_late(transaction, now))
     if transaction.writes and transaction.phase is QUEUED and not writes.is_first(transaction):
-        return WAITS
+        return BEHIND_WRITE
     if now < node.suspended_until:
         return Rejected(make_error(NodeDown, SUSPENDED, transaction))
     if transaction.poll is not None:

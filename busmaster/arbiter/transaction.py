@@ -39,7 +39,8 @@ URGENT, COMMAND, POLL, BACKGROUND = Priority
 
 
 class Phase(enum.Enum):
-    """State of a transaction. A write is PARKED while an earlier write to its node is unfinished (R7).
+    """State of a transaction. PARKED: it is in no class queue. It waits for an earlier write to its node (R7), or for a
+    time before which it may not be sent.
 
     FAILING: the line became unusable while it was queued. It ends next and is never sent (R13).
     """

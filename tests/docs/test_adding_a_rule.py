@@ -1,0 +1,51 @@
+"""The example of docs/adding-a-rule.md: its changes are made in a copy of the package, where its test passes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+from tests.docs.pages import ROOT
+
+PAGE = ROOT / "docs" / "adding-a-rule.md"
+BLOCK = re.compile(r"^ *```(?:py|text)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+FIRST = re.compile(r"# (?P<file>\S+?)(?:, before: (?P<anchor>.*))?\n")
+
+
+def test_the_example_works_as_the_page_shows_it(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "busmaster", tmp_path / "busmaster", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "tests/arbiter").mkdir(parents=True)
+    shutil.copy(ROOT / "tests/arbiter/bench.py", tmp_path / "tests/arbiter")
+    added: list[Path] = []
+    for block in BLOCK.findall(PAGE.read_text()):
+        code = textwrap.dedent(block)
+        head = FIRST.match(code)
+        assert head is not None, code
+        path, rest = tmp_path / head["file"], code[head.end() :]
+        if head["anchor"] is None:
+            path.write_text(rest)
+            added.append(path)
+            continue
+        line = re.search(rf"^( *){re.escape(head['anchor'])}$", text := path.read_text(), re.MULTILINE)
+        assert line is not None, f"{head['file']} has no line {head['anchor']!r}"
+        path.write_text(text[: line.start()] + textwrap.indent(rest, line[1]) + text[line.start() :])
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--rootdir",
+        str(tmp_path),
+        *map(str, added),
+    ]
+    done = subprocess.run(command, check=False, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 passed" in done.stdout
