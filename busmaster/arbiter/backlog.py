@@ -426,7 +426,7 @@ class Writes:
         for node in [node for node, waiting in self.queues.items() if not waiting]:
             del self.queues[node]
 
-    def over(self, write: Transaction) -> None:
+    def ended(self, write: Transaction) -> None:
         """Handle the end of a write: the next write of its client to its node may be sent."""
         # The write that has ended is nearly always the first one. A superseded or cancelled write can be anywhere.
         writes = self.queues[write.node]

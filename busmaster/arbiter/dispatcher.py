@@ -143,7 +143,7 @@ class Tapped:
             quiet_time=self._counters.spent[RESYNCHRONISING],
         )
 
-    def over(self, transaction: Transaction, verdict: Verdict, result: Any, now: float) -> None:
+    def ended(self, transaction: Transaction, verdict: Verdict, result: Any, now: float) -> None:
         """Report the result of the attempt."""
         attempt, self.attempt = self.attempt, None
         if attempt is None:  # it was on the wire before the tap was opened
@@ -210,7 +210,9 @@ class Dispatcher:
         node, counters = transaction.node, self.counters
         transaction.queued = now
         transaction.deadline = now + RETRY_PATIENCE
-        transaction.exchanges_ahead = counters.exchanges  # same as `_waits`, written out: this runs for every request
+        transaction.exchanges_ahead = (
+            counters.exchanges
+        )  # same as `_store_counts`, written out: this runs for every request
         transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING]
         # Checked again for each request and not only at the loss: requests keep arriving while the line is down.
         if self.fault is not None:
@@ -377,7 +379,7 @@ class Dispatcher:
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
         """Record a success. Parts that do not affect the next request are deferred until that request has left."""
         if self.tapped is not None:
-            self.tapped.over(transaction, Verdict.OK, value, now)
+            self.tapped.ended(transaction, Verdict.OK, value, now)
         # Set if the owner has not fetched its events since the last success.
         if self.unnoted is not None:
             self.note_success()
@@ -416,7 +418,7 @@ class Dispatcher:
     ) -> None:
         """Retry or fail a transaction. An `ambiguous` reply does not change the node's health (R15)."""
         if self.tapped is not None:
-            self.tapped.over(transaction, _verdict(no_reply, failure.what, ambiguous), failure.what, now)
+            self.tapped.ended(transaction, _verdict(no_reply, failure.what, ambiguous), failure.what, now)
         node = transaction.node
         transaction.unsure = True
         if no_reply:
@@ -444,7 +446,7 @@ class Dispatcher:
         """Fail a transaction because the protocol's reader raised an exception. It is not retried: the bug would
         recur."""
         if self.tapped is not None:
-            self.tapped.over(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
+            self.tapped.ended(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
         # Not a failure of the node: the bug would be the same for a healthy one.
         transaction.node.counters.garbled += 1
@@ -461,7 +463,7 @@ class Dispatcher:
         may have been carried out.
         """
         if self.tapped is not None:
-            self.tapped.over(transaction, Verdict.REFUSED, refusal.what, now)
+            self.tapped.ended(transaction, Verdict.REFUSED, refusal.what, now)
         node = transaction.node
         node.counters.refused += 1
         transaction.unsure = transaction.unsure or not certain
@@ -491,7 +493,7 @@ class Dispatcher:
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """Fail the transaction on the wire after the port was lost. A write may have been carried out."""
         if self.tapped is not None:
-            self.tapped.over(transaction, Verdict.CUT_OFF, error.what, now)
+            self.tapped.ended(transaction, Verdict.CUT_OFF, error.what, now)
         transaction.node.counters.cut_off += 1
         self._end(transaction, now, name_error(error, transaction))
 
@@ -602,7 +604,7 @@ class Dispatcher:
     def release_polls(self, now: float) -> None:
         """Start a batch of due cycles. The deadline has already passed while more are left."""
         for transaction in self.schedule.begin(now):
-            self._waits(transaction)
+            self._store_counts(transaction)
             if self._admitted(transaction, now) is not None:
                 self.backlog.push(transaction)
         self._deadlines.schedule = self.schedule.next_due()
@@ -625,7 +627,7 @@ class Dispatcher:
         """Send the next due probe if the budget allows it. `idle`: the line has nothing else to do."""
         probe = self.probes.next(now, self.fault is None, idle)
         if probe is not None:
-            self._waits(probe)
+            self._store_counts(probe)
             probe.deadline = now + RETRY_PATIENCE
             if probe.node.budgeted:
                 probe.client = self.share().new_nodes()
@@ -638,7 +640,7 @@ class Dispatcher:
         check.check = True
         check.wanted = False
         check.queued, check.deadline = now, inf
-        self._waits(check)
+        self._store_counts(check)
         return check
 
     # the ways of one transaction
@@ -680,7 +682,7 @@ class Dispatcher:
             # R7: a later NodeDown or Superseded does not mean that the first attempt was not carried out.
             if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
                 error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
-            self.writes.over(transaction)
+            self.writes.ended(transaction)
         if not transaction.attempts:
             transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
             transaction.quiet_time_ahead = self.counters.spent[RESYNCHRONISING] - transaction.quiet_time_ahead
@@ -690,7 +692,7 @@ class Dispatcher:
         if error is not None and not transaction.check:
             transaction.node.counters.failed += 1
         if transaction.probe:
-            self.probes.over(transaction)
+            self.probes.ended(transaction)
         if not transaction.wanted and not transaction.check:
             transaction.node.counters.unheard += transaction.attempts > 0
         for other in transaction.stops_alike:
@@ -709,7 +711,7 @@ class Dispatcher:
             self.counters.completed += 1
             self.events.append(transaction)
 
-    def _waits(self, transaction: Transaction) -> None:
+    def _store_counts(self, transaction: Transaction) -> None:
         """Store the line's counters. Their difference at the start of the request gives the exchanges that went ahead
         of it."""
         transaction.exchanges_ahead = self.counters.exchanges

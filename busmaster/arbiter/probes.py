@@ -75,7 +75,7 @@ class Probes:
         self.budget.refund(node.max_reply_delay)
         self.plan()
 
-    def over(self, probe: Transaction) -> None:
+    def ended(self, probe: Transaction) -> None:
         """Note that a transaction has ended. It may have been the running probe."""
         # Identity and not equality: a caller may have sent the same command to the same node.
         if probe is self._running:
