@@ -14,7 +14,7 @@ NAME = "busmaster.audit"
 TICK = 0.05
 MOST_WAITING_ENTRIES = 1_000
 """Maximum number of lines that wait while standard error is blocked."""
-FAREWELL = 2.0
+CLOSE_WITHIN = 2.0
 """Seconds in which it is to take the rest, at the end."""
 
 
@@ -48,7 +48,7 @@ class AuditLog(logging.Handler):
         self._log.removeHandler(self)
         self._log.setLevel(self._level_before)
         self._stop.set()
-        self._thread.join(FAREWELL)
+        self._thread.join(CLOSE_WITHIN)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Have it printed. Never waits."""

@@ -32,7 +32,7 @@ USUAL = LineSettings(9600)
 
 
 @dataclass(frozen=True, slots=True)
-class Errand:
+class Job:
     """The port of a search and the steps to try."""
 
     port: SerialPort | TcpPort
@@ -65,10 +65,10 @@ def command(
     all other addresses of its protocol are tried too, and the addresses that were not tried are printed. A baud rate in
     PORT (`?baudrate=9600`) is the only one that is tried, and so is a framing with it (`&bytesize=7&parity=E`).
     """
-    errand = Errand(*parsed(lambda text: what_to_try(text, names, nodes), port))
+    job = Job(*parsed(lambda text: what_to_try(text, names, nodes), port))
     if output is not None and Path(output).exists():
         raise click.UsageError(f"{output} exists and is not overwritten; choose another name")
-    tell_plan(errand)
+    tell_plan(job)
     if not yes and not sys.stdin.isatty():
         raise click.UsageError(
             "confirmation required, but there is no terminal; nothing was sent; use --yes to skip the question"
@@ -76,11 +76,11 @@ def command(
     if not yes and not click.confirm("Send these reads, if no other master is active?", err=True):
         note("nothing was sent")
         return FAILED
-    with capturing(capture, port=errand.port.name, protocol="", echo=errand.port.echo) as recorder:
-        discovery = until_ended(discover, errand, recorder)
+    with capturing(capture, port=job.port.name, protocol="", echo=job.port.echo) as recorder:
+        discovery = until_ended(discover, job, recorder)
     if discovery is None:
         return FAILED
-    text = line_text(lasting(errand.port), discovery)
+    text = line_text(lasting(job.port), discovery)
     note(f"found {summary(discovery)}")
     if output is None:
         emit_all(text.splitlines())
@@ -107,9 +107,9 @@ def what_to_try(
     return where, steps(wanted, nodes, allowed)
 
 
-def tell_plan(errand: Errand) -> None:
+def tell_plan(job: Job) -> None:
     """Print the steps and their duration."""
-    tried = errand.tried
+    tried = job.tried
     settings = list(dict.fromkeys(step.settings for step in tried))
     titles = dict.fromkeys(step.kind.profile.title for step in tried)
     requests = sum(len(step.addresses) for step in tried)
@@ -121,22 +121,22 @@ def tell_plan(errand: Errand) -> None:
         case _:
             at = f"at {len(settings)} settings of the line"
     reads = "1 read" if requests == 1 else f"{requests} reads"
-    note(f"{errand.port.name}: listen for {LISTENING:g} s; then {reads}, {at}, in {', '.join(titles)}")
+    note(f"{job.port.name}: listen for {LISTENING:g} s; then {reads}, {at}, in {', '.join(titles)}")
     note(f"at most {seconds(tried):.0f} s if no node replies; nothing is written to any node")
     if any(step.rest for step in tried):
         note("if a node replies, the other addresses of its protocol are tried too")
 
 
-async def discover(errand: Errand, tap: Tap | None) -> Discovery | None:
+async def discover(job: Job, tap: Tap | None) -> Discovery | None:
     """Listen, then search. Returns None, after a message, if nothing was sent or found."""
     from busmaster.app.cli.progress import Bar  # it takes a fifth of the time of --help
 
-    async with opened(errand.port, tap) as wire, EnterStops() as stop:
-        search = Search(wire, errand.port, note, Bar, stop.offered)
-        if talk := await search.listen(errand.tried):
+    async with opened(job.port, tap) as wire, EnterStops() as stop:
+        search = Search(wire, job.port, note, Bar, stop.offered)
+        if talk := await search.listen(job.tried):
             note(f"{talk}; nothing was sent. `busmaster monitor` shows it; stop the other master to look for nodes")
             return None
-        discovery = await search.look(errand.tried)
+        discovery = await search.look(job.tried)
     if not discovery.found:
         note("no node replied; check power, wires A and B (swap them), termination; name nodes beyond 1-8 with --nodes")
     for name, addresses in discovery.not_asked.items():

@@ -22,7 +22,7 @@ from busmaster.app.cli.parsing import option_type, parse_seconds, parse_value, p
 from busmaster.app.cli.protocols import WIDTH, NodeCommand
 from busmaster.app.cli.targets import NODE_AT, Lines, Target, split
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.service.authorisation import Wish
+from busmaster.app.service.authorisation import WriteRequest
 from busmaster.app.service.record import RAW_COMMAND, WriteRecord
 from busmaster.app.service.values import utc
 from busmaster.errors import InvalidCommand
@@ -189,7 +189,7 @@ class RecordedNode(HeldNode):
         with self._line.authorisation.begin(self._wish(command)):
             return await self._node.request(command, touches=touches, stops_seen=stops_seen, stop=stop, **options)
 
-    def _wish(self, command: Command[Any]) -> Wish:
+    def _wish(self, command: Command[Any]) -> WriteRequest:
         """Return the audit entry of a write: its point and value, or the command if no point matches."""
         for item in (*self._line.file.nodes[self._name].points, *self._handle.items()):
             point = self._line.point(f"{self._name}/{item}")
@@ -200,5 +200,5 @@ class RecordedNode(HeldNode):
                     return self._wish_of(point.key, point, value)
         return self._wish_of(f"{self._name}/{RAW_COMMAND}", None, str(command))
 
-    def _wish_of(self, name: str, point: Point[Any] | None, value: Any) -> Wish:
-        return Wish(interface="command line", by=self._by, name=name, point=point, value=value)
+    def _wish_of(self, name: str, point: Point[Any] | None, value: Any) -> WriteRequest:
+        return WriteRequest(interface="command line", by=self._by, name=name, point=point, value=value)

@@ -21,7 +21,7 @@ from busmaster.app.service.authorisation import Authorisation
 
 LEAVE_SCREEN = b"\x1b[?1000l\x1b[?1003l\x1b[?1006l\x1b[?2004l\x1b[?1004l\x1b[<u\x1b[?25h\x1b[?1049l"
 """No mouse, no bracketed paste, no reports of focus, the usual keyboard, a cursor, and the page of before."""
-FAREWELL = 3.0
+CLOSE_WITHIN = 3.0
 """Seconds in which the screen gives the terminal back."""
 ENDED_BY_A_PERSON = (0, 130)
 
@@ -38,7 +38,7 @@ async def draw(address: str) -> int:
         await anyio.to_thread.run_sync(process.wait, abandon_on_cancel=True)
     finally:
         with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(see_off, process)
+            await anyio.to_thread.run_sync(end_view, process)
         if process.returncode < 0:  # one that was killed has left the terminal as it was drawing on it
             restore_terminal(before)
     return process.returncode if process.returncode in ENDED_BY_A_PERSON else FAILED
@@ -72,11 +72,11 @@ def restore_terminal(before: list[Any] | None) -> None:
             pass  # the terminal is gone, too
 
 
-def see_off(process: subprocess.Popen[bytes]) -> None:
-    """End the view, which gives the terminal back; kill it after FAREWELL seconds."""
+def end_view(process: subprocess.Popen[bytes]) -> None:
+    """End the view, which gives the terminal back; kill it after CLOSE_WITHIN seconds."""
     process.terminate()
     try:
-        process.wait(FAREWELL)
+        process.wait(CLOSE_WITHIN)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

@@ -33,7 +33,7 @@ from busmaster.app.line.parameter_sets import (
     read_set,
     write_set,
 )
-from busmaster.app.service.authorisation import Wish
+from busmaster.app.service.authorisation import WriteRequest
 from busmaster.app.service.record import WriteRecord, this_user
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.ext import (
@@ -119,14 +119,14 @@ def recorded(target: Target, change: Change) -> Iterator[None]:
         return
     parameter = change.parameter
     name = parameter.name if parameter.name in target.line.file.nodes[target.name].points else parameter.item
-    wish = Wish(
+    request = WriteRequest(
         interface="command line",
         by="busmaster params load",
         name=f"{target.name}/{name}",
         point=target.line.point(f"{target.name}/{name}"),
         value=in_unit(parameter, change.value, target.kind),
     )
-    with target.line.authorisation.begin(wish):
+    with target.line.authorisation.begin(request):
         yield
 
 

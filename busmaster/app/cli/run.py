@@ -32,7 +32,7 @@ SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
 WORTH_SAYING = 0.005
 """Share of the line that learned reply times must save to be suggested."""
-FAREWELL = 2.0
+CLOSE_WITHIN = 2.0
 """Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
 
 
@@ -79,7 +79,7 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
             ending := context.find_object(Ending),
         )
         if ending is not None:
-            ending.patience = running.line.safe_state.within + FAREWELL
+            ending.patience = running.line.safe_state.within + CLOSE_WITHIN
         try:
             with AuditLog(running.watch.may_print):
                 status = until_ended(running.run)

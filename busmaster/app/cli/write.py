@@ -21,7 +21,7 @@ from busmaster.app.cli.parsing import Assignment, Whole, parse_assignment, parse
 from busmaster.app.cli.protocols import ItemCommand
 from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.service.authorisation import Wish
+from busmaster.app.service.authorisation import WriteRequest
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import utc
@@ -108,9 +108,9 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     try:
         prepared = [prepare(line, one, verify) for one in pairs]
         async with line.bus, late_nodes(line.bus, in_file=True):
-            for wish, send in prepared:
-                await pass_on(line, wish, send)
-                tell(wish.name, as_json, point=wish.name)
+            for request, send in prepared:
+                await pass_on(line, request, send)
+                tell(request.name, as_json, point=request.name)
     finally:
         await keep(audit, records)
 
@@ -130,29 +130,29 @@ def tell(name: str, as_json: bool, **fields: Any) -> None:
     emit(json_line(**fields, ok=True, time=utc(time.time())) if as_json else f"{name} ok")
 
 
-async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
+async def pass_on(line: ConfiguredLine, request: WriteRequest, send: Send) -> None:
     """Write one point, of which a record is kept."""
-    with line.authorisation.begin(wish):
+    with line.authorisation.begin(request):
         await send()
 
 
-def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> Wish:
+def write_request_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> WriteRequest:
     """Return the user's write request; without a point if the target is not a point of the line."""
     value = values[0] if len(values) == 1 else tuple(values)
-    return Wish(interface="command line", by="busmaster write", name=name, point=point, value=value)
+    return WriteRequest(interface="command line", by="busmaster write", name=name, point=point, value=value)
 
 
-def prepare(line: ConfiguredLine, one: Assignment, verify: bool) -> tuple[Wish, Send]:
+def prepare(line: ConfiguredLine, one: Assignment, verify: bool) -> tuple[WriteRequest, Send]:
     """Return what a person wants, and what writes it.
 
     Raises InvalidCommand, of which a record is kept, for what may not be written, and for no point of the line.
     """
-    wish = wish_of(one.item, one.values)
+    request = write_request_of(one.item, one.values)
     try:
-        wish = wish_of(one.item, one.values, line.point(one.item))
-        return wish, prepare_point(line, one, verify)
+        request = write_request_of(one.item, one.values, line.point(one.item))
+        return request, prepare_point(line, one, verify)
     except InvalidCommand as error:
-        line.authorisation.refuse(wish, str(error))
+        line.authorisation.refuse(request, str(error))
         raise
 
 

@@ -13,7 +13,7 @@ import anyio
 
 from busmaster import Bus, Node, Priority, ext
 from busmaster.app.config.points import NamedPoint
-from busmaster.app.service.authorisation import Authorisation, Wish, outcome_of
+from busmaster.app.service.authorisation import Authorisation, WriteRequest, outcome_of
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.record import Outcome
 from busmaster.bounds import LONGEST_SAFE_STATE
@@ -142,7 +142,7 @@ class Leaving:
         self.error: BusError | None = NotStarted("not sent in time", node=write.node)
         key = write.point.key
         self._passage = authorisation.begin(
-            Wish(interface="safe", by=by, name=key, point=write.point, value=write.value)
+            WriteRequest(interface="safe", by=by, name=key, point=write.point, value=write.value)
         )
 
     async def try_once(self, within: float) -> bool:

@@ -23,7 +23,7 @@ from busmaster.ext import Outdated
 
 WAITING = 256
 """Cycles of a group that may wait for a loop that is busy with other things."""
-FAREWELL = 5.0
+CLOSE_WITHIN = 5.0
 """Seconds in which the outputs write their queues when the line is closed."""
 
 
@@ -102,8 +102,8 @@ class Distributor:
     async def replace(self, wanted: Mapping[str, Wanted], groups: Iterable[Source]) -> None:
         """Run these outputs, and feed them from these groups, from now on.
 
-        An unchanged output is reopened, and continues with its queue. A changed one is closed, within FAREWELL seconds,
-        and new items wait for its successor. Raises InvalidCommand, before any change, if an extra is missing.
+        An unchanged output is reopened, and continues with its queue. A changed one is closed within CLOSE_WITHIN
+        seconds, and new items wait for its successor. Raises InvalidCommand, before any change, if an extra is missing.
         """
         # Made before anything is changed: an extra may be missing.
         fresh = {kind: self._make(kind, *one) for kind, one in wanted.items() if not one.same(self._wanted.get(kind))}
@@ -169,7 +169,7 @@ class Distributor:
     async def close(self) -> None:
         """Close the outputs, once the bus is closed.
 
-        The values polled so far are still offered, and written within FAREWELL seconds.
+        The values polled so far are still offered, and written within CLOSE_WITHIN seconds.
         """
         with anyio.CancelScope(shield=True):
             # They end with the bus's streams. If they were cancelled, the values polled last would be missing.
@@ -250,7 +250,7 @@ async def close_all(outputs: Collection[Output]) -> None:
     """Close them, their interfaces first, so that all of them have the audit entries of their replies."""
     # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
     await asyncio.gather(*(asyncio.to_thread(output.close_interface) for output in outputs))
-    await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in outputs))
+    await asyncio.gather(*(asyncio.to_thread(output.close, CLOSE_WITHIN) for output in outputs))
 
 
 def label_of(event: BusEvent) -> str:

@@ -49,7 +49,7 @@ from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
 from busmaster.app.outputs.spilling import SpillingOutput
 from busmaster.app.outputs.spool import Record
-from busmaster.app.service.authorisation import Authorisation, Wish
+from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import cycle_fields, json_line, micros, sample_fields, write_fields
 from busmaster.bounds import LONGEST_TOPIC
@@ -80,7 +80,7 @@ LAST_ANSWERS = 2.0
 MARGIN = 1.0
 """Seconds, beyond those, for a thread that does not get on: who does not answer then never will."""
 HURRY = 2.0
-"""Seconds from the wish to end until what could not be sent goes to disk."""
+"""Seconds from the request to end until what could not be sent goes to disk."""
 
 
 class Outgoing(NamedTuple):
@@ -463,16 +463,18 @@ class MqttOutput(SpillingOutput):
                 await self._arriving.answered()
             tasks.cancel_scope.cancel()
 
-    async def _write(self, wish: Wish) -> WriteRecord:
+    async def _write(self, request: WriteRequest) -> WriteRecord:
         """Write it on the loop that owns the line."""
         assert self._owner is not None
-        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._authorisation.write(wish), self._owner))
+        return await asyncio.wrap_future(
+            asyncio.run_coroutine_threadsafe(self._authorisation.write(request), self._owner)
+        )
 
-    def _keep(self, wish: Wish, error: str) -> None:
+    def _keep(self, request: WriteRequest, error: str) -> None:
         """Store the audit entry of a refused command, on the owner's loop."""
         assert self._owner is not None
         with suppress(RuntimeError):  # that loop has ended
-            self._owner.call_soon_threadsafe(self._authorisation.refuse, wish, error)
+            self._owner.call_soon_threadsafe(self._authorisation.refuse, request, error)
 
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")

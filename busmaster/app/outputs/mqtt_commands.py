@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import anyio
 
 from busmaster import Point
-from busmaster.app.service.authorisation import Authorisation, Wish
+from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.payload import NoCommand, read_payload
 from busmaster.app.service.record import WriteRecord
 from busmaster.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
@@ -53,7 +53,7 @@ class Answer(NamedTuple):
         return {**fields, "id": self.id} if self.id else fields
 
 
-Write: TypeAlias = Callable[[Wish], Awaitable[WriteRecord]]
+Write: TypeAlias = Callable[[WriteRequest], Awaitable[WriteRecord]]
 Say: TypeAlias = Callable[[Answer], Awaitable[None]]
 
 
@@ -74,7 +74,7 @@ class Commands:
         self.refused = 0
         """Refused commands, including those without a reply."""
         self.unanswered = 0
-        self.queued: deque[Wish] = deque()
+        self.queued: deque[WriteRequest] = deque()
         self._tell = tell
         self._asked = f"{prefix}/set/"
         self._authorisation = authorisation
@@ -86,7 +86,7 @@ class Commands:
         """Bytes that were read, at least."""
         self._looks: deque[tuple[float, int]] = deque()
         """Later looks, each with what will have been read when all is that lay there then."""
-        self._answers: deque[tuple[Wish, Answer]] = deque()
+        self._answers: deque[tuple[WriteRequest, Answer]] = deque()
         self._answering = 0
         """Commands that are neither waiting nor answered yet."""
         self._told = 0
@@ -110,7 +110,7 @@ class Commands:
             self._count_alone()  # before it is decoded: a flood of commands must cost nothing
             return
         shown = name if len(name) <= LONGEST_NAME else ""
-        wish = Wish(
+        request = WriteRequest(
             interface="mqtt",
             by=_sender(topic[:LONGEST_NAME], message),
             name=shown or name[:40],
@@ -119,33 +119,33 @@ class Commands:
             arrived=self._looked,
         )
         try:
-            wish = self._read(wish, message)  # first: the reply to every command contains its value and its id
+            request = self._read(request, message)  # first: the reply to every command contains its value and its id
             if point is None:
-                raise InvalidCommand(self._authorisation.refusal(wish))
+                raise InvalidCommand(self._authorisation.refusal(request))
             if message.retain:
                 raise InvalidCommand("a retained command is not accepted, because its age is unknown")
             if len(self.queued) >= MOST_COMMANDS:
                 raise InvalidCommand(f"{MOST_COMMANDS} commands are already waiting; send fewer at a time")
         except NoCommand as error:
-            self._refuse(replace(wish, id=error.id), shown, str(error))
+            self._refuse(replace(request, id=error.id), shown, str(error))
         except InvalidCommand as error:
-            self._refuse(wish, shown, str(error))
+            self._refuse(request, shown, str(error))
         else:
-            self.queued.append(wish)
+            self.queued.append(request)
         self._something.set()
 
-    def _read(self, wish: Wish, message: Message | MQTTMessage) -> Wish:
+    def _read(self, request: WriteRequest, message: Message | MQTTMessage) -> WriteRequest:
         said = read_payload(message.payload)
         ends = [] if said.expires is None else [said.expires]
         interval = getattr(message.properties, EXPIRY, None)
         if interval is not None:
             ends.append(time.time() - (self._now() - self._looked) + interval)
-        return replace(wish, value=said.value, expires=min(ends, default=None), id=said.id)
+        return replace(request, value=said.value, expires=min(ends, default=None), id=said.id)
 
-    def _refuse(self, wish: Wish, name: str, error: str) -> None:
+    def _refuse(self, request: WriteRequest, name: str, error: str) -> None:
         if len(self._answers) < MOST_COMMANDS:
             self.refused += 1
-            self._answers.append((wish, Answer(name, False, error, wish.id)))
+            self._answers.append((request, Answer(name, False, error, request.id)))
         else:
             self._count_alone()
 
@@ -154,7 +154,7 @@ class Commands:
         self.unanswered += 1
 
     async def serve(
-        self, write: Write, keep: Callable[[Wish, str], object], say: Say, unread: Callable[[], int]
+        self, write: Write, keep: Callable[[WriteRequest, str], object], say: Say, unread: Callable[[], int]
     ) -> None:
         """Write the permitted commands and reply to all, until cancelled.
 
@@ -186,19 +186,19 @@ class Commands:
     async def _obey(self, write: Write, say: Say) -> None:
         while True:
             if self.queued:
-                wish = self.queued.popleft()
+                request = self.queued.popleft()
                 with self._one_more():
-                    record = await write(wish)
-                    await say(Answer(wish.name, record.ok, record.error, wish.id))
+                    record = await write(request)
+                    await say(Answer(request.name, record.ok, record.error, request.id))
             else:
                 await self._wait()
 
-    async def _answer_refusals(self, keep: Callable[[Wish, str], object], say: Say) -> None:
+    async def _answer_refusals(self, keep: Callable[[WriteRequest, str], object], say: Say) -> None:
         while True:
             if self._answers:
-                wish, answer = self._answers.popleft()
+                request, answer = self._answers.popleft()
                 with self._one_more():
-                    keep(wish, answer.error)
+                    keep(request, answer.error)
                     await say(answer)
                 await anyio.sleep(BREATH)
             else:
@@ -217,13 +217,13 @@ class Commands:
         while self.queued or self._answers or self._answering:  # noqa: ASYNC110  many have a hand in it
             await anyio.sleep(LOOK)
 
-    def close(self, keep: Callable[[Wish, str], object]) -> None:
+    def close(self, keep: Callable[[WriteRequest, str], object]) -> None:
         """Stop accepting commands. `keep` is called with those without a reply; later ones are only counted."""
         self._closed = True
-        for wish, answer in self._answers:
-            keep(wish, answer.error)
-        for wish in self.queued:
-            keep(wish, "the connection to the broker ended before it was its turn: nothing was sent")
+        for request, answer in self._answers:
+            keep(request, answer.error)
+        for request in self.queued:
+            keep(request, "the connection to the broker ended before it was its turn: nothing was sent")
         self.queued.clear()
         self._answers.clear()
 

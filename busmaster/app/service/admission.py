@@ -12,11 +12,11 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from typing import Any
 
 from busmaster.app.service.client import Client
+from busmaster.app.service.client_connection import ClientConnection
 from busmaster.app.service.messages import Malformed
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.refusals import Refusals
 from busmaster.app.service.rights import RIGHTS, Role
-from busmaster.app.service.visit import Visit
 from busmaster.bounds import (
     CONNECTIONS_A_SECOND,
     FREE_CONNECTIONS,
@@ -45,7 +45,7 @@ class Admission:
         self._refusals.note_connection(permission.role.value)
         return self._why_not(permission.role)
 
-    def admit(self, permission: Permission, clients: Mapping[Client, Visit], *, safe_only: bool) -> bool:
+    def admit(self, permission: Permission, clients: Mapping[Client, ClientConnection], *, safe_only: bool) -> bool:
         """Admit one more program beside `clients`, and return whether it gets a place for the safe state.
 
         `safe_only`: it has declared that it only sends the safe state. Raises Malformed with the reason for a refusal.
@@ -60,7 +60,7 @@ class Admission:
             if idle is None:
                 self._refusals.note_connection("safe")
                 raise Malformed(f"{len(here)} programs are already sending the safe state; wait for them")
-            clients[idle].connection.abort()
+            clients[idle].websocket.abort()
         return True
 
     def _has_place(self, role: Role, clients: Iterable[Client]) -> bool:
@@ -114,13 +114,13 @@ def connecting_peer(origin: int | str | None, process: int) -> Hashable:
     return (origin, process) if origin in (0, os.getuid()) else origin
 
 
-def stranger_to_close(strangers: Collection[Visit]) -> Visit | None:
+def stranger_to_close(strangers: Collection[ClientConnection]) -> ClientConnection | None:
     """Return the connection without a first message that is closed for a new one; None if there is space.
 
     It is the oldest of the user or address with the most connections, so a peer that opens many closes its own.
     """
     if len(strangers) < MOST_STRANGERS:
         return None
-    origins: Counter[Any] = Counter(visit.connection.origin for visit in strangers)
+    origins: Counter[Any] = Counter(connection.websocket.origin for connection in strangers)
     [(crowd, _)] = origins.most_common(1)
-    return next(visit for visit in strangers if visit.connection.origin == crowd)
+    return next(connection for connection in strangers if connection.websocket.origin == crowd)

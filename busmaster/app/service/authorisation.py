@@ -37,7 +37,7 @@ NEVER_SENT = (ArithmeticError, TypeError, ValueError, RecursionError)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
+class WriteRequest:
     """A write that a client requests.
 
     `arrived`: time of arrival, by the bus's clock; None if a user waits for the result. `expires`: time after which the
@@ -59,7 +59,7 @@ class Wish:
 
 Durable: TypeAlias = Awaitable[str] | None
 """Result when an audit entry is on the disk: "", or the reason why it is not. None if that is not awaited."""
-Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], tuple[WriteRecord, Durable]]
+Keep: TypeAlias = Callable[[WriteRequest, Outcome, str, Any, float], tuple[WriteRecord, Durable]]
 """Stores an audit entry: the request, its outcome and the reason, the value before, and the duration in seconds."""
 
 
@@ -82,20 +82,20 @@ class SafeWrites(Protocol):
         ...
 
 
-class Passage:
+class WriteInProgress:
     """One write in progress, for `with`: every end is stored in the audit log. Exceptions are raised again."""
 
-    def __init__(self, wish: Wish, now: Callable[[], float], keep: Keep) -> None:
+    def __init__(self, request: WriteRequest, now: Callable[[], float], keep: Keep) -> None:
         self.record: WriteRecord | None = None
         """None until it has ended."""
         self._durable: Durable = None
-        self._wish = wish
+        self._write_request = request
         self._now = now
         self._keep = keep
         self._began = now()
-        self._before = _before(wish.point)
+        self._before = _before(request.point)
 
-    def __enter__(self) -> Passage:
+    def __enter__(self) -> WriteInProgress:
         return self
 
     def __exit__(
@@ -107,7 +107,7 @@ class Passage:
         """Store the audit entry with the error, or None for a confirmed write."""
         outcome, text = outcome_of(error)
         took = self._now() - self._began
-        self.record, self._durable = self._keep(self._wish, outcome, text, self._before, took)
+        self.record, self._durable = self._keep(self._write_request, outcome, text, self._before, took)
 
     async def not_durable(self) -> str:
         """Wait until the audit entry of a write is on the disk, if an output requires that before the acknowledgement.
@@ -175,77 +175,79 @@ class Authorisation:
         """Replace the tokens: digests by name."""
         self.access = replace(self.access, secrets=secrets)
 
-    def refusal(self, wish: Wish) -> str:
+    def refusal(self, request: WriteRequest) -> str:
         """Return why a write is not permitted, "" if it is."""
         if self.leaving:
             return "the line is closing; nothing was sent"
         if self.read_only:
             return "this line is read-only"
-        if wish.point is None:
+        if request.point is None:
             return "the line's file does not permit this write; add the point to allow_commands"
-        if wish.command is not None and (refusal := wish.permission.refusal(wish.point.node, wish.command)):
+        if request.command is not None and (refusal := request.permission.refusal(request.point.node, request.command)):
             return refusal
-        if self._left(wish) <= 0:
+        if self._left(request) <= 0:
             return "the command has expired; nothing was sent"
-        if self._running.get(wish.interface, 0) >= MOST_AT_ONCE:
+        if self._running.get(request.interface, 0) >= MOST_AT_ONCE:
             return f"{MOST_AT_ONCE} commands are already being written; wait for them"
         return ""
 
-    async def write(self, wish: Wish) -> WriteRecord:
+    async def write(self, request: WriteRequest) -> WriteRecord:
         """Write it, unless it is refused, and return the audit entry."""
-        passage = self.begin(wish)
+        in_progress = self.begin(request)
         try:
-            with passage:
-                if refusal := self.refusal(wish):
+            with in_progress:
+                if refusal := self.refusal(request):
                     raise InvalidCommand(refusal)
-                await self._pass(wish)
+                await self._pass(request)
         except (BusError, *NEVER_SENT):
             pass  # it is in the audit log
-        assert passage.record is not None
-        if why := await passage.not_durable():
-            return passage.record._replace(outcome=Outcome.UNCONFIRMED, error=cut(why))
-        return passage.record
+        assert in_progress.record is not None
+        if why := await in_progress.not_durable():
+            return in_progress.record._replace(outcome=Outcome.UNCONFIRMED, error=cut(why))
+        return in_progress.record
 
-    def begin(self, wish: Wish) -> Passage:
+    def begin(self, request: WriteRequest) -> WriteInProgress:
         """Begin a write of this process itself: its safe state, or a write from its command line.
 
         It is not checked here. The caller does the write within `with`, and it is stored in the audit log.
         """
-        return Passage(wish, self.bus.now, self._keep)
+        return WriteInProgress(request, self.bus.now, self._keep)
 
-    def refuse(self, wish: Wish, error: str) -> WriteRecord:
+    def refuse(self, request: WriteRequest, error: str) -> WriteRecord:
         """Store the audit entry of a write that was refused before it began."""
-        return self._keep(wish, Outcome.REFUSED, error, _before(wish.point), 0.0)[0]
+        return self._keep(request, Outcome.REFUSED, error, _before(request.point), 0.0)[0]
 
-    async def _pass(self, wish: Wish) -> None:
-        assert wish.point is not None
-        self._running[wish.interface] = self._running.get(wish.interface, 0) + 1
+    async def _pass(self, request: WriteRequest) -> None:
+        assert request.point is not None
+        self._running[request.interface] = self._running.get(request.interface, 0) + 1
         try:
-            left = self._left(wish)
-            await wish.point.write(wish.value, start_within=None if left == inf else max(0.0, left))
+            left = self._left(request)
+            await request.point.write(request.value, start_within=None if left == inf else max(0.0, left))
         finally:
-            self._running[wish.interface] -= 1
+            self._running[request.interface] -= 1
 
-    def _left(self, wish: Wish) -> float:
+    def _left(self, request: WriteRequest) -> float:
         """Return for how many seconds the write may still wait; inf if a user waits for the result."""
-        if wish.expires is not None:
-            return wish.expires - time.time()
-        return inf if wish.arrived is None else wish.arrived + FRESH - self.bus.now()
+        if request.expires is not None:
+            return request.expires - time.time()
+        return inf if request.arrived is None else request.arrived + FRESH - self.bus.now()
 
-    def _keep(self, wish: Wish, outcome: Outcome, error: str, before: Any, took: float) -> tuple[WriteRecord, Durable]:
+    def _keep(
+        self, request: WriteRequest, outcome: Outcome, error: str, before: Any, took: float
+    ) -> tuple[WriteRecord, Durable]:
         record = WriteRecord(
             time=self.bus.wall_time(),
-            interface=wish.interface,
-            by=cut(wish.by),
+            interface=request.interface,
+            by=cut(request.by),
             user=self._user,
             process=os.getpid(),
-            point=cut(wish.name),
+            point=cut(request.name),
             before=before,
-            value=_shown(wish.value),
+            value=_shown(request.value),
             outcome=outcome,
             error=cut(error),
             took=took,
-            id=wish.id,
+            id=request.id,
         )
         # an unconfirmed write has an unknown result, which the user must check
         level = logging.WARNING if outcome is Outcome.UNCONFIRMED else logging.INFO

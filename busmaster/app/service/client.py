@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any
 
 from busmaster import Node, Point, PollGroup, Priority, ext
-from busmaster.app.service.errands import Errand, Writing, errand_of
+from busmaster.app.service.client_requests import ClientRequest, Writing, client_request_of
 from busmaster.app.service.failures import REFUSED, refusal_of, said_error
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import NO_METHOD, Malformed, answered, check_within, timings_of, written
@@ -114,9 +114,9 @@ class Client:
         return self._line.authorisation.read_only or not self.permission.writes
 
     @property
-    def errands(self) -> tuple[Errand, ...]:
+    def unfinished(self) -> tuple[ClientRequest, ...]:
         """Return its requests that have not ended."""
-        return self.requests.errands
+        return self.requests.unfinished
 
     # messages to the client
 
@@ -231,9 +231,9 @@ class Client:
                 if len(params["commands"]) > MOST_CHECKED:
                     raise InvalidCommand(f"more than {MOST_CHECKED} writes in one check; send several checks")
                 for command in params["commands"]:
-                    errand = errand_of({**params, "command": command}, self, self._line)
-                    if isinstance(errand, Writing):
-                        errand.check()
+                    request = client_request_of({**params, "command": command}, self, self._line)
+                    if isinstance(request, Writing):
+                        request.check()
                 return None
             case "now":
                 return self._line.bus.now()

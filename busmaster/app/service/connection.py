@@ -38,7 +38,7 @@ _BINARY, _CONTROL, _OPEN = 2, 8, 1  # numbers of the WebSocket's standard, and o
 _ANY_URI = "ws://busmaster/"
 
 
-class Hearer(Protocol):
+class MessageHandler(Protocol):
     """Receives the messages of a connection. Its methods must not raise, because the connection would be lost."""
 
     def opened(self) -> None:
@@ -58,7 +58,7 @@ class Hearer(Protocol):
         ...
 
 
-class TokenCheck(Hearer, Protocol):
+class TokenCheck(MessageHandler, Protocol):
     """Receives the messages of a serving connection, and decides whether it is admitted."""
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
@@ -71,18 +71,18 @@ class TokenCheck(Hearer, Protocol):
 
 
 class Connection(asyncio.BufferedProtocol):
-    """One end of a connection, for an event loop. `hearer` receives the messages, at most `read_at_once` bytes in a
+    """One end of a connection, for an event loop. `handler` receives the messages, at most `read_at_once` bytes in a
     turn; a message of more than `longest` bytes ends the connection."""
 
     _serves: bool
 
     def __init__(
-        self, core: ServerProtocol | ClientProtocol, hearer: Hearer, *, longest: int, read_at_once: int
+        self, core: ServerProtocol | ClientProtocol, handler: MessageHandler, *, longest: int, read_at_once: int
     ) -> None:
         self.full = False
         """Whether earlier messages are still unsent. Later ones wait behind them in memory."""
         self._core = core
-        self._hearer = hearer
+        self._handler = handler
         self._buffer = memoryview(bytearray(read_at_once))
         self._transport: asyncio.Transport | None = None
         self._loop: asyncio.AbstractEventLoop
@@ -195,7 +195,7 @@ class Connection(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         self.full = False
         self._timers.pop("taken").cancel()
-        self._hearer.writable()
+        self._handler.writable()
 
     def connection_lost(self, cause: Exception | None) -> None:
         for timer in self._timers.values():
@@ -203,7 +203,7 @@ class Connection(asyncio.BufferedProtocol):
         self._core.receive_eof()
         self._is_open = self._talks = False
         self._over.set()
-        self._hearer.lost()
+        self._handler.lost()
 
     # inside
 
@@ -213,7 +213,7 @@ class Connection(asyncio.BufferedProtocol):
     def _open(self) -> None:
         self._is_open = self._talks = True
         self._set_timer("ping", PING_EVERY, self._ping)
-        self._hearer.opened()
+        self._handler.opened()
 
     def _cut(self, size: int) -> bytes:
         part = bytes(self._rest[:size])
@@ -252,7 +252,7 @@ class Connection(asyncio.BufferedProtocol):
             self._core.fail(NO_TEXT, "a message is text in UTF-8")
             self._write()
         else:
-            self._hearer.heard(message)
+            self._handler.heard(message)
 
     def _write(self) -> None:
         transport = self.transport
@@ -281,17 +281,17 @@ class Connection(asyncio.BufferedProtocol):
         self._timers[name] = self._loop.call_later(delay, call)
 
 
-class ServedConnection(Connection):
+class IncomingConnection(Connection):
     """The server's end."""
 
     _core: ServerProtocol
-    _hearer: TokenCheck
+    _handler: TokenCheck
     _serves = True
 
-    def __init__(self, hearer: TokenCheck, *, longest: int, read_at_once: int) -> None:
+    def __init__(self, handler: TokenCheck, *, longest: int, read_at_once: int) -> None:
         server = check_installed()[0]
         core = server(origins=[None], max_size=longest, logger=_quiet())
-        super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
+        super().__init__(core, handler, longest=longest, read_at_once=read_at_once)
         self.origin: int | str | None = None
         """Where the connection comes from: the number of a user, or an address of the network."""
         self._frames = 0
@@ -302,7 +302,7 @@ class ServedConnection(Connection):
         connected = transport.get_extra_info("socket")
         self.origin = origin_of(connected)
         super().connection_made(transport)
-        delay = self._hearer.delay(self.origin, process_number(connected))
+        delay = self._handler.delay(self.origin, process_number(connected))
         if delay is None:
             self.abort()
         elif delay:
@@ -321,7 +321,7 @@ class ServedConnection(Connection):
             self.pause()  # its further data is not read: it has CLOSE_WITHIN to receive this
 
     def _shake_hands(self, event: Request) -> None:
-        refusal = self._hearer.refusal(event)
+        refusal = self._handler.refusal(event)
         answer = self._core.accept(event) if refusal is None else self._core.reject(*refusal)
         self._core.send_response(answer)
         self._write()
@@ -329,7 +329,7 @@ class ServedConnection(Connection):
             self._open()
 
 
-class AskingConnection(Connection):
+class OutgoingConnection(Connection):
     """The client's end, with a token if there is one.
 
     `masks`: whether messages are masked, as required where a proxy between the two ends could misinterpret them. There
@@ -340,11 +340,11 @@ class AskingConnection(Connection):
     _serves = False
 
     def __init__(
-        self, hearer: Hearer, *, masks: bool, token: str | None = None, longest: int, read_at_once: int
+        self, handler: MessageHandler, *, masks: bool, token: str | None = None, longest: int, read_at_once: int
     ) -> None:
         _, client, parse_uri = check_installed()
         core = client(parse_uri(_ANY_URI), max_size=longest, logger=_quiet())
-        super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
+        super().__init__(core, handler, longest=longest, read_at_once=read_at_once)
         self._masks = masks
         self._key = new_key() if masks else NO_MASK
         self._token = token
@@ -368,7 +368,7 @@ class AskingConnection(Connection):
         return None if self._core.handshake_exc is None else str(self._core.handshake_exc)
 
     @property
-    def farewell(self) -> str:
+    def close_reason(self) -> str:
         """Return the reason with which the other end closed the connection, "" if it has not."""
         said = self._core.close_rcvd
         return "" if said is None else said.reason

@@ -26,7 +26,7 @@ HEARD_AT_ONCE = 200
 """Pieces of what passes that are put into their order at once."""
 
 
-class Passage:
+class TracedExchange:
     """One attempt at a command with all of its bytes; or, without an attempt, unexpected bytes."""
 
     __slots__ = ("attempt", "bytes", "said")
@@ -58,8 +58,8 @@ class Listener:
     def __init__(self) -> None:
         self._lost = 0
         self._heard: list[tuple[float, bool, bytes, Attempt | None]] = []
-        self._passages: deque[Passage] = deque()
-        self._last: Passage | None = None
+        self._passages: deque[TracedExchange] = deque()
+        self._last: TracedExchange | None = None
         self._has_begun = False
         """An attempt has begun. Earlier bytes can be the reply to an attempt that was not recorded."""
 
@@ -78,10 +78,10 @@ class Listener:
     def attempted(self, attempt: Attempt, /) -> None:
         """Do nothing: an attempt has its own end."""
 
-    def take(self) -> tuple[list[Passage], int]:
+    def take(self) -> tuple[list[TracedExchange], int]:
         """Return the completed exchanges in their order, and the number of all that were dropped."""
         self._put_in_order()
-        over: list[Passage] = []
+        over: list[TracedExchange] = []
         while self._passages and self._passages[0].is_over:
             over.append(self._passages.popleft())
         if not self._passages:
@@ -91,22 +91,22 @@ class Listener:
     def _put_in_order(self) -> None:
         heard, self._heard = self._heard, []
         for now, by_master, data, attempt in heard:
-            passage = self._last
+            exchange = self._last
             if attempt is not None or (self._has_begun and not by_master):
-                if passage is None or passage.attempt is not attempt:
-                    passage = self._begin(attempt)
-            elif passage is None:
+                if exchange is None or exchange.attempt is not attempt:
+                    exchange = self._begin(attempt)
+            elif exchange is None:
                 continue
-            passage.add(now, by_master, data)
+            exchange.add(now, by_master, data)
 
-    def _begin(self, attempt: Attempt | None) -> Passage:
+    def _begin(self, attempt: Attempt | None) -> TracedExchange:
         self._has_begun = True
-        self._last = passage = Passage(attempt)
-        self._passages.append(passage)
+        self._last = exchange = TracedExchange(attempt)
+        self._passages.append(exchange)
         if len(self._passages) > MOST_KEPT:
             self._passages.popleft()
             self._lost += 1
-        return passage
+        return exchange
 
 
 class ExchangesBroadcast(Broadcast):
@@ -126,7 +126,7 @@ class ExchangesBroadcast(Broadcast):
                 for first in range(0, len(passages), ENCODED_AT_ONCE):
                     if first:
                         await asyncio.sleep(0)
-                    parts.append(encoded(list(map(said_passage, passages[first : first + ENCODED_AT_ONCE])))[1:-1])
+                    parts.append(encoded(list(map(exchange_to_json, passages[first : first + ENCODED_AT_ONCE])))[1:-1])
                 head = encoded({"now": self._bus.now(), "left_out": left_out})
                 yield "exchanges", f'{head[:-1]},"exchanges":[{",".join(parts)}]}}'
                 await asyncio.sleep(INTERVAL)
@@ -134,16 +134,16 @@ class ExchangesBroadcast(Broadcast):
             ext.remove_tap(self._bus, listener)
 
 
-def said_passage(passage: Passage) -> list[Any]:
+def exchange_to_json(exchange: TracedExchange) -> list[Any]:
     """Return a completed exchange as a list for JSON: values in a fixed order, times in whole microseconds, bytes in
     hexadecimal digits. Names would be repeated for each exchange, and floats take ten times as long.
     """
-    attempt = passage.attempt
+    attempt = exchange.attempt
     if attempt is None or attempt.verdict is None:
-        return [passage.said, passage.bytes]
+        return [exchange.said, exchange.bytes]
     return [
-        passage.said,
-        passage.bytes,
+        exchange.said,
+        exchange.bytes,
         round(attempt.ended_at * 1e6),
         attempt.protocol,
         attempt.address,

@@ -10,10 +10,10 @@ from typing import Any
 from busmaster import Bus, Node, Point, PollGroup, ext
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.exchanges import ExchangesBroadcast
-from busmaster.app.service.overview import Journal, Overview
+from busmaster.app.service.overview import EventLog, Overview
 from busmaster.app.service.plans import Planner
 from busmaster.app.service.rights import RIGHTS, Role
-from busmaster.app.service.safe import SafeWishes
+from busmaster.app.service.safe import SafeStateRequests
 from busmaster.app.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 from busmaster.errors import InvalidCommand
 from busmaster.ext import NodeRecord, Placed
@@ -31,9 +31,9 @@ class ServedLine:
         self.share = share
         self.title = title
         """Title above the views of the line."""
-        self.safe_wishes = SafeWishes(authorisation)
+        self.safe_wishes = SafeStateRequests(authorisation)
         self.planner = Planner(bus)
-        self.journal = Journal(bus)
+        self.journal = EventLog(bus)
         """The events from now on, also before the line is served."""
         self._demanded: dict[tuple[str, Role], float] = {}
         """When a role's programs last had a group polled off its grid."""

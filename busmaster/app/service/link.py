@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Any
 
-from busmaster.app.service.connection import AskingConnection
+from busmaster.app.service.connection import OutgoingConnection
 from busmaster.app.service.failures import error_of
 from busmaster.app.service.folder import socket_path
 from busmaster.app.service.messages import VERSIONS, numbered, read, words, written
@@ -36,7 +36,7 @@ NO_PLACE = "see busmaster status; if no place is free, stop a program that uses 
 AGAIN = "check whether it is running, and connect again"
 
 
-class Asked:
+class PendingRequest:
     """One request in progress. `writes`: its error must state whether the write may have been sent."""
 
     __slots__ = ("command", "future", "handed", "node", "number", "writes")
@@ -94,10 +94,10 @@ class Link:
         self._token = token
         self._on_news = on_news
         self._on_lost = on_lost
-        self._connection: AskingConnection | None = None
-        self._waiting: deque[tuple[str, Asked | None]] = deque()
+        self._connection: OutgoingConnection | None = None
+        self._waiting: deque[tuple[str, PendingRequest | None]] = deque()
         """Messages to send when the connection is ready, each with its request."""
-        self._asked: dict[int, Asked] = {}
+        self._asked: dict[int, PendingRequest] = {}
         self._count = 0
         self._over: tuple[type[BusError], str, str] | None = None
         self._is_open = False
@@ -109,7 +109,7 @@ class Link:
             await asyncio.to_thread(_where, self.address) if is_a_name(self.address) else _where(self.address)
         )
         loop = asyncio.get_running_loop()
-        self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
+        self._asked[0] = hello = PendingRequest(0, loop.create_future(), False, None, None)
         params: dict[str, Any] = {"versions": list(VERSIONS), "program": program}
         if self._safe_only:
             params["safe_only"] = True
@@ -146,13 +146,13 @@ class Link:
 
     def ask(
         self, method: str, params: Mapping[str, Any], *, writes: bool = False, node: Addressed | None = None
-    ) -> Asked:
+    ) -> PendingRequest:
         """Do what `put` does, for a method and its parameters."""
         return self.put(words(method, params), writes, node)
 
     def put(
         self, question: str, writes: bool, node: Addressed | None = None, command: Command[Any] | None = None
-    ) -> Asked:
+    ) -> PendingRequest:
         """Send a request in the form of `words`, after all earlier messages. Its future gets the reply.
 
         Raises LineDown or BusClosed.
@@ -162,7 +162,7 @@ class Link:
         self._count = number = self._count + 1
         text = numbered(question, number)
         handed = self._passes(text)  # first: the other end begins while this end creates the objects for it
-        asked = Asked(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
+        asked = PendingRequest(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
         self._asked[number] = asked
         if not handed:
             self._waiting.append((text, asked))
@@ -174,7 +174,7 @@ class Link:
             kind, what, hint = self._over
             raise kind(what, node=node, command=_text(command), hint=hint)
 
-    async def answer(self, asked: Asked, finish_within: float | None = None) -> Any:
+    async def answer(self, asked: PendingRequest, finish_within: float | None = None) -> Any:
         """Wait for a reply. A cancellation also cancels the request at the line."""
         timer = None
         if finish_within is not None:
@@ -191,9 +191,9 @@ class Link:
 
     # called by the connection
 
-    def _connect(self) -> AskingConnection:
+    def _connect(self) -> OutgoingConnection:
         is_tcp = self.address.startswith(TCP)
-        self._connection = AskingConnection(
+        self._connection = OutgoingConnection(
             self, masks=is_tcp, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE
         )
         return self._connection
@@ -237,7 +237,7 @@ class Link:
         """Return why the owner did not admit this program, None if the error has another cause."""
         connection = self._connection
         status = None if connection is None else connection.status
-        farewell = "" if connection is None else connection.farewell
+        close_reason = "" if connection is None else connection.close_reason
         complaint = None if connection is None else connection.complaint
         if status == HTTPStatus.UNAUTHORIZED:
             what = f"{where} {'requires a token' if self._token is None else 'does not accept this token'}"
@@ -249,8 +249,8 @@ class Link:
             return LineDown(
                 f"{where} does not check this token: {connection.refusal}", hint="correct the token, and wait"
             )
-        if farewell:
-            return LineDown(f"{where} does not admit this program: {farewell}", hint=NO_PLACE)
+        if close_reason:
+            return LineDown(f"{where} does not admit this program: {close_reason}", hint=NO_PLACE)
         if connection is not None and isinstance(error, TimeoutError):
             what = f"the program that serves {where} did not reply within {CONNECT_WITHIN:g} s"
             return LineDown(what, hint="if it hangs, stop it, because it keeps the line for itself")
@@ -268,12 +268,12 @@ class Link:
         connection.say(text)
         return True
 
-    def _drop(self, asked: Asked) -> None:
+    def _drop(self, asked: PendingRequest) -> None:
         """Stop waiting for a request, and cancel it at the line."""
         if self._asked.pop(asked.number, None) is not None and asked.handed:
             self.tell("cancel", {"id": asked.number})
 
-    def _overdue(self, asked: Asked) -> None:
+    def _overdue(self, asked: PendingRequest) -> None:
         what = "the time of the request is over, and the program that owns the line did not reply"
         asked.lost(NoReply, what, "check whether that program is running")
         self._drop(asked)

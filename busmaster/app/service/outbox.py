@@ -9,7 +9,7 @@ from typing import Protocol
 from busmaster.bounds import MOST_UNREAD, MOST_WAITING
 
 
-class Way(Protocol):
+class MessageSink(Protocol):
     """What takes messages to the client."""
 
     @property
@@ -20,7 +20,7 @@ class Way(Protocol):
     def say(self, text: str, /) -> None: ...
 
 
-class _Letter:
+class _Message:
     __slots__ = ("key", "text")
 
     def __init__(self, text: str, key: Hashable = None) -> None:
@@ -35,60 +35,60 @@ class Outbox:
     the oldest beyond MOST_UNREAD are dropped. `on_drop` is called with their stream.
     """
 
-    def __init__(self, way: Way, on_drop: Callable[[Hashable], None]) -> None:
-        self._way = way
+    def __init__(self, sink: MessageSink, on_drop: Callable[[Hashable], None]) -> None:
+        self._sink = sink
         self._on_drop = on_drop
-        self._letters: OrderedDict[_Letter, None] = OrderedDict()  # one that is dropped is taken out from between
-        self._news: deque[_Letter] = deque()
-        self._latest: dict[Hashable, _Letter] = {}
+        self._messages: OrderedDict[_Message, None] = OrderedDict()  # one that is dropped is taken out from between
+        self._news: deque[_Message] = deque()
+        self._latest: dict[Hashable, _Message] = {}
 
     @property
     def waiting(self) -> int:
         """Return how many messages are not handed over yet."""
-        return len(self._letters)
+        return len(self._messages)
 
     @property
     def crowded(self) -> bool:
         """Return whether so many replies wait that no further requests of this client must be read."""
-        return len(self._letters) >= MOST_WAITING
+        return len(self._messages) >= MOST_WAITING
 
     def put(self, text: str) -> None:
         """Send a message that is never dropped."""
-        if self._letters or self._way.full:
-            self._letters[_Letter(text)] = None
+        if self._messages or self._sink.full:
+            self._messages[_Message(text)] = None
         else:
-            self._way.say(text)
+            self._sink.say(text)
 
     def put_latest(self, key: Hashable, text: str) -> None:
         """Send a message that replaces an earlier unsent one with the same key."""
-        letter = self._latest.get(key)
-        if letter is not None:
-            letter.text = text
-        elif self._letters or self._way.full:
-            self._latest[key] = letter = _Letter(text, key)
-            self._letters[letter] = None
+        message = self._latest.get(key)
+        if message is not None:
+            message.text = text
+        elif self._messages or self._sink.full:
+            self._latest[key] = message = _Message(text, key)
+            self._messages[message] = None
         else:
-            self._way.say(text)
+            self._sink.say(text)
 
     def put_news(self, key: Hashable, text: str) -> None:
         """Send a notification of a stream, unless the client does not keep up."""
-        if not self._letters and not self._way.full:
-            self._way.say(text)
+        if not self._messages and not self._sink.full:
+            self._sink.say(text)
             return
         while len(self._news) >= MOST_UNREAD:
             oldest = self._news.popleft()
-            del self._letters[oldest]
+            del self._messages[oldest]
             self._on_drop(oldest.key)
-        letter = _Letter(text, key)
-        self._news.append(letter)
-        self._letters[letter] = None
+        message = _Message(text, key)
+        self._news.append(message)
+        self._messages[message] = None
 
     def flush(self, *, last: bool = False) -> None:
         """Send waiting messages until the connection is full; with `last` all of them, because nothing follows."""
-        while self._letters and (last or not self._way.full):
-            letter, _ = self._letters.popitem(last=False)
-            if self._news and self._news[0] is letter:
+        while self._messages and (last or not self._sink.full):
+            message, _ = self._messages.popitem(last=False)
+            if self._news and self._news[0] is message:
                 self._news.popleft()
-            elif self._latest.get(letter.key) is letter:
-                del self._latest[letter.key]
-            self._way.say(letter.text)
+            elif self._latest.get(message.key) is message:
+                del self._latest[message.key]
+            self._sink.say(message.text)

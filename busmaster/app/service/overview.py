@@ -40,7 +40,7 @@ STATES = {LineState.OFFLINE: "offline", LineState.RESYNCHRONISING: "resynchronis
 """States with a text of their own; in every other state the line is ready."""
 
 
-class Journal:
+class EventLog:
     """The last events of a line, as sentences, for clients that connect later."""
 
     def __init__(self, bus: Bus) -> None:
@@ -113,7 +113,7 @@ class Overview(Broadcast):
         self,
         bus: Bus,
         authorisation: Authorisation,
-        journal: Journal,
+        journal: EventLog,
         title: Callable[[], str],
         on_end: Callable[[], None],
     ) -> None:

@@ -20,7 +20,7 @@ from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.app.service.remote_node import RemoteNode
 from busmaster.app.service.remote_overview import RemoteOverview
 from busmaster.app.service.safe import outcomes_of
-from busmaster.app.service.sequences import Room
+from busmaster.app.service.sequences import RequestLimit
 from busmaster.app.service.telling import (
     event_of,
     protocol_of,
@@ -97,7 +97,7 @@ class RemoteBus:
         self._planning = asyncio.Lock()
         self._count = 0
         self._sequences = 0
-        self.room = Room(self.now)
+        self.room = RequestLimit(self.now)
         """Limits the number of requests in progress."""
         self._touched: dict[tuple[str, int], float] = {}
         """When the last write to a node ended."""

@@ -11,7 +11,7 @@ from busmaster import Point, Sample
 from busmaster.app.service.link import Link
 from busmaster.app.service.messages import value_of, words
 from busmaster.app.service.reads import words_of
-from busmaster.app.service.sequences import HoldsLine, Room, held_remotely, shortened
+from busmaster.app.service.sequences import HoldsLine, RequestLimit, held_remotely, shortened
 from busmaster.app.service.telling import protocol_of
 from busmaster.errors import InvalidCommand
 from busmaster.ext import (
@@ -32,7 +32,7 @@ LEFT_OUT = ("verify", "safe")
 """Options without use on another's line. If they are given, they are false."""
 
 
-class Home(HoldsLine, Protocol):
+class RemoteLine(HoldsLine, Protocol):
     """The line of a remote node."""
 
     @property
@@ -42,7 +42,7 @@ class Home(HoldsLine, Protocol):
     def line(self) -> str: ...
 
     @property
-    def room(self) -> Room: ...
+    def room(self) -> RequestLimit: ...
 
     def opened(self, node: RemoteNode, command: Command[Any], /) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the line is entered."""
@@ -60,7 +60,7 @@ class Home(HoldsLine, Protocol):
 class RemoteNode:
     """One node of a line that another program owns. Handles and points work on it as on a node of this process."""
 
-    def __init__(self, bus: Home, profile: Profile, address: int) -> None:
+    def __init__(self, bus: RemoteLine, profile: Profile, address: int) -> None:
         self.stops = 0
         """Number of stops by any program since this one named the node."""
         self.label = profile.label(address)

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from busmaster import Priority
-from busmaster.app.service.errands import Asker, Errand, Writing, errand_of
+from busmaster.app.service.client_requests import ClientRequest, RequestSender, Writing, client_request_of
 from busmaster.app.service.failures import REFUSED, refusal_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import Malformed
@@ -23,16 +23,16 @@ class Requests:
 
     def __init__(
         self,
-        asker: Asker,
+        sender: RequestSender,
         line: ServedLine,
         answer: Callable[[int, Any], object],
         refuse: Callable[[int, Exception], object],
     ) -> None:
-        self._asker = asker
+        self._sender = sender
         self._line = line
         self._answer = answer
         self._refuse = refuse
-        self._under_way: dict[int, Errand | None] = {}
+        self._under_way: dict[int, ClientRequest | None] = {}
         """Requests without a reply, by number. None is the safe state, which is being sent."""
         self._log = logging.getLogger("busmaster.app.service")
 
@@ -42,9 +42,9 @@ class Requests:
             raise Malformed(f"request {number} is already in progress; use another number")
 
     @property
-    def errands(self) -> tuple[Errand, ...]:
+    def unfinished(self) -> tuple[ClientRequest, ...]:
         """Return the requests at its nodes."""
-        return tuple(errand for errand in self._under_way.values() if errand is not None)
+        return tuple(request for request in self._under_way.values() if request is not None)
 
     @property
     def sends_safe_state(self) -> bool:
@@ -59,8 +59,8 @@ class Requests:
         try:
             if len(under_way) >= MOST_REQUESTS:
                 self._check_room(said)
-            under_way[number] = errand = errand_of(said, self._asker, self._line)
-            errand.begin(partial(self._ended, number))
+            under_way[number] = request = client_request_of(said, self._sender, self._line)
+            request.begin(partial(self._ended, number))
         except REFUSED as error:
             under_way.pop(number, None)
             self._refuse(number, refusal_of("request", error))
@@ -70,7 +70,7 @@ class Requests:
         self.check_number(number)
         try:
             self._check_room({})
-            sending = self._line.safe_wishes.begin(params["writes"], self._asker.peer)
+            sending = self._line.safe_wishes.begin(params["writes"], self._sender.peer)
         except REFUSED as error:
             self._refuse(number, refusal_of("safe", error))
         else:
@@ -79,23 +79,23 @@ class Requests:
 
     def cancel(self, number: object) -> None:
         """Cancel a command; it gets no reply. An unknown number is ignored."""
-        errand = self._under_way.get(number)  # type: ignore[call-overload]  # a program can send anything
-        if errand is not None:
-            errand.cancel()
+        request = self._under_way.get(number)  # type: ignore[call-overload]  # a program can send anything
+        if request is not None:
+            request.cancel()
 
     def end(self) -> None:
         """Send the result of all requests, because the service ends, and perhaps the bus too."""
-        for number, errand in list(self._under_way.items()):
-            if errand is not None:
-                errand.cancel()
-                self._refuse(number, _untold(errand, BusClosed, "the program that owns the line ends"))
+        for number, request in list(self._under_way.items()):
+            if request is not None:
+                request.cancel()
+                self._refuse(number, _unreported(request, BusClosed, "the program that owns the line ends"))
 
     async def give_up(self) -> None:
         """Cancel all requests, and return when they have ended. The safe state continues."""
-        for errand in self.errands:
-            errand.cancel()
+        for request in self.unfinished:
+            request.cancel()
         while doing := [
-            errand.doing for errand in self.errands if isinstance(errand, Writing) and errand.doing is not None
+            request.doing for request in self.unfinished if isinstance(request, Writing) and request.doing is not None
         ]:
             await asyncio.wait(doing)
 
@@ -106,9 +106,9 @@ class Requests:
         if waiting >= MOST_REQUESTS and not (_is_urgent(said) and waiting < MOST_REQUESTS + MOST_URGENT):
             raise BacklogFull(f"{waiting} requests of this program have no reply yet")
 
-    def _ended(self, number: int, errand: Errand, value: Any, error: BaseException | None) -> None:
+    def _ended(self, number: int, request: ClientRequest, value: Any, error: BaseException | None) -> None:
         del self._under_way[number]
-        if errand.given_up:
+        if request.given_up:
             return
         try:
             if error is not None:
@@ -117,9 +117,9 @@ class Requests:
         except (BusError, InvalidCommand) as refusal:
             self._refuse(number, refusal)
         except Exception as bug:  # an error of a protocol: the client gets it, and the line continues
-            self._log.exception("a request of %s failed", self._asker.peer)
+            self._log.exception("a request of %s failed", self._sender.peer)
             what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
-            self._refuse(number, _untold(errand, BusError, what))
+            self._refuse(number, _unreported(request, BusError, what))
 
     def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
         del self._under_way[number]
@@ -130,11 +130,11 @@ class Requests:
             self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
 
 
-def _untold(errand: Errand, kind: type[BusError], what: str) -> BusError:
+def _unreported(request: ClientRequest, kind: type[BusError], what: str) -> BusError:
     """Return the error for a request whose result is unknown: `kind`, unless it may have written."""
-    if errand.command.writes and errand.sent:
+    if request.command.writes and request.sent:
         kind = WriteUnconfirmed
-    return kind(what, node=errand.node, command=str(errand.command))
+    return kind(what, node=request.node, command=str(request.command))
 
 
 def _is_urgent(said: Mapping[str, Any] | PlainRead) -> bool:

@@ -12,7 +12,7 @@ from busmaster.app.service.peers import Peer
 from busmaster.errors import BusError, InvalidCommand
 
 
-class SafeWishes:
+class SafeStateRequests:
     """Sends the safe state. Once begun, it continues, even if the requesting program disconnects."""
 
     def __init__(self, authorisation: Authorisation) -> None:

@@ -16,7 +16,7 @@ from busmaster.ext import Command, CommandOptions, HeldNode, Requester, RequestO
 T = TypeVar("T")
 
 
-class Room:
+class RequestLimit:
     """Limits the number of a program's requests in progress. Others wait here in their order, within their limits."""
 
     def __init__(self, now: Callable[[], float]) -> None:

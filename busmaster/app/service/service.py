@@ -20,6 +20,7 @@ from busmaster import Bus, ext
 from busmaster.app.service.admission import Admission, ConnectionRate, connecting_peer, stranger_to_close
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client import Client
+from busmaster.app.service.client_connection import ClientConnection, MessageOrder
 from busmaster.app.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.app.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
 from busmaster.app.service.line import ServedLine
@@ -30,7 +31,6 @@ from busmaster.app.service.peers import Holder, Peer, find_name, process_of
 from busmaster.app.service.refusals import SERVICE, Logins, wait_text
 from busmaster.app.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 from busmaster.app.service.telling import listed_groups
-from busmaster.app.service.visit import Reception, Visit
 from busmaster.errors import InvalidCommand
 from busmaster.ext import LEAST_SHARE, MOST_SHARE, NodeRecord
 from busmaster.registry import protocols
@@ -90,8 +90,8 @@ class Service:
         self._listen = listen
         self._served: ServedSocket
         self._servers: list[asyncio.Server] = []
-        self._clients: dict[Client, Visit] = {}
-        self._strangers: dict[Visit, None] = {}
+        self._clients: dict[Client, ClientConnection] = {}
+        self._strangers: dict[ClientConnection, None] = {}
         """Connections without a first message, the oldest first."""
         self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
@@ -101,7 +101,7 @@ class Service:
         self._log = logging.getLogger("busmaster.app.service")
         self.tell: Callable[[str], None] = self._log.warning
         """Called, at most once a minute, with a text about refused connections and logins."""
-        self.reception = Reception()
+        self.message_order = MessageOrder()
         self._groups_sent = -inf
         self._groups_timer: asyncio.TimerHandle | None = None
 
@@ -180,18 +180,18 @@ class Service:
         await self.line.safe_wishes.close()
         for server in self._servers:
             server.close()
-        visits = [*self._clients.values(), *self._strangers]
+        connections = [*self._clients.values(), *self._strangers]
         for client in self._clients:
             client.release()
-        for visit in visits:
-            visit.bid_farewell()
+        for connection in connections:
+            connection.end()
         try:
-            await _closed(visits)
+            await _closed(connections)
         finally:
-            for visit in visits:
-                visit.connection.abort()
+            for connection in connections:
+                connection.websocket.abort()
             try:
-                await _closed(visits)
+                await _closed(connections)
                 while self._leaving:
                     await asyncio.wait(self._leaving)
             finally:
@@ -237,18 +237,18 @@ class Service:
         """Serve a socket. One connection is accepted in a turn of the loop; the kernel queues the others."""
         loop = asyncio.get_running_loop()
         serve: Any = loop.create_unix_server if opened.family == socket.AF_UNIX else loop.create_server
-        server: asyncio.Server = await serve(self._visited, sock=opened, backlog=1)
+        server: asyncio.Server = await serve(self._connected, sock=opened, backlog=1)
         opened.listen(MOST_WAITING_TO_CONNECT)
         return server
 
-    def _visited(self) -> asyncio.BaseProtocol:
+    def _connected(self) -> asyncio.BaseProtocol:
         """Return the end of a new connection, and close the oldest one if there are too many."""
         if (one_too_many := stranger_to_close(self._strangers)) is not None:
             self.refused += 1
-            one_too_many.connection.abort()
-        visit = Visit(self)
-        self._strangers[visit] = None
-        return visit.connection
+            one_too_many.websocket.abort()
+        connection = ClientConnection(self)
+        self._strangers[connection] = None
+        return connection.websocket
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
         """Return after how many seconds the connection is read; None if it is closed, which is counted."""
@@ -258,21 +258,24 @@ class Service:
             self.authorisation.refusals.note_rate(origin if isinstance(origin, str) else f"user {origin}")
         return delay
 
-    def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
+    def refusal(self, connection: ClientConnection, request: Request, /) -> tuple[int, str] | None:
         """Store the peer. Refuse possible requests of web pages, missing or wrong tokens, and one connection too many.
 
         An Origin is refused by the library.
         """
-        refusal = self._refusal(visit, request.headers)
+        refusal = self._refusal(connection, request.headers)
         if refusal is not None:
             self.refused += 1
         return refusal
 
-    def _refusal(self, visit: Visit, headers: Headers) -> tuple[int, str] | None:
+    def _refusal(self, connection: ClientConnection, headers: Headers) -> tuple[int, str] | None:
         hosts, shown = headers.get_all("Host"), headers.get_all("Authorization")
         if len(hosts) != 1 or not self._is_our_name(hosts[0]):
             return HTTPStatus.FORBIDDEN, f"no such host: {', '.join(hosts)[:40]!r}\n"
-        peer, origin = self._peer(visit.connection.transport.get_extra_info("socket"), shown), visit.connection.origin
+        peer, origin = (
+            self._peer(connection.websocket.transport.get_extra_info("socket"), shown),
+            connection.websocket.origin,
+        )
         if shown and isinstance(origin, str):  # by TCP
             wait = self._logins.judge(origin, peer.token if isinstance(peer, Holder) else None)
             if wait:
@@ -283,7 +286,7 @@ class Service:
         # A program that may write declares in `hello` whether it only sends the safe state, which has reserved places.
         if not permission.writes and (refusal := self._admission.refusal(permission, self._clients)):
             return HTTPStatus.SERVICE_UNAVAILABLE, f"{refusal}\n"
-        visit.peer = peer
+        connection.peer = peer
         return None
 
     def _is_our_name(self, host: str) -> bool:
@@ -297,13 +300,13 @@ class Service:
 
     def _tell_access(self) -> None:
         """Disconnect clients whose token is not valid any more, and send the others their permission."""
-        for client, visit in self._clients.items():
+        for client, connection in self._clients.items():
             if client.peer.may_stay(self.authorisation.access):
                 client.tell_access()
             else:
-                visit.connection.abort()
+                connection.websocket.abort()
 
-    def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
+    def admit(self, connection: ClientConnection, said: Mapping[str, Any], /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
         params = said.get("params", {})
         wanted = params.get("versions") if isinstance(params, dict) else None
@@ -316,35 +319,35 @@ class Service:
                 "update the older of the two programs",
                 INVALID_PARAMS,
             )
-        if not visit.peer.may_stay(self.authorisation.access):
+        if not connection.peer.may_stay(self.authorisation.access):
             raise Malformed("this token is not valid any more")
-        permission, safe_only = visit.peer.permission(self.authorisation.access), params.get("safe_only") is True
+        permission, safe_only = connection.peer.permission(self.authorisation.access), params.get("safe_only") is True
         in_safe_place = self._admission.admit(permission, self._clients, safe_only=safe_only)
 
         def drop(stream: object) -> None:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
 
         self._count += 1
-        outbox = Outbox(visit.connection, drop)
-        client = Client(self.line, visit.peer, self._count, outbox, in_safe_place=in_safe_place)
-        del self._strangers[visit]
-        self._clients[client] = visit
+        outbox = Outbox(connection.websocket, drop)
+        client = Client(self.line, connection.peer, self._count, outbox, in_safe_place=in_safe_place)
+        del self._strangers[connection]
+        self._clients[client] = connection
         client.outbox.put(written({"id": said.get("id"), "result": self._about(client, max(common))}))
         return client
 
-    def send_away(self, visit: Visit, /) -> None:
+    def count_rejected(self, connection: ClientConnection, /) -> None:
         """Count a connection that was closed because of an invalid or missing message."""
         self.refused += 1
 
-    def over(self, visit: Visit, /) -> None:
+    def ended(self, connection: ClientConnection, /) -> None:
         """End the requests of a program whose connection is over."""
-        self._strangers.pop(visit, None)
-        if visit.client is not None:
-            leaving = asyncio.ensure_future(self._see_off(visit.client))
+        self._strangers.pop(connection, None)
+        if connection.client is not None:
+            leaving = asyncio.ensure_future(self._end_client(connection.client))
             self._leaving.add(leaving)
             leaving.add_done_callback(self._leaving.discard)
 
-    async def _see_off(self, client: Client) -> None:
+    async def _end_client(self, client: Client) -> None:
         try:
             await client.leave()
         finally:
@@ -383,9 +386,9 @@ class Service:
         }
 
 
-async def _closed(visits: Iterable[Visit]) -> None:
+async def _closed(connections: Iterable[ClientConnection]) -> None:
     """Wait until connections are over, for CLOSE_WITHIN: there may be one that does not listen."""
     with suppress(TimeoutError):
         async with asyncio.timeout(CLOSE_WITHIN):
-            for visit in visits:
-                await visit.connection.closed()
+            for connection in connections:
+                await connection.websocket.closed()

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import pytest
 
-from busmaster.app.service.authorisation import FRESH, Authorisation, Wish, outcome_of
+from busmaster.app.service.authorisation import FRESH, Authorisation, WriteRequest, outcome_of
 from busmaster.app.service.record import Outcome, WriteRecord
 from busmaster.bounds import MOST_AT_ONCE
 from busmaster.bus.bus import Bus
@@ -52,21 +52,23 @@ def at_the_authorisation(story: Story) -> None:
     run_in_virtual_time(run())
 
 
-def wish(controller: Hcp2Controller, element: int, interface: str = "mqtt") -> Wish:
-    return Wish(interface=interface, by="a test", name=f"5/{element}", point=controller.point(str(element)), value=1)
+def request(controller: Hcp2Controller, element: int, interface: str = "mqtt") -> WriteRequest:
+    return WriteRequest(
+        interface=interface, by="a test", name=f"5/{element}", point=controller.point(str(element)), value=1
+    )
 
 
 def test_one_interface_cannot_fill_the_line_and_another_is_not_held_up_by_it() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
-        writes = [authorisation.write(wish(controller, element)) for element in range(1, MOST_AT_ONCE + 4)]
-        *ended, other = await asyncio.gather(*writes, authorisation.write(wish(controller, 30, interface="screen")))
+        writes = [authorisation.write(request(controller, element)) for element in range(1, MOST_AT_ONCE + 4)]
+        *ended, other = await asyncio.gather(*writes, authorisation.write(request(controller, 30, interface="screen")))
         refused = [record for record in ended if not record.ok]
         assert [record.point for record in refused] == ["5/17", "5/18", "5/19"]
         assert {record.error for record in refused} == {
             f"{MOST_AT_ONCE} commands are already being written; wait for them"
         }
         assert other.ok
-        assert (await authorisation.write(wish(controller, 1))).ok  # they are over
+        assert (await authorisation.write(request(controller, 1))).ok  # they are over
         assert len(records) == MOST_AT_ONCE + 5
 
     at_the_authorisation(story)
@@ -74,7 +76,7 @@ def test_one_interface_cannot_fill_the_line_and_another_is_not_held_up_by_it() -
 
 def test_a_write_whose_writer_is_cancelled_is_on_record_as_unconfirmed() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
-        writing = asyncio.ensure_future(authorisation.write(wish(controller, 1)))
+        writing = asyncio.ensure_future(authorisation.write(request(controller, 1)))
         await asyncio.sleep(0)
         writing.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -90,9 +92,9 @@ def test_a_write_whose_writer_is_cancelled_is_on_record_as_unconfirmed() -> None
 
 def test_what_this_process_wishes_itself_is_on_record_and_raises_on() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
-        with authorisation.begin(wish(controller, 1, interface="safe")):
+        with authorisation.begin(request(controller, 1, interface="safe")):
             await controller.write(1, 1)
-        with pytest.raises(InvalidCommand), authorisation.begin(wish(controller, 2)):
+        with pytest.raises(InvalidCommand), authorisation.begin(request(controller, 2)):
             await controller.write(2, float("nan"))
         assert [(record.point, record.outcome) for record in records] == [
             ("5/1", Outcome.WRITTEN),
@@ -108,7 +110,7 @@ def test_what_is_refused_unread_is_on_record_as_it_came_with_the_value_before_it
         await point.write(5)
         await anext(aiter(authorisation.bus.poll_group("all", period=1, points=[point])))
         for sent in (b"true", "ä".encode(), b"\x1b[2J", b"\xff"):
-            authorisation.refuse(replace(wish(controller, 1), value=sent), "it is no number")
+            authorisation.refuse(replace(request(controller, 1), value=sent), "it is no number")
         assert [record.value for record in records] == ["true", "ä", r"\x1b[2J", "\ufffd"]
         assert {record.before for record in records} == {5}
 
@@ -118,13 +120,15 @@ def test_what_is_refused_unread_is_on_record_as_it_came_with_the_value_before_it
 def test_of_nonsense_its_beginning_is_kept_and_how_long_it_was() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         for sent in ("x" * 60_000, (1,) * 8_000, 10**299, b"x" * 4_096):
-            authorisation.refuse(replace(wish(controller, 1), value=sent, by="b" * 300, name="n" * 300), "e" * 60_000)
+            authorisation.refuse(
+                replace(request(controller, 1), value=sent, by="b" * 300, name="n" * 300), "e" * 60_000
+            )
         for record, length in zip(records, (60_002, 24_000, 300, 4_096), strict=True):
             assert record.value[200:] == f"... ({length} characters)"
             assert record.error == f"{'e' * 200}... (60000 characters)"
             assert (record.by, record.point) == (f"{'b' * 200}... (300 characters)", f"{'n' * 200}... (300 characters)")
             assert len(record.text) < 1_200
-        authorisation.refuse(replace(wish(controller, 1), value=10**99), "too large")
+        authorisation.refuse(replace(request(controller, 1), value=10**99), "too large")
         assert records[-1].value == 10**99
 
     at_the_authorisation(story)
@@ -154,11 +158,13 @@ def test_the_value_before_is_known_by_whatever_name_it_was_polled(
             point = unit.point(written)
             value = (1,) * len(before) if isinstance(before, tuple) else (1, 2, 3) if written == "holding:10:3" else 1
             for _ in range(2):
-                await authorisation.write(Wish(interface="mqtt", by="a test", name=point.key, point=point, value=value))
+                await authorisation.write(
+                    WriteRequest(interface="mqtt", by="a test", name=point.key, point=point, value=value)
+                )
             assert [(record.ok, record.before) for record in records] == [(True, before), (True, None)]
             await anext(aiter(group))
             authorisation.refuse(
-                Wish(interface="mqtt", by="a test", name=point.key, point=point, value=value), "a test"
+                WriteRequest(interface="mqtt", by="a test", name=point.key, point=point, value=value), "a test"
             )
             assert records[-1].before == (value if before is not None else None)
 
@@ -213,25 +219,25 @@ def test_writes_that_fail_give_their_places_back() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         absent = Hcp2Controller(authorisation.bus, ABSENT)
         for _ in range(MOST_AT_ONCE):
-            await authorisation.write(wish(absent, 1))
+            await authorisation.write(request(absent, 1))
         refused = Hcp2Controller(authorisation.bus, 5).point("1")
         refused.limit(maximum=0)
         for _ in range(MOST_AT_ONCE):
-            await authorisation.write(wish(controller, 1))
+            await authorisation.write(request(controller, 1))
         assert not any(record.ok for record in records)
-        assert (await authorisation.write(wish(controller, 2))).ok
+        assert (await authorisation.write(request(controller, 2))).ok
 
     at_the_authorisation(story)
 
 
 def test_writes_whose_writers_are_cancelled_give_their_places_back() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
-        writing = [asyncio.ensure_future(authorisation.write(wish(controller, 1))) for _ in range(MOST_AT_ONCE)]
+        writing = [asyncio.ensure_future(authorisation.write(request(controller, 1))) for _ in range(MOST_AT_ONCE)]
         await asyncio.sleep(0)
         for one in writing:
             one.cancel()
         await asyncio.gather(*writing, return_exceptions=True)
-        assert (await authorisation.write(wish(controller, 2))).ok
+        assert (await authorisation.write(request(controller, 2))).ok
 
     at_the_authorisation(story)
 
@@ -239,11 +245,11 @@ def test_writes_whose_writers_are_cancelled_give_their_places_back() -> None:
 def test_a_line_that_is_left_or_read_only_lets_no_write_through() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         authorisation.leaving = True
-        assert (await authorisation.write(wish(controller, 1))).error == "the line is closing; nothing was sent"
+        assert (await authorisation.write(request(controller, 1))).error == "the line is closing; nothing was sent"
         authorisation.leaving, authorisation.read_only = False, True
-        assert (await authorisation.write(wish(controller, 1))).error == "this line is read-only"
+        assert (await authorisation.write(request(controller, 1))).error == "this line is read-only"
         authorisation.read_only = False
-        assert (await authorisation.write(wish(controller, 1))).ok
+        assert (await authorisation.write(request(controller, 1))).ok
         outcomes = [record.outcome for record in records]
         assert outcomes == [Outcome.REFUSED, Outcome.REFUSED, Outcome.WRITTEN]
 
@@ -255,16 +261,16 @@ def test_a_command_waits_for_the_line_as_long_as_it_is_fresh_and_its_age_counts(
         async with busy(authorisation):
             began = authorisation.bus.now()
             new, old = (
-                authorisation.write(replace(wish(controller, 1), arrived=began - age)) for age in (0.0, FRESH / 2)
+                authorisation.write(replace(request(controller, 1), arrived=began - age)) for age in (0.0, FRESH / 2)
             )
             ended = asyncio.ensure_future(old)
             assert (await new).outcome is Outcome.NOT_STARTED
             assert authorisation.bus.now() - began == pytest.approx(FRESH, abs=0.001)
             assert ended.result().took == pytest.approx(FRESH / 2, abs=0.001)
             assert ended.result().outcome is Outcome.NOT_STARTED
-        too_old = await authorisation.write(replace(wish(controller, 1), arrived=authorisation.bus.now() - FRESH))
+        too_old = await authorisation.write(replace(request(controller, 1), arrived=authorisation.bus.now() - FRESH))
         assert (too_old.outcome, too_old.error) == (Outcome.REFUSED, "the command has expired; nothing was sent")
-        assert (await authorisation.write(replace(wish(controller, 1), arrived=authorisation.bus.now()))).ok
+        assert (await authorisation.write(replace(request(controller, 1), arrived=authorisation.bus.now()))).ok
 
     at_the_authorisation(story)
 
@@ -274,7 +280,7 @@ def test_a_command_that_says_until_when_it_is_meant_is_held_to_that_alone(monkey
     monkeypatch.setattr(time, "time", lambda: today)
 
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
-        old = replace(wish(controller, 1), arrived=authorisation.bus.now() - 10 * FRESH)
+        old = replace(request(controller, 1), arrived=authorisation.bus.now() - 10 * FRESH)
         assert (await authorisation.write(replace(old, expires=today + FRESH))).ok
         assert (
             await authorisation.write(replace(old, expires=today))
@@ -294,10 +300,10 @@ def test_the_log_says_how_a_write_ended_and_warns_of_one_that_is_unconfirmed(
 
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         began = authorisation.bus.now()
-        await authorisation.write(replace(wish(Hcp2Controller(authorisation.bus, ABSENT), 1), id="a1"))
+        await authorisation.write(replace(request(Hcp2Controller(authorisation.bus, ABSENT), 1), id="a1"))
         assert records[0].took == authorisation.bus.now() - began > 0
-        await authorisation.write(wish(controller, 1))
-        authorisation.refuse(wish(controller, 1), "no")
+        await authorisation.write(request(controller, 1))
+        authorisation.refuse(request(controller, 1), "no")
         audit = [record for record in caplog.records if record.name == "busmaster.audit"]
         assert [record.levelno for record in audit] == [logging.WARNING, logging.INFO, logging.INFO]
         assert f"unconfirmed in {records[0].took:.3f} s by mqtt a test [a1], " in audit[0].message
@@ -313,7 +319,7 @@ def test_a_user_without_a_name_is_on_record_by_number(monkeypatch: pytest.Monkey
     monkeypatch.setattr(os, "getuid", lambda: 12345)
 
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
-        await authorisation.write(wish(controller, 1))
+        await authorisation.write(request(controller, 1))
         assert (records[0].user, records[0].process) == ("12345", os.getpid())
 
     at_the_authorisation(story)

@@ -11,7 +11,7 @@ import pytest
 from busmaster.app.cli import audit_log
 from busmaster.app.cli.audit_log import NAME, AuditLog
 from busmaster.app.cli.output import Level
-from busmaster.app.service.authorisation import Authorisation, Wish
+from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
@@ -44,15 +44,15 @@ class Printed:
 def printed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Printed]:
     printed = Printed()
     monkeypatch.setattr(audit_log, "note", printed.note)
-    monkeypatch.setattr(audit_log, "FAREWELL", PATIENCE)
+    monkeypatch.setattr(audit_log, "CLOSE_WITHIN", PATIENCE)
     yield printed
     printed.goes_on.set()  # the thread ends, whatever the test did
 
 
 def write(authorisation: Authorisation, name: str, error: BaseException | None = None) -> None:
-    authorisation.begin(Wish(interface="mqtt", by="line/set/" + name, name=name, point=None, value=7, id="a1")).end(
-        error
-    )
+    authorisation.begin(
+        WriteRequest(interface="mqtt", by="line/set/" + name, name=name, point=None, value=7, id="a1")
+    ).end(error)
 
 
 def test_each_write_is_a_line_and_one_that_is_unconfirmed_a_warning(

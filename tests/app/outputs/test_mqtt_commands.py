@@ -20,7 +20,7 @@ from busmaster.app.outputs.mqtt_commands import LEAST, Commands
 from busmaster.app.outputs.mqtt_connection import unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
-from busmaster.app.service.authorisation import Authorisation, Wish
+from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.record import Outcome, WriteRecord
 from busmaster.bounds import MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.bus import Bus
@@ -439,7 +439,7 @@ def test_what_came_while_we_stood_still_is_as_old_as_the_standstill() -> None:
     commands.look(2 * len("line/set/5/1" + "1") + 20)  # with acknowledgements of ours among it
     for payload in (b"1", b"2"):
         commands.arrive(cast("Message", Arrived(payload)))
-    assert [wish.arrived for wish in commands.queued] == [10.0, 10.0]
+    assert [request.arrived for request in commands.queued] == [10.0, 10.0]
     clock[0] = 15.02
     commands.look(0)
     clock[0] = 15.03
@@ -483,21 +483,21 @@ async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> N
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
     commands = Commands("line", Authorisation(bus), {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: 0.0)
     kept: list[tuple[Any, str]] = []
-    under_way: list[Wish] = []
+    under_way: list[WriteRequest] = []
     for number in range(MOST_AT_ONCE + 2):
         commands.arrive(cast("Message", Arrived(str(number).encode())))
     for refused in (b"on", b"off"):
         commands.arrive(cast("Message", Arrived(refused)))
 
-    async def write(wish: Wish) -> WriteRecord:
-        under_way.append(wish)
+    async def write(request: WriteRequest) -> WriteRecord:
+        under_way.append(request)
         return await asyncio.Future()
 
     async def say(_: object) -> None:
         await asyncio.Future()
 
-    def keep(wish: Wish, why: str) -> None:
-        kept.append((wish.value, why))
+    def keep(request: WriteRequest, why: str) -> None:
+        kept.append((request.value, why))
 
     serving = asyncio.ensure_future(commands.serve(write, keep, say, lambda: 0))
     await until(lambda: len(under_way) == MOST_AT_ONCE and len(kept) == 1)

@@ -18,7 +18,7 @@ HELLO = 0
 @pytest.fixture(autouse=True)
 def _unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may take longer over a write than that is fresh: a test that asks for just this says its age."""
-    for interface in ("busmaster.app.service.errands", "busmaster.app.service.authorisation"):
+    for interface in ("busmaster.app.service.client_requests", "busmaster.app.service.authorisation"):
         monkeypatch.setattr(f"{interface}.FRESH", PATIENCE)
     monkeypatch.setattr("busmaster.app.service.remote_overview.SOON", PATIENCE)
 
@@ -36,7 +36,7 @@ def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         except schema.ValidationError as error:
             wrong.append(f"{said!r:.400}: {error.message:.400}")
 
-    def asked_for(self: link.Link, question: str, *arguments: Any, **options: Any) -> link.Asked:
+    def asked_for(self: link.Link, question: str, *arguments: Any, **options: Any) -> link.PendingRequest:
         request = put(self, question, *arguments, **options)
         asked[self, request.number] = schema.heard(numbered(question, request.number))["method"]
         return request

@@ -43,7 +43,7 @@ class Served:
 
     async def sent(self) -> None:
         """Wait until a request of a program is on the wire, or was."""
-        await until(lambda: any(one.sent for client in self.service.clients for one in client.errands))
+        await until(lambda: any(one.sent for client in self.service.clients for one in client.unfinished))
 
     async def alone(self) -> None:
         """Wait until no program is connected."""

@@ -14,10 +14,10 @@ from websockets.exceptions import ConnectionClosed
 
 from busmaster import Hcp2Controller, bounds, connect
 from busmaster.app.service.admission import ConnectionRate, connecting_peer, stranger_to_close
+from busmaster.app.service.client_connection import ClientConnection
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.refusals import LimitedReport, Refusals
 from busmaster.app.service.rights import RIGHTS, Role
-from busmaster.app.service.visit import Visit
 from busmaster.errors import LineDown
 from busmaster.testing import run_in_virtual_time
 from tests.app.service.lines import Served, raw, served, until
@@ -221,7 +221,7 @@ def test_who_opens_many_connections_and_says_nothing_closes_its_own(tmp_path: Pa
         many = [await asyncio.open_connection(host, int(port)) for _ in range(bounds.FREE_CONNECTIONS)]
         await until(lambda: service.refused == bounds.FREE_CONNECTIONS - bounds.MOST_STRANGERS + 1)
         assert service.strangers == bounds.MOST_STRANGERS
-        assert os.getuid() in {visit.connection.origin for visit in service._strangers}
+        assert os.getuid() in {connection.websocket.origin for connection in service._strangers}
         own[1].write(b"x\r\n\r\n")  # it is still heard
         await own[0].read()
         for _, writer in (own, *many):
@@ -232,9 +232,9 @@ def test_who_opens_many_connections_and_says_nothing_closes_its_own(tmp_path: Pa
 
 def test_of_strangers_the_oldest_of_the_crowd_is_closed_once_there_are_too_many() -> None:
     def stranger(origin: str) -> Any:
-        visit = Visit.__new__(Visit)
-        visit.connection = type("Connection", (), {"origin": origin})()
-        return visit
+        connection = ClientConnection.__new__(ClientConnection)
+        connection.websocket = type("Connection", (), {"origin": origin})()
+        return connection
 
     one, *crowd = [stranger("alone"), *(stranger("crowd") for _ in range(bounds.MOST_STRANGERS - 2))]
     assert stranger_to_close([one, *crowd]) is None

@@ -322,7 +322,7 @@ def test_a_program_that_does_not_read_its_answers_is_not_read_either(
     async def story(line: Served) -> None:
         async with raw(line) as client:
             [visitor] = line.service.clients
-            connection = line.service._clients[visitor].connection
+            connection = line.service._clients[visitor].websocket
             connection.full = True
             for number in range(5):
                 await client.say(id=number, method="groups", params={})

@@ -14,9 +14,9 @@ from websockets.exceptions import ConnectionClosed
 
 from busmaster import Hcp2Controller, RemoteBus, bounds, connect
 from busmaster.app.service.client import Client
+from busmaster.app.service.client_connection import READ_AT_ONCE, ClientConnection, MessageOrder
 from busmaster.app.service.folder import Owner, ServedSocket
 from busmaster.app.service.outbox import Outbox
-from busmaster.app.service.visit import READ_AT_ONCE, Reception, Visit
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 from tests.app.service.lines import ABSENT, Served, SlowWay, on_a_line, on_a_served_line, raw, served, until
@@ -39,7 +39,7 @@ def test_a_write_that_is_given_up_before_its_first_step_is_on_record_and_leaves_
         command = {"command": "write", "element": 1, "values": [7.0]}
         client.take({"id": 70, "method": "request", "params": {"protocol": "hcp2", "address": 5, "command": command}})
         client.take({"method": "cancel", "params": {"id": 70}})
-        await until(lambda: not client.errands)
+        await until(lambda: not client.unfinished)
         assert line.audit() == [("5/write element 1 = 7", "not started")]
         assert await Hcp2Controller(line.bus, 5).read(1) == 0
 
@@ -131,15 +131,15 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
         count()
         await remote.statistics()
         taken.clear()
-        [visit] = line.service._clients.values()
+        [connection] = line.service._clients.values()
         sizes: list[int] = []
-        receive = visit.connection.buffer_updated
+        receive = connection.websocket.buffer_updated
 
         def received(count: int) -> None:
             sizes.append(count)
             receive(count)
 
-        monkeypatch.setattr(visit.connection, "buffer_updated", received)
+        monkeypatch.setattr(connection.websocket, "buffer_updated", received)
         for _ in range(100):
             remote.link.tell("end", {"stream": 7})
         await until(lambda: len(taken) >= 100)
@@ -171,13 +171,13 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lengths: list[int] = []
-    heard = Visit.heard
+    heard = ClientConnection.heard
 
-    def note(visit: Visit, message: str | bytes) -> None:
+    def note(connection: ClientConnection, message: str | bytes) -> None:
         lengths.append(len(message))
-        heard(visit, message)
+        heard(connection, message)
 
-    monkeypatch.setattr(Visit, "heard", note)
+    monkeypatch.setattr(ClientConnection, "heard", note)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]
@@ -218,7 +218,7 @@ def test_of_those_who_never_say_hello_the_oldest_goes_for_one_too_many(
 
 
 def test_one_that_says_nothing_for_ten_seconds_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("busmaster.app.service.visit.HELLO_WITHIN", 0.05)
+    monkeypatch.setattr("busmaster.app.service.client_connection.HELLO_WITHIN", 0.05)
 
     async def story(line: Served) -> None:
         async with raw(line, hello=False) as client:
@@ -263,15 +263,15 @@ def test_one_message_of_each_program_is_taken_before_the_second_of_any() -> None
             taken.append((self.name, turn))
             self.count -= 1
             if self.count:
-                reception.ask(self)  # type: ignore[arg-type]  # all of a visit that it asks for
+                message_order.ask(self)  # type: ignore[arg-type]  # all of a connection that it asks for
 
     taken: list[tuple[str, int]] = []
-    turn, reception = 0, Reception()
+    turn, message_order = 0, MessageOrder()
 
     async def run() -> None:
         nonlocal turn
         for name, count in (("first", 1), ("much", 4), ("some", 2), ("one", 1)):
-            reception.ask(Queue(name, count))  # type: ignore[arg-type]  # all of a client that is asked of it
+            message_order.ask(Queue(name, count))  # type: ignore[arg-type]  # all of a client that is asked of it
         for turn in range(1, 9):  # noqa: B007  it is looked at in `take`
             await asyncio.sleep(0)
 

@@ -186,8 +186,8 @@ def test_what_only_the_owner_can_reject_is_raised_where_the_group_is_iterated(tm
 def test_a_group_that_the_owner_never_accepted_raises_that_the_line_is_down(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         group = remote.poll_group("mine", period=60, points=[Hcp2Controller(remote, 5).point("1")])
-        [visit] = line.service._clients.values()
-        visit.connection.abort()
+        [connection] = line.service._clients.values()
+        connection.websocket.abort()
         with pytest.raises(LineDown):
             await anext(aiter(group))
         with pytest.raises(LineDown):

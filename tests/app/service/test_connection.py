@@ -15,7 +15,7 @@ from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 
 from busmaster.app.service import connection
-from busmaster.app.service.connection import AskingConnection, Connection, ServedConnection
+from busmaster.app.service.connection import Connection, IncomingConnection, OutgoingConnection
 from busmaster.app.service.frames import new_key, text_frame
 from busmaster.testing import run_in_virtual_time
 
@@ -92,8 +92,8 @@ def client() -> ClientProtocol:
     return ClientProtocol(parse_uri("ws://localhost/"))
 
 
-def served(ear: Ear) -> tuple[ServedConnection, Wire]:
-    end, wire = ServedConnection(ear, longest=LONGEST, read_at_once=512), Wire()
+def served(ear: Ear) -> tuple[IncomingConnection, Wire]:
+    end, wire = IncomingConnection(ear, longest=LONGEST, read_at_once=512), Wire()
     end.connection_made(wire)
     return end, wire
 
@@ -221,7 +221,7 @@ def test_one_that_is_silent_between_two_pings_is_let_go_and_one_that_is_not_read
 def test_one_who_asks_hears_why_it_is_refused() -> None:
     def story() -> None:
         ear, wire = Ear(), Wire()
-        end = AskingConnection(ear, masks=True, longest=LONGEST, read_at_once=512)
+        end = OutgoingConnection(ear, masks=True, longest=LONGEST, read_at_once=512)
         end.connection_made(wire)
         give(end, b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 3\r\n\r\nno\n", lambda: 7)
         end.eof_received()

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from busmaster import Hcp2Controller, RemoteBus
-from busmaster.app.service.exchanges import HEARD_AT_ONCE, MOST_BYTES, MOST_KEPT, Listener, said_passage
+from busmaster.app.service.exchanges import HEARD_AT_ONCE, MOST_BYTES, MOST_KEPT, Listener, exchange_to_json
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -134,7 +134,7 @@ def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
     for number in range(3):
         listener.received(1.5 + number, b"x" * MOST_BYTES, None)
     [_, passage], _ = listener.take()
-    told = json.loads(json.dumps(said_passage(passage)))
+    told = json.loads(json.dumps(exchange_to_json(passage)))
     check("unexpected", told)
     assert told == [[[1_500_000, "node", b"x".hex() * MOST_BYTES]], 3 * MOST_BYTES]
     assert listener.take() == ([], 0)

@@ -61,7 +61,7 @@ def test_a_program_that_asks_more_than_it_may_at_a_time_has_it_all_answered(tmp_
         async def look() -> None:
             nonlocal most
             while True:
-                most = max(most, *(len(client.errands) for client in line.service.clients))
+                most = max(most, *(len(client.unfinished) for client in line.service.clients))
                 await asyncio.sleep(0)
 
         looking = asyncio.ensure_future(look())
@@ -80,7 +80,7 @@ def test_requests_that_are_given_up_make_room_for_others(tmp_path: Path) -> None
         absent = Hcp2Controller(line.bus, ABSENT, timings=PATIENT)
         own = asyncio.ensure_future(absent.read(1))
         asked = [asyncio.ensure_future(controller.read(1)) for _ in range(MANY)]
-        await until(lambda: any(len(client.errands) == MOST_UNDER_WAY for client in line.service.clients))
+        await until(lambda: any(len(client.unfinished) == MOST_UNDER_WAY for client in line.service.clients))
         for one in asked:
             one.cancel()
         assert await asyncio.gather(*(controller.read(1) for _ in range(MOST_UNDER_WAY))) == [0] * MOST_UNDER_WAY
@@ -94,7 +94,7 @@ def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path
     async def story(line: Served, remote: RemoteBus) -> None:
         absent = Hcp2Controller(remote, ABSENT, timings=PATIENT)
         waiting = [asyncio.ensure_future(absent.read(1)) for _ in range(2 * MOST_UNDER_WAY)]
-        await until(lambda: any(len(client.errands) == MOST_UNDER_WAY for client in line.service.clients))
+        await until(lambda: any(len(client.unfinished) == MOST_UNDER_WAY for client in line.service.clients))
         with pytest.raises(NotStarted, match="of this program have no reply yet"):
             await Hcp2Controller(remote, 5).write(1, 7, finish_within=0.01)
         await given_up(waiting)
@@ -107,7 +107,7 @@ def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Pa
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
         flood = [asyncio.ensure_future(controller.read(1)) for _ in range(MANY)]
-        await until(lambda: line.service.clients[0].errands)
+        await until(lambda: line.service.clients[0].unfinished)
         await controller.write(2, 3, priority=Priority.URGENT)
         assert not flood[-1].done()
         await given_up(flood)

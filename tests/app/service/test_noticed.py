@@ -19,8 +19,8 @@ from busmaster.emulator.line import Line
 from busmaster.errors import LineDown, NoReply, WriteUnconfirmed
 from busmaster.registry import make_device
 from tests.app.service.lines import Served, on_a_line, served, until
-from tests.app.service.test_safe_wishes import BOTH, TEXT
-from tests.app.service.test_safe_wishes import on_a_line as on_a_safe_line
+from tests.app.service.test_safe_state_requests import BOTH, TEXT
+from tests.app.service.test_safe_state_requests import on_a_line as on_a_safe_line
 from tests.patience import PATIENCE
 
 

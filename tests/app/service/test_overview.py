@@ -252,8 +252,8 @@ def test_the_end_of_the_owner_and_a_lost_connection_are_told_apart(tmp_path: Pat
         async with connect(line.address) as second:
             lost = await second.overview(Picture().hear)
             await until(lambda: len(line.service.clients) == 2)
-            visit = list(line.service._clients.values())[1]
-            visit.connection.abort()
+            connection = list(line.service._clients.values())[1]
+            connection.websocket.abort()
             with pytest.raises(LineDown, match="was lost"):
                 await lost.over()
         await line.service.__aexit__(None, None, None)
@@ -278,7 +278,7 @@ def test_one_that_does_not_read_sees_fewer_pictures_and_no_other_fewer(tmp_path:
         async with raw(line) as stuck:
             await stuck.ask("overview", stream=3)
             client = line.service.clients[1]
-            client.outbox._way = Full()
+            client.outbox._sink = Full()
             await until(lambda: client.outbox.waiting > 1)
             seen = picture.frame.now if picture.frame else 0.0
             await until(lambda: picture.frame and picture.frame.now > seen + 4 * INTERVAL)

@@ -146,7 +146,7 @@ def test_of_plain_reads_too_so_many_may_be_unanswered_and_each_has_a_number_of_i
             with pytest.raises(Malformed, match="request 0 is already in progress"):
                 owner.requests.begin(0, read)
             owner.requests.begin(MOST_REQUESTS, read)
-            assert len(owner.errands) == MOST_REQUESTS
+            assert len(owner.unfinished) == MOST_REQUESTS
             said = await client.hear()
             assert (said["id"], said["error"]["data"]["error"]) == (MOST_REQUESTS, "BacklogFull")
 

@@ -297,8 +297,8 @@ def test_a_lost_connection_ends_each_request_truthfully(tmp_path: Path) -> None:
         writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
         reading = asyncio.ensure_future(Hcp2Controller(remote, 5).read(1))
         await line.sent()
-        [visit] = line.service._clients.values()
-        visit.connection.abort()
+        [connection] = line.service._clients.values()
+        connection.websocket.abort()
         with pytest.raises(WriteUnconfirmed, match="the write may have been sent"):
             await writing
         with pytest.raises(LineDown, match="node 5: the connection to the program that owns the line was lost"):
@@ -371,15 +371,15 @@ def test_nobody_there_is_said_with_what_to_do(tmp_path: Path) -> None:
 def test_a_program_that_could_not_connect_leaves_no_error_that_nobody_hears(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[link.Asked] = []
-    make = link.Asked
+    asked: list[link.PendingRequest] = []
+    make = link.PendingRequest
 
-    def kept(*arguments: Any) -> link.Asked:
+    def kept(*arguments: Any) -> link.PendingRequest:
         asked.append(make(*arguments))
         return asked[-1]
 
     async def run() -> None:
-        monkeypatch.setattr(link, "Asked", kept)
+        monkeypatch.setattr(link, "PendingRequest", kept)
         with pytest.raises(LineDown):
             await connect(f"unix:{tmp_path}/line.sock").__aenter__()
         assert [one.future.cancelled() for one in asked] == [True]

@@ -10,8 +10,8 @@ from typing import Any, cast
 import pytest
 
 from busmaster import Hcp2Controller, RemoteBus
-from busmaster.app.service.connection import ServedConnection
-from busmaster.app.service.sequences import Room
+from busmaster.app.service.connection import IncomingConnection
+from busmaster.app.service.sequences import RequestLimit
 from busmaster.bus.requester import ORDINARY, Requester, RequestOptions
 from busmaster.errors import NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -23,10 +23,10 @@ NODE = cast("Requester", SimpleNamespace(label="node 5", line="line", address=5)
 COMMAND = hcp2.Read(1)
 
 
-def full(monkeypatch: pytest.MonkeyPatch, most: int = 1) -> Room:
+def full(monkeypatch: pytest.MonkeyPatch, most: int = 1) -> RequestLimit:
     """A room that is taken."""
     monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", most)
-    room = Room(lambda: asyncio.get_running_loop().time())
+    room = RequestLimit(lambda: asyncio.get_running_loop().time())
     assert all(room.take() for _ in range(most))
     assert not room.take()
     return room
@@ -88,7 +88,7 @@ def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[str] = []
-    turn, say = Pump.turn, ServedConnection.say
+    turn, say = Pump.turn, IncomingConnection.say
 
     def turned(pump: Pump) -> None:
         seen.append("turn")
@@ -103,7 +103,7 @@ def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
         controller = Hcp2Controller(remote, 5)
         await controller.read(1)
         monkeypatch.setattr(Pump, "turn", turned)
-        monkeypatch.setattr(ServedConnection, "say", said)
+        monkeypatch.setattr(IncomingConnection, "say", said)
         assert await controller.read(1) == 0
         assert seen[-3:] == ["turn", "answer", "turn over"]
 
@@ -119,7 +119,7 @@ def test_a_read_that_its_program_gives_up_waits_for_the_line_no_longer(tmp_path:
             client.take({"id": number, "method": "request", "params": read})
         for number in (70, 71, 72):
             client.take({"method": "cancel", "params": {"id": number}})
-        assert client.errands == ()
+        assert client.unfinished == ()
         counts = await line.bus.statistics()
         assert (counts.cancelled, counts.backlog) == (3, 0)
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from busmaster.app.service.client import Client
-from busmaster.app.service.connection import GOING_AWAY, POLICY, ServedConnection
+from busmaster.app.service.connection import GOING_AWAY, POLICY, IncomingConnection
 from busmaster.app.service.messages import INTERNAL, INVALID_PARAMS, Malformed, read_request, written
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.reads import plain_read_of
@@ -23,24 +23,24 @@ READ_AT_ONCE = 512
 frames."""
 
 
-class Reception:
+class MessageOrder:
     """The order of messages: one in a turn of the loop, from any program, so that the line can work in between. The
     first message of each program is taken before the second of any.
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[Visit] = deque()
+        self._waiting: deque[ClientConnection] = deque()
         self._taken = False
         """Whether a message was taken in this turn of the loop."""
 
-    def ask(self, visit: Visit) -> None:
+    def ask(self, connection: ClientConnection) -> None:
         """Take a message of this program: at once, or when it is its turn."""
         if self._taken:
-            self._waiting.append(visit)
+            self._waiting.append(connection)
             return
         self._taken = True
         try:
-            visit.take()
+            connection.take()
         finally:  # after the message, which must not wait for this
             asyncio.get_running_loop().call_soon(self._next)
 
@@ -54,43 +54,43 @@ class Host(Protocol):
     """The server of a connection."""
 
     @property
-    def reception(self) -> Reception: ...
+    def message_order(self) -> MessageOrder: ...
 
     def delay(self, origin: int | str | None, process: int, /) -> float | None:
         """Return after how many seconds the connection is read; None if it is closed."""
         ...
 
-    def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
+    def refusal(self, connection: ClientConnection, request: Request, /) -> tuple[int, str] | None:
         """Store the peer; return the HTTP status and text of a refusal, None if it is admitted."""
         ...
 
-    def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
+    def admit(self, connection: ClientConnection, said: Mapping[str, Any], /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
         ...
 
-    def send_away(self, visit: Visit, /) -> None:
+    def count_rejected(self, connection: ClientConnection, /) -> None:
         """Count a connection that is closed because of an invalid or missing message."""
         ...
 
-    def over(self, visit: Visit, /) -> None:
+    def ended(self, connection: ClientConnection, /) -> None:
         """Handle the end of a connection."""
         ...
 
 
-class Visit:
-    """One connection. It is a stranger's until its first message is taken, which must arrive within HELLO_WITHIN."""
+class ClientConnection:
+    """One connection. Its program is unknown until its first message, which must arrive within HELLO_WITHIN."""
 
     def __init__(self, host: Host) -> None:
         self.client: Client | None = None
         self.peer: Peer
         """Set before the connection is opened."""
-        self.connection = ServedConnection(self, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE)
+        self.websocket = IncomingConnection(self, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE)
         self._host = host
         self._messages: deque[str | bytes] = deque()
         self._queued = False
         self._ended = False
         self._log = logging.getLogger("busmaster.app.service")
-        self._stranger = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
+        self._hello_timer = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
 
     # called by the connection
 
@@ -112,7 +112,7 @@ class Visit:
         self._messages.append(message)
         self._go_on()
         if self._messages:
-            self.connection.pause()
+            self.websocket.pause()
 
     def writable(self) -> None:
         """Send waiting messages, and continue to read if that was paused."""
@@ -123,7 +123,7 @@ class Visit:
     def lost(self) -> None:
         """Handle the loss of the connection."""
         self._finish()
-        self._host.over(self)
+        self._host.ended(self)
 
     # called by the host
 
@@ -135,21 +135,21 @@ class Visit:
         try:
             message = self._messages.popleft()
             if self.client is None:
-                self.client = self._host.welcome(self, read_request(message))
-                self._stranger.cancel()
+                self.client = self._host.admit(self, read_request(message))
+                self._hello_timer.cancel()
             elif not self.client.in_safe_place and (read := plain_read_of(message)) is not None:
                 self.client.requests.begin(*read)
             else:
                 self.client.take(read_request(message))
         except Malformed as error:
-            self._send_away(error)
+            self._reject(error)
         except Exception as bug:  # without this, the connection would stay paused for ever and keep its place
             self._log.exception("a message of %s could not be taken", self.peer)
-            self._send_away(Malformed(f"the program that owns the line failed: {type(bug).__name__}: {bug}", INTERNAL))
+            self._reject(Malformed(f"the program that owns the line failed: {type(bug).__name__}: {bug}", INTERNAL))
         else:
             self._go_on()
 
-    def bid_farewell(self) -> None:
+    def end(self) -> None:
         """Close the connection, because the line's owner ends, after all messages."""
         self._end(GOING_AWAY, "the program that owns the line ends")
 
@@ -160,34 +160,34 @@ class Visit:
         if self._queued or self._ended:
             return
         # Messages for a client wait only behind a full connection, which is rare.
-        if self.connection.full and self.client is not None and self.client.outbox.crowded:
-            self.connection.pause()  # `writable` comes here again
+        if self.websocket.full and self.client is not None and self.client.outbox.crowded:
+            self.websocket.pause()  # `writable` comes here again
         elif self._messages:
             self._queued = True
-            self._host.reception.ask(self)
+            self._host.message_order.ask(self)
         else:
-            self.connection.resume()
+            self.websocket.resume()
 
     def _wait_no_longer(self) -> None:
-        self._send_away(Malformed("no hello was received", INVALID_PARAMS))
+        self._reject(Malformed("no hello was received", INVALID_PARAMS))
 
-    def _send_away(self, error: Malformed) -> None:
-        self._host.send_away(self)
+    def _reject(self, error: Malformed) -> None:
+        self._host.count_rejected(self)
         text = written({"id": None, "error": {"code": error.code, "message": str(error)}})
         if self.client is not None:
             self.client.outbox.put(text)
         else:
-            self.connection.say(text)
+            self.websocket.say(text)
         self._end(POLICY, str(error)[:100])
 
     def _end(self, code: int, reason: str) -> None:
         self._finish()
         if self.client is not None:
             self.client.outbox.flush(last=True)
-        self.connection.close(code, reason)
-        self.connection.resume()  # the other end's agreement must be read
+        self.websocket.close(code, reason)
+        self.websocket.resume()  # the other end's agreement must be read
 
     def _finish(self) -> None:
         self._ended = True
-        self._stranger.cancel()
+        self._hello_timer.cancel()
         self._messages.clear()

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster import Node, Point, ext
-from busmaster.app.service.authorisation import FRESH, NEVER_SENT, Wish, outcome_of
+from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.peers import Peer
@@ -37,7 +37,7 @@ OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 INTERFACE = "service"
 
 
-class Asker(Protocol):
+class RequestSender(Protocol):
     """The client that sends the request."""
 
     @property
@@ -81,7 +81,7 @@ class Asker(Protocol):
         ...
 
 
-class Task(NamedTuple):
+class RequestedCommand(NamedTuple):
     """A requested command for a node, the command that reads the written value (`touches`), and perhaps its point."""
 
     node: Node
@@ -92,15 +92,15 @@ class Task(NamedTuple):
     point: Point[Any] | None = None
 
     @classmethod
-    def of_node(cls, params: Mapping[str, Any], asker: Asker) -> Task:
+    def of_node(cls, params: Mapping[str, Any], sender: RequestSender) -> RequestedCommand:
         """Return the command that a client sends. Raises InvalidCommand for one that the protocol does not have."""
-        node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
+        node, protocol = sender.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
         command, touches = protocol.read_back(params["command"]), params.get("touches")
         value = str(command) if command.writes else None
         return cls(node, command, None if touches is None else protocol.read_back(touches), value)
 
     @classmethod
-    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Task:
+    def of_point(cls, params: Mapping[str, Any], sender: RequestSender, line: ServedLine) -> RequestedCommand:
         """Return the write of a value to a point of a poll group.
 
         Raises InvalidCommand, after an audit entry, for a value that cannot be written.
@@ -113,14 +113,16 @@ class Task(NamedTuple):
                 value = point.meaning.number_of(value)
             return cls(point.node, _encoded(point, value), point.command, value, point)
         except NEVER_SENT as error:
-            by, permission = str(asker.peer), asker.permission
-            wish = Wish(interface=INTERFACE, by=by, name=point.key, point=point, value=value, permission=permission)
-            refusal = line.authorisation.refusal(wish) or outcome_of(error)[1]
-            line.authorisation.refuse(wish, refusal)
+            by, permission = str(sender.peer), sender.permission
+            request = WriteRequest(
+                interface=INTERFACE, by=by, name=point.key, point=point, value=value, permission=permission
+            )
+            refusal = line.authorisation.refusal(request) or outcome_of(error)[1]
+            line.authorisation.refuse(request, refusal)
             raise InvalidCommand(refusal) from None
 
 
-Told: TypeAlias = Callable[["Errand", Any, BaseException | None], object]
+OnEnd: TypeAlias = Callable[["ClientRequest", Any, BaseException | None], object]
 """Called at the end of a request with its value or its error; with neither if it was cancelled, see there."""
 
 
@@ -129,9 +131,9 @@ class Reading:
     future takes would add to the time that a program waits.
     """
 
-    __slots__ = ("_over", "_request", "_told", "command", "given_up", "node")
+    __slots__ = ("_on_end", "_over", "_request", "command", "given_up", "node")
 
-    _told: Told
+    _on_end: OnEnd
 
     def __init__(
         self,
@@ -152,12 +154,12 @@ class Reading:
         """Return whether an attempt was passed to the line."""
         return self._request.sent
 
-    def begin(self, told: Told) -> None:
-        """Start the command; `told` is called once at its end, perhaps before this returns.
+    def begin(self, on_end: OnEnd) -> None:
+        """Start the command; `on_end` is called once at its end, perhaps before this returns.
 
         Raises BusError or InvalidCommand if it could not be started.
         """
-        self._told = told
+        self._on_end = on_end
         ext.start(self.node, self._request, self)
 
     def cancel(self) -> None:
@@ -166,7 +168,7 @@ class Reading:
             if self._request.transaction is not None:
                 ext.give_up(self.node, self._request.transaction)
             self._over = self.given_up = True
-            self._told(self, None, None)
+            self._on_end(self, None, None)
 
     # called by the line
 
@@ -177,12 +179,12 @@ class Reading:
     def set_result(self, value: Any, /) -> None:
         """Handle the value that was read."""
         self._over = True
-        self._told(self, value, None)
+        self._on_end(self, value, None)
 
     def set_exception(self, error: BaseException, /) -> None:
         """Handle the error of a failed read."""
         self._over = True
-        self._told(self, None, error)
+        self._on_end(self, None, error)
 
 
 class Writing:
@@ -190,11 +192,11 @@ class Writing:
 
     def __init__(
         self,
-        task: Task,
+        task: RequestedCommand,
         options: CommandOptions,
         *,
         line: ServedLine,
-        asker: Asker,
+        sender: RequestSender,
         client: LineClient,
         asked: float,
         stops_seen: int | None,
@@ -209,11 +211,11 @@ class Writing:
         self._task = task
         self._options = options
         self._line = line
-        self._asker = asker
+        self._sender = sender
         self._asked = asked
         self._stop = stop
         self._begun = False
-        self._told: Told
+        self._on_end: OnEnd
 
     @property
     def sent(self) -> bool:
@@ -222,19 +224,19 @@ class Writing:
 
     def check(self) -> None:
         """Raise InvalidCommand for a write that would be refused now, after an audit entry."""
-        wish = self._wish()
+        request = self._write_request()
         try:
-            if refusal := self._line.authorisation.refusal(wish):
+            if refusal := self._line.authorisation.refusal(request):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             self.node.check(self.command, stop=self._stop)
         except InvalidCommand as error:
-            self._line.authorisation.refuse(wish, str(error))
+            self._line.authorisation.refuse(request, str(error))
             raise
 
-    def begin(self, told: Told) -> None:
-        """Start the write; `told` is called once at its end."""
-        self._told = told
-        if self._asker.takes_stop(self.node):
+    def begin(self, on_end: OnEnd) -> None:
+        """Start the write; `on_end` is called once at its end."""
+        self._on_end = on_end
+        if self._sender.takes_stop(self.node):
             self._stop_node()
         self.doing = asyncio.ensure_future(self._write())
         self.doing.add_done_callback(self._written)
@@ -248,24 +250,24 @@ class Writing:
 
     def _stop_node(self) -> None:
         """Count this write as a stop if it is permitted. Otherwise send the program the number of stops."""
-        if self._line.authorisation.refusal(self._wish()):
-            self._asker.tell_stops(ext.record_of(self.node))
+        if self._line.authorisation.refusal(self._write_request()):
+            self._sender.tell_stops(ext.record_of(self.node))
         else:
             self.node.note_stop()
 
     def _written(self, writing: asyncio.Task[Any]) -> None:
         if not self._begun:  # a task that is cancelled before its first step runs nothing of it
-            self._line.authorisation.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
+            self._line.authorisation.begin(self._write_request()).end(self._truth(asyncio.CancelledError()))
         self.given_up = writing.cancelled()
         error = None if self.given_up else writing.exception()
-        self._told(self, None if self.given_up or error is not None else writing.result(), error)
+        self._on_end(self, None if self.given_up or error is not None else writing.result(), error)
 
     async def _write(self) -> Any:
         self._begun = True
-        wish = self._wish()
-        passage = self._line.authorisation.begin(wish)
+        request = self._write_request()
+        in_progress = self._line.authorisation.begin(request)
         try:
-            if refusal := self._line.authorisation.refusal(wish):
+            if refusal := self._line.authorisation.refusal(request):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
                 raise NotStarted(
@@ -279,10 +281,10 @@ class Writing:
             )
             value = await ext.run(self.node, self._request)
         except BaseException as error:
-            passage.end(self._truth(error))
+            in_progress.end(self._truth(error))
             raise
-        passage.end(None)
-        if why := await passage.not_durable():
+        in_progress.end(None)
+        if why := await in_progress.not_durable():
             hint = "check why that output failed; the value need not be written again"
             raise WriteUnconfirmed(why, node=self.node, command=str(self.command), hint=hint)
         return value
@@ -295,7 +297,7 @@ class Writing:
             return WriteUnconfirmed("its program cancelled it before the reply")
         return NotStarted("its program cancelled it before it was sent")
 
-    def _wish(self) -> Wish:
+    def _write_request(self) -> WriteRequest:
         """Return the request for the audit log, with the name and unit of a point if a poll group has it."""
         command, point, value = self.command, self._task.point, self._task.value
         if point is None and isinstance(command, Changing):
@@ -304,25 +306,25 @@ class Writing:
             if point is not None:
                 value = _value(point, changes, value)
         point = point or Point(self.node, RAW_COMMAND, command)
-        return Wish(
+        return WriteRequest(
             interface=INTERFACE,
-            by=str(self._asker.peer),
+            by=str(self._sender.peer),
             name=point.key,
             point=point,
             value=value,
             command=command,
-            permission=self._asker.permission,
+            permission=self._sender.permission,
         )
 
 
-Errand: TypeAlias = Reading | Writing
+ClientRequest: TypeAlias = Reading | Writing
 
 
-def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
+def client_request_of(said: Mapping[str, Any] | PlainRead, sender: RequestSender, line: ServedLine) -> ClientRequest:
     """Return the request of a client. Raises InvalidCommand for a command that the protocol does not have."""
     if isinstance(said, PlainRead):
-        return Reading(asker.node(said.protocol, said.address), said.command, asker.turn, None, asker.reads)
-    task = Task.of_point(said, asker, line) if "key" in said else Task.of_node(said, asker)
+        return Reading(sender.node(said.protocol, said.address), said.command, sender.turn, None, sender.reads)
+    task = RequestedCommand.of_point(said, sender, line) if "key" in said else RequestedCommand.of_node(said, sender)
     node, command = task.node, task.command
     given = cast("CommandOptions", said.get("options") or {})
     if not set(given) <= OPTIONS:
@@ -330,15 +332,15 @@ def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLin
     RequestOptions.of(given, node.label)  # checked here, before it may wait
     _check_waits(given, node)
     now, stops_seen = line.bus.now(), said.get("stops_seen")
-    stops_seen = None if stops_seen is None else stops_seen + asker.stops_before(node)
-    client = asker.client_of(said.get("sequence"), node)
+    stops_seen = None if stops_seen is None else stops_seen + sender.stops_before(node)
+    client = sender.client_of(said.get("sequence"), node)
     stop = said.get("stop") is True and _check_stop(node, command)
     asked = min(now, seconds(said.get("requested", now), "requested"))
     if not command.writes:
         options = RequestOptions.of(_left(given, now - asked), node.label)
-        options = replace(options, priority=max(options.priority, asker.rights.reads))
+        options = replace(options, priority=max(options.priority, sender.rights.reads))
         return Reading(node, command, client, stops_seen, options)
-    return Writing(task, given, line=line, asker=asker, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+    return Writing(task, given, line=line, sender=sender, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
 
 
 def _check_waits(options: CommandOptions, node: Node) -> None:

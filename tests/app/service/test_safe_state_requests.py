@@ -18,7 +18,7 @@ from busmaster.app.service.authorisation import SafeWrites
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.rights import Role
-from busmaster.app.service.safe import SafeWishes
+from busmaster.app.service.safe import SafeStateRequests
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, NoReply, Superseded, WriteUnconfirmed
 from busmaster.registry import make_device
@@ -123,16 +123,16 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
-    send = SafeWishes._send
+    send = SafeStateRequests._send
 
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         meant = asyncio.Event()
 
-        async def hold(wishes: SafeWishes, state: SafeWrites, by: str) -> dict[str, Any]:
+        async def hold(wishes: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
             await meant.wait()
             return await send(wishes, state, by)
 
-        monkeypatch.setattr(SafeWishes, "_send", hold)
+        monkeypatch.setattr(SafeStateRequests, "_send", hold)
         asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
         await until(lambda: service.line.safe_wishes.under_way)
         with pytest.raises(BacklogFull, match="1 requests of this program have no reply yet"):
