@@ -6,7 +6,6 @@ A package that is drawn apart so that it can be read apart is so for its types t
 from __future__ import annotations
 
 import ast
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,14 +31,6 @@ APPLICATION: dict[str, set[str]] = {
     },
 }
 """The rooms of the application, and which others of them each may import."""
-INTERFACES = {
-    entry.partition(":")[0].removeprefix("busmaster.")
-    for entry in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][
-        "busmaster.interfaces"
-    ].values()
-}
-"""Interfaces that are one module with their command. They import what one of another package imports."""
-OF_AN_INTERFACE = {"app.cli.ending", "app.cli.interfaces", "app.cli.output"}
 DEMO = {"app.cli.demo_line"}
 """The demo shows certain drives, so it imports them."""
 ON_DEMAND = {"app.line.configured_line", "app.service.remote", "app.service.service"}
@@ -74,10 +65,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "app": {"app"},
     "config": set(),
     **{room: {room, *others, *LIBRARY_OF_THE_APPLICATION - {""}} for room, others in APPLICATION.items()},
-    **{
-        module: {"app.interfaces", "app.service", *OF_AN_INTERFACE, *LIBRARY_OF_THE_APPLICATION - {""}}
-        for module in INTERFACES
-    },
     **{module: {"app.cli", "protocols", *LIBRARY_OF_THE_APPLICATION - {""}} for module in DEMO},
 }
 OPEN: dict[str, set[str]] = {
@@ -106,13 +93,13 @@ OPEN: dict[str, set[str]] = {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "rfc2217", "serial_port", "tcp"),
     },
     "wire": {"characters", "checks", "numbers", "readers"},
-    "app.cli": {"", "ending", "interfaces", "output"},
+    "app.cli": {""},
     "app.config": {
         *("", "emulated", "names", "point_section", "points", "recording", "rewriting", "schema", "sections"),
         *("service", "source", "table", "templates"),
     },
     "app.diagnostics": {"adapters", "diagnosis", "examination", "probing", "search", "steps", "uart", "writing"},
-    "app.interfaces": {"following", "opcua", "opcua_access", "web"},
+    "app.interfaces": {"following", "modbus_tcp", "opcua", "opcua_access", "web"},
     "app.line": {"", "parameter_sets", "points_table", "points_taking"},
     "app.outputs": {"base", "cells", "distributor", "history", "kinds", "settings"},
     "app.service": {
