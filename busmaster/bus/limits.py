@@ -68,11 +68,20 @@ class Limit:
             raise InvalidCommand(f"{self.name} = {self.text(value)} is above its maximum of {self.text(self.maximum)}")
 
     def check_step(self, before: Any, value: Any) -> None:
-        """Raise InvalidCommand with the limit for a value that is too far from the current one."""
-        step = abs(value - before)
+        """Raise InvalidCommand with the limit for a value that is too far from the current one.
+
+        If the current value is beyond a limit, the step counts from that limit: else no write could bring it back.
+        """
+        start = before
+        if self.maximum is not None and start > self.maximum:
+            start = self.maximum
+        if self.minimum is not None and start < self.minimum:
+            start = self.minimum
+        step = abs(value - start)
         if self.max_step is not None and not (step <= self.max_step or _equal(step, self.max_step)):
+            beyond = "" if start == before else f" (it is {self.text(before)} now, beyond its limits)"
             raise InvalidCommand(
-                f"{self.name} = {self.text(value)} is too far from {self.text(before)}: "
+                f"{self.name} = {self.text(value)} is too far from {self.text(start)}{beyond}: "
                 f"its max_step is {self.text(self.max_step)}"
             )
 

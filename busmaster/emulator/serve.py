@@ -150,7 +150,7 @@ class PtyServer(LineServer):
     The terminal is raw and stays open, so that clients can connect and disconnect. It has the line's rate. If a client
     sets another rate, both sides receive wrong bytes, as from a UART. The first bytes at each other rate are reported
     once: `report` is called with a text, in the server's thread; by default the text is logged. Raises FileExistsError
-    if `link` exists and is not a symbolic link.
+    if `link` exists and is not a symbolic link, or is one to another terminal that exists.
     """
 
     def __init__(
@@ -172,6 +172,7 @@ class PtyServer(LineServer):
             os.set_blocking(self._master, False)
             if self._link is not None:
                 if os.path.islink(self._link):
+                    _check_unused(self._link, self._device)
                     os.unlink(self._link)
                 os.symlink(self._device, self._link)
                 self.path = self._link
@@ -270,6 +271,13 @@ class TcpServer(LineServer):
         self._listener.close()
         for client in self._clients.values():
             client.close()
+
+
+def _check_unused(link: str, device: str) -> None:
+    """Raise FileExistsError if a link leads to another pseudo-terminal that exists, and so has a server."""
+    target = os.readlink(link)
+    if target.startswith("/dev/pts/") and target != device and os.path.exists(target):
+        raise FileExistsError(f"another emulator serves it on {target}; end that one, or delete the link")
 
 
 def serve_pty(

@@ -353,3 +353,20 @@ def test_limits_that_mean_nothing_are_refused() -> None:
             press.point("2008").limit(**wrong)
     with pytest.raises(InvalidCommand, match="limit each value"):
         press.point("2008:32").limit(maximum=1)
+
+
+@in_virtual_time
+async def test_a_value_beyond_its_limits_comes_back_by_a_step_from_the_nearest_limit() -> None:
+    async with controller() as drive:
+        for outside, inside, too_far, limit in ((900, 450, 449, 500), (-40, 50, 51, 0)):
+            await drive.write(10, outside)
+            held = drive.element(10).limit(minimum=0, maximum=500, max_step=50)
+            with pytest.raises(InvalidCommand) as refused:
+                await drive.write(10, too_far)
+            assert f"10 = {too_far} is too far from {limit} (it is {outside} now, beyond its limits)" in str(
+                refused.value
+            )
+            await drive.write(10, inside)
+            with pytest.raises(InvalidCommand, match=f"too far from {inside}: "):
+                await drive.write(10, inside + 60 if limit == 0 else inside - 60)
+            Node.of(drive).lift(held)

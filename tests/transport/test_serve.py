@@ -146,6 +146,18 @@ def test_a_stale_link_is_replaced_but_a_file_is_not(tmp_path: Path) -> None:
     assert link.read_text() == "mine"
 
 
+def test_a_link_to_a_line_that_is_served_is_not_taken_over(tmp_path: Path) -> None:
+    link = tmp_path / "line"
+    with serve_pty(mint_line(), link):
+        served = os.readlink(link)
+        with pytest.raises(FileExistsError, match=f"another emulator serves it on {served}; end that one, or delete"):
+            serve_pty(mint_line(), link)
+        assert os.readlink(link) == served
+        port = opened(str(link))
+        assert ask(port, WRITE, 1) == b"\x06"
+        os.close(port)
+
+
 def test_an_unplugged_pty_is_gone_and_comes_back_at_the_same_path(tmp_path: Path) -> None:
     link = tmp_path / "line"
     line = mint_line()

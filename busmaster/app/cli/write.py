@@ -90,14 +90,31 @@ async def write(
         with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
         handle = replace(connection, options=with_decimals).open_handle(bus, address)
     prepared = [
-        (one.item, ext.prepare_write(handle, checked(handle, one, one.item), one.values, **options_of(one, verify)))
+        (one, ext.prepare_write(handle, checked(handle, one, one.item), one.values, **options_of(one, verify)))
         for one in pairs
     ]
     async with bus, late_nodes(bus):
-        for item, sends in prepared:
+        for one, sends in prepared:
             for send in sends:
                 await send()
-            tell(item, as_json, node=connection.node_number(address), item=item)
+            written = items_of(handle, one)
+            if as_json:
+                more = {"items": written} if len(written) > 1 else {}
+                tell(one.item, as_json, node=connection.node_number(address), item=one.item, **more)
+            else:
+                # Each of several: the comma of 10=2,5 may have been meant as a decimal point.
+                for item in written:
+                    tell(item, as_json)
+
+
+def items_of(handle: Handle, one: Assignment) -> list[str]:
+    """Return the items that an assignment writes: the named one and those after it."""
+    if len(one.values) == 1:
+        return [one.item]
+    try:
+        return list(ext.run_items(handle, one.item.partition(":")[0], len(one.values)))
+    except InvalidCommand:  # several values of one item
+        return [one.item]
 
 
 async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json: bool) -> None:

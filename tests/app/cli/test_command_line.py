@@ -120,10 +120,10 @@ def test_a_command_takes_what_is_promised_and_nothing_else(name: str) -> None:
 
 SHAPES = {
     "hcp2 5": {
-        "write 1=123.456 10=12.5,-0.0001,1234": "1 ok, 10 ok",
+        "write 1=123.456 10=12.5,-0.0001,1234": "1 ok, 10 ok, 11 ok, 12 ok",
         "read 1 10 11 12": "1 123.456, 10 12.5, 11 -0.0001, 12 1234",
     },
-    "hcp 15": {"write 98=.5,-1 --verify": "98 ok", "read 98 99": "98 0.5, 99 -1"},
+    "hcp 15": {"write 98=.5,-1 --verify": "98 ok, 99 ok", "read 98 99": "98 0.5, 99 -1"},
     "microflex 7": {"read status_word hall_state": "status_word 64 HARDWARE_ENABLE, hall_state 1"},
     "msc 3": {
         "write 2008=7 flag:0=1 flag:5=1 flag:31=1": "2008 ok, flag:0 ok, flag:5 ok, flag:31 ok",

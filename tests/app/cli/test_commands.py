@@ -29,12 +29,21 @@ def test_what_was_written_is_read(busmaster: Command, controllers: TcpServer) ->
 
 
 def test_several_items_are_a_line_each_and_json_an_object_a_line(busmaster: Command, controllers: TcpServer) -> None:
-    assert busmaster("write", controllers.path, *HCP2, "--node", "2", "10=12.5,-0.0001,1234").out == "10 ok\n"
+    assert busmaster("write", controllers.path, *HCP2, "--node", "2", "10=12.5,-0.0001,1234").lines == [
+        "10 ok",
+        "11 ok",
+        "12 ok",
+    ]
     assert busmaster("read", controllers.path, *HCP2, "--node", "2", "10", "11", "12", "axis0.idle").lines == [
         "10 12.5",
         "11 -0.0001",
         "12 1234",
         "axis0.idle 1",
+    ]
+    wrote = busmaster("write", controllers.path, *HCP2, "--node", "2", "10=12.5,-0.0001,1234", "1=5", "--json")
+    assert list(map(without_time, wrote.lines)) == [
+        {"node": 2, "item": "10", "items": ["10", "11", "12"], "ok": True},
+        {"node": 2, "item": "1", "ok": True},
     ]
     read = busmaster("read", controllers.path, *HCP2, "--node", "2", "10", "12", "--json")
     assert list(map(without_time, read.lines)) == [

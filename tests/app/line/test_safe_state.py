@@ -10,7 +10,7 @@ import pytest
 
 from busmaster import Hcp2Controller, MemoryPort
 from busmaster.app.config.sections import read
-from busmaster.app.config.source import Source
+from busmaster.app.config.source import FileError, Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.record import Outcome, WriteRecord
 from busmaster.bus.node import Node
@@ -151,3 +151,41 @@ def test_a_line_that_is_left_takes_no_other_write_and_one_that_is_not_left_does(
         assert await drive.read(10) == (0 if leaving else 5)
 
     on_a_line(story, "winder/speed")
+
+
+LIMITED = """
+port = "/dev/ttyUSB0?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 2
+points.force = { item = "11", minimum = 10, maximum = 500 }
+[safe]
+repeatable = ["winder/POINT"]
+writes = { "winder/POINT" = VALUE }
+"""
+
+
+@pytest.mark.parametrize("point", ["force", "11"])
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ("900", "force = 900 is above its maximum of 500"),
+        ("5", "force = 5 is below its minimum of 10"),
+        ("-1", "force = -1 is below its minimum of 10"),
+        ("500", None),
+        ("10", None),
+        ("0", None),  # a stop
+    ],
+)
+def test_a_safe_value_beyond_the_limits_of_its_point_is_rejected_when_the_file_is_read(
+    point: str, value: str, problem: str | None
+) -> None:
+    text = LIMITED.replace("POINT", point).replace("VALUE", value)
+    file = read(Source("line.toml", text))
+    if problem is None:
+        assert ConfiguredLine(file, outputs=False).safe_state.values == {f"winder/{point}": float(value)}
+        return
+    with pytest.raises(FileError) as rejected:
+        ConfiguredLine(file, outputs=False)
+    assert str(rejected.value).startswith("line.toml:9: ")
+    assert problem in str(rejected.value)
