@@ -578,7 +578,10 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
         )
     if code == errno.ENOENT:
         target = f": it points to {os.readlink(path)}, which is gone" if os.path.islink(path) else ""
-        return LineDown(f"{path} does not exist{target}", hint="plug it in, or see `python -m serial.tools.list_ports`")
+        return LineDown(
+            f"{path} does not exist{target}",
+            hint="plug it in or start its emulator, or see `python -m serial.tools.list_ports`",
+        )
     if code in (errno.EACCES, errno.EPERM):
         return LineDown(f"no permission to open {path}", hint=holders.how_to_open(path))
     if isinstance(error, ValueError):

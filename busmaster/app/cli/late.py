@@ -51,7 +51,11 @@ class LateNodes:
 def advice(age: float, *, in_file: bool = False) -> str:
     """Return advice for a node with a reply after `age` seconds: an option, or a key of LINE.toml if `in_file`."""
     window = math.ceil(ROOM * age / STEP) * STEP
-    what = f"set timing = {{ window = {window:g} }} in its section" if in_file else f"try --timeout {window * 1000:.0f}"
+    what = (
+        f"set timing = {{ window = {window:g} }} in its section of the file"
+        if in_file
+        else f"try --timeout {window * 1000:.0f}"
+    )
     return f"late reply, {age * 1000:.0f} ms after the request; {what}"
 
 

@@ -111,8 +111,8 @@ def losses_text(losses: Losses) -> str:
     shortest, longest = map(time_text, losses.windows)
     windows = f"a window of {shortest}" if shortest == longest else f"windows of {shortest} to {longest}"
     return (
-        f"with {losses.share:.0%} of all frames lost the schedule needs {losses.documented:.0%} of the line; "
-        f'with timing = "learned" ({windows}) for {losses.learned:.0%}'
+        f"if {losses.share:.0%} of all frames are lost, the schedule needs {losses.documented:.0%} of the line, "
+        f'and {losses.learned:.0%} with timing = "learned" ({windows})'
     )
 
 

@@ -171,7 +171,9 @@ class ConfiguredLine:
             try:
                 point.encode(tuple(values))
             except (ArithmeticError, TypeError, ValueError) as error:
-                raise InvalidCommand(f"{name} does not accept {len(values)} values: {error}") from None
+                raise InvalidCommand(
+                    f"{name} does not accept {len(values)} values ({error}); write decimals with a point"
+                ) from None
         handle = self.handle(point.where, bus)
         # one call for several exchanges: a partial write must not look like none or all
         [send] = ext.prepare_write(handle, point.source.item, list(map(point.unscaled, values)), **options)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
+import os
 import socket
 from collections.abc import Sequence
 
@@ -31,6 +33,15 @@ def check_listening(listen: HostPort, *, tokens: bool) -> None:
         )
 
 
+def listening_error(host: str, port: int, error: OSError) -> str:
+    """Return why nothing can listen there."""
+    if error.errno == errno.EADDRINUSE:
+        return f"{host}:{port} is in use by another program; end that one, or use another port"
+    # the text of create_server repeats the address
+    what = error.strerror if isinstance(error, socket.gaierror) or not error.errno else os.strerror(error.errno)
+    return f"cannot listen on {host}:{port}: {what}"
+
+
 def listening(listen: HostPort) -> socket.socket:
     """Open a socket that listens there; port 0 is any free one. A name may take its time. Raises InvalidCommand."""
     host, port = listen
@@ -38,7 +49,7 @@ def listening(listen: HostPort) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         opened = socket.create_server(address[:2], family=family, backlog=BACKLOG)
     except OSError as error:
-        raise InvalidCommand(f"{host}:{port} cannot be listened at: {error.strerror}") from None
+        raise InvalidCommand(listening_error(host, port, error)) from None
     opened.setblocking(False)
     return opened
 

@@ -97,7 +97,7 @@ def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None
     assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "quality", "error", "late"}
 
 
-SPARED = "busmaster: with 1% of all frames lost the schedule needs "
+SPARED = "busmaster: if 1% of all frames are lost, the schedule needs "
 UNLEARNED = TEXT.replace('timing = "learned"', "")
 FEW = UNLEARNED.replace("period = 0.02", "period = 60").replace("period = 0.1", "period = 60")
 
@@ -204,8 +204,8 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert float(healthy) < float(dead) < 200  # a maximum reply delay of HCP2, not a bound that no line comes near
     assert outcome.lines[6].startswith("worst case (R9), if every exchange takes its longest possible time: urgent ")
     assert outcome.lines[-2].startswith("reply times are assumed (half of late_after) for ")
-    assert outcome.lines[-1].startswith("with 1% of all frames lost the schedule needs ")
-    assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
+    assert outcome.lines[-1].startswith("if 1% of all frames are lost, the schedule needs ")
+    assert ' with timing = "learned" (a window of 39.5 ms)' in outcome.lines[-1]
 
 
 @pytest.mark.parametrize(
@@ -315,7 +315,7 @@ def test_r13_a_lost_port_and_why_it_does_not_come_back_are_told_on_standard_erro
             _, err = process.communicate(timeout=PATIENCE)
     assert told == [
         f"busmaster: the line is down: {link} was lost: it hung up\n",
-        f"busmaster: cannot connect: {link} does not exist; plug it in, or see `python -m serial.tools.list_ports`\n",
+        f"busmaster: cannot connect: {link} does not exist; plug it in or start its emulator, or see `python -m serial.tools.list_ports`\n",
         "busmaster: the line is up\n",
     ]
     assert process.returncode == 130

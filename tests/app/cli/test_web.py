@@ -94,4 +94,4 @@ def test_what_is_mistyped_is_one_line(busmaster: Command, tmp_path: Path) -> Non
     assert (ran.status, "other users can read" in ran.err) == (2, True)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         ran = busmaster("web", "slitter", "--bind", f"127.0.0.1:{taken.getsockname()[1]}")
-        assert (ran.status, "cannot be listened at" in ran.err) == (2, True)
+        assert (ran.status, "is in use by another program" in ran.err) == (2, True)
