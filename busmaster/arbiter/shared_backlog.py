@@ -13,7 +13,7 @@ from collections.abc import Callable, Hashable, Iterator
 from itertools import chain
 from math import inf
 from operator import attrgetter
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from busmaster.arbiter.backlog import LOOKED_AT, SHARE, Backlog, EarliestDeadlineFirst, Fifo, Queue, Writes, new_queues
 from busmaster.arbiter.clients import OWN, Account, Hold, LineClient, turn_of
@@ -45,13 +45,25 @@ _had: Callable[[_Turn], float] = attrgetter("had")
 _Order: TypeAlias = "OrderedDict[LineClient, _Turn]"
 
 
+class SequenceRule(NamedTuple):
+    """Which sequences may begin. `held`: a sequence holds the line. `role`: its next sequence waits for the owner's
+    time."""
+
+    held: bool
+    role: Account | None
+
+    def may_begin(self, hold: Hold) -> bool:
+        """Return True if the line can be held for a sequence that does not hold it yet."""
+        return not self.held and hold.client.role is not self.role
+
+
 class Turns:
     """A class whose clients take turns. `new_queue` makes a client's queue; `own` is the queue of the line's owner.
 
     `owner_first`: the owner always goes first, so that other programs do not delay its safe state.
     """
 
-    __slots__ = ("_had", "_new_queue", "_next", "_own", "_owner_first", "_turns", "aside", "live", "may_begin")
+    __slots__ = ("_had", "_new_queue", "_next", "_own", "_owner_first", "_turns", "aside", "live", "rule")
 
     def __init__(self, own: Queue, new_queue: Callable[[], Queue], *, owner_first: bool = False) -> None:
         self._owner_first = owner_first
@@ -65,15 +77,15 @@ class Turns:
         self._had = 0.0
         """Initial use of a new client."""
         self.live = own.live
-        self.may_begin: Callable[[Hold], bool] | None = None
-        """Returns whether the line can be held for a sequence; None: always. Set with `admit_sequences`."""
+        self.rule: SequenceRule | None = None
+        """Which sequences may not begin; None: every sequence may. Set with `admit_sequences`."""
         self.aside: list[Transaction] = []
         """Requests of sequences that may not begin. They are kept outside the queues, so that no request waits behind
         them."""
 
     def push(self, transaction: Transaction) -> None:
         """Add a transaction to its client's queue."""
-        if self.may_begin is not None and self._stays_aside(transaction):
+        if self.rule is not None and self._stays_aside(transaction):
             self.aside.append(transaction)
             return
         self._joined(transaction).queue.push(transaction)
@@ -81,7 +93,7 @@ class Turns:
 
     def push_front(self, transaction: Transaction) -> None:
         """Add a transaction at the front of its client's queue."""
-        if self.may_begin is not None and self._stays_aside(transaction):
+        if self.rule is not None and self._stays_aside(transaction):
             self.aside.insert(0, transaction)
             return
         self._joined(transaction).queue.push_front(transaction)
@@ -175,16 +187,16 @@ class Turns:
 
     # sequences that may not begin
 
-    def admit_sequences(self, may_begin: Callable[[Hold], bool] | None) -> None:
+    def admit_sequences(self, rule: SequenceRule | None) -> None:
         """Set aside the requests of sequences that may not begin any more, and put back the others."""
-        self.may_begin = may_begin
+        self.rule = rule
         before, self.aside = self.aside, []
         for transaction in reversed(before):
             if self._stays_aside(transaction):
                 self.aside.insert(0, transaction)
             else:
                 self._put_back(transaction)
-        if may_begin is not None:
+        if rule is not None:
             waiting = [one for turn in self._waiting() for one in turn.queue if self._stays_aside(one)]
             for transaction in waiting:
                 self.remove(transaction)
@@ -203,9 +215,9 @@ class Turns:
     def _stays_aside(self, transaction: Transaction) -> bool:
         hold = transaction.client
         # A stop never waits for a sequence: it is sent, and the sequence begins later.
-        if not isinstance(hold, Hold) or hold.holds or transaction.stop or self.may_begin is None:
+        if not isinstance(hold, Hold) or hold.holds or transaction.stop or self.rule is None:
             return False
-        return not self.may_begin(hold)
+        return not self.rule.may_begin(hold)
 
     def _leave_aside(self, transaction: Transaction) -> bool:
         """Remove a transaction from those set aside. Returns True if it was one of them."""
@@ -489,7 +501,7 @@ class SharedBacklog(Backlog):
             self._count_run(transaction.priority, client)
         self._since = now
         asks = None if transaction is None else transaction.client
-        self._begins = isinstance(asks, Hold) and self._may_begin(asks)
+        self._begins = isinstance(asks, Hold) and SequenceRule(self.hold is not None, self._held_by).may_begin(asks)
         self._owner_waited = self._owner_waits()
         if self._pause and self.hold is None and transaction is None and any(turns.aside for turns in self._turns):
             # On an idle line no exchange ends, so the end of the pause needs a deadline of its own.
@@ -579,13 +591,9 @@ class SharedBacklog(Backlog):
 
     def _admit_sequences(self) -> None:
         """Update in each class which sequences are set aside."""
-        waits = self.hold is not None or self._held_by is not None
+        rule = SequenceRule(self.hold is not None, self._held_by)
         for turns in self._turns:
-            turns.admit_sequences(self._may_begin if waits else None)
-
-    def _may_begin(self, hold: Hold) -> bool:
-        """Return True if the line can be held for a sequence that does not hold it yet."""
-        return self.hold is None and hold.client.role is not self._held_by
+            turns.admit_sequences(rule if rule.held or rule.role is not None else None)
 
     def let_pass(self, transaction: Transaction) -> None:
         """Send a transaction although its sequence may not begin: a stop is queued behind it."""

@@ -315,7 +315,8 @@ def test_r13_a_lost_port_and_why_it_does_not_come_back_are_told_on_standard_erro
             _, err = process.communicate(timeout=PATIENCE)
     assert told == [
         f"busmaster: the line is down: {link} was lost: it hung up\n",
-        f"busmaster: cannot connect: {link} does not exist; plug it in or start its emulator, or see `python -m serial.tools.list_ports`\n",
+        f"busmaster: cannot connect: {link} does not exist; plug it in or start its emulator, "
+        "or see `python -m serial.tools.list_ports`\n",
         "busmaster: the line is up\n",
     ]
     assert process.returncode == 130

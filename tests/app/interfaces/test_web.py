@@ -608,7 +608,10 @@ async def test_interfaces_with_pages_that_come_and_go_leave_nothing_with_the_lin
 
 @pytest.mark.asyncio
 async def test_a_port_that_is_taken_is_one_sentence() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InvalidCommand, match="is in use by another program"):
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(InvalidCommand, match="is in use by another program"),
+    ):
         async with serving(None, taken.getsockname()):
             pass
 

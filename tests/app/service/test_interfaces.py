@@ -169,7 +169,9 @@ def test_a_port_that_is_taken_leaves_no_socket_behind(tmp_path: Path) -> None:
     async def run() -> None:
         with socket.create_server(LOOPBACK) as other:
             where = other.getsockname()
-            with pytest.raises(InvalidCommand, match=f"127.0.0.1:{where[1]} is in use by another program; end that one"):
+            with pytest.raises(
+                InvalidCommand, match=f"127.0.0.1:{where[1]} is in use by another program; end that one"
+            ):
                 await served(tmp_path, listen=where).__aenter__()
         assert os.listdir(tmp_path) == []
 

@@ -39,3 +39,11 @@ def test_each_world_has_a_name_of_its_own() -> None:
     named = [setup for group in GROUPS for setup in GROUPS[group]()]
     assert len({setup.name for setup in named}) == len(set(named))
     assert {setup.name for setup in worlds(list(GROUPS))} == {setup.name for setup in named}
+
+
+@pytest.mark.slow
+def test_each_world_can_be_explored() -> None:
+    """Not to the end: each can be begun, saved and restored. Once, nobody noticed that those of sequences could not."""
+    for setup in worlds(list(GROUPS)):
+        seconds = 1.0 if setup.longest_hold > 0 else 0.05  # a sequence must have ended
+        assert Explorer(setup).run(seconds).events, setup.name
