@@ -307,7 +307,10 @@ async def test_while_another_device_has_the_name_every_request_says_so_and_what_
         while not isinstance(event := await anext(events), PortFailed) or "does not exist" not in event.cause:
             pass
         for request in (axis.read(1), axis.write(1, 5)):
-            with pytest.raises(LineDown, match=rf"the line is down: {name} does not exist: .*; plug it in, or see"):
+            with pytest.raises(
+                LineDown,
+                match=rf"the line is down: {name} does not exist: .*; plug it in or start its emulator, or see",
+            ):
                 await request
         give(name, other)
         while not isinstance(event := await anext(events), PortFailed) or "is now" not in event.cause:

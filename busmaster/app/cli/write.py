@@ -109,12 +109,9 @@ async def write(
 
 def items_of(handle: Handle, one: Assignment) -> list[str]:
     """Return the items that an assignment writes: the named one and those after it."""
-    if len(one.values) == 1:
+    if len(one.values) == 1 or ":" in one.item:  # the item has the number of values
         return [one.item]
-    try:
-        return list(ext.run_items(handle, one.item.partition(":")[0], len(one.values)))
-    except InvalidCommand:  # several values of one item
-        return [one.item]
+    return list(ext.run_items(handle, one.item, len(one.values)))
 
 
 async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json: bool) -> None:

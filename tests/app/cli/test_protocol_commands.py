@@ -55,7 +55,7 @@ def test_msc_values_in_a_row_need_the_address_step(msc: Ask) -> None:
     refused = msc("write", "3000=1,2,3")
     assert (refused.status, refused.out) == (2, "")
     assert "address step" in refused.err
-    assert msc("write", "3000=1,-2,3", "--address-step", "4", "--verify").out == "3000 ok\n"
+    assert msc("write", "3000=1,-2,3", "--address-step", "4", "--verify").out == "3000 ok\n3004 ok\n3008 ok\n"
     assert msc("write", "3012:1=4", "--verify").out == "3012:1 ok\n"
     assert msc("read", "3000:3", "--address-step", "4").lines == ["3000 1", "3004 -2", "3008 3"]
     assert without_time(msc("read", "3000:3", "--json").out) == {"node": 3, "item": "3000:3", "value": [1, -2, 3]}
@@ -85,7 +85,7 @@ def test_msc_refuses_before_anything_is_sent(msc: Ask, assignment: str, complain
 @pytest.mark.slow
 def test_mentor_parameters_wide_integers_and_runs(mentor: Ask) -> None:
     assert mentor("write", "1.17=-476", "15.60:wide=54321", "--verify").lines == ["1.17 ok", "15.60:wide ok"]
-    assert mentor("write", "1.18=1,2").out == "1.18 ok\n"
+    assert mentor("write", "1.18=1,2").out == "1.18 ok\n1.19 ok\n"
     assert mentor("read", "1.17", "01.17", "1.17:hires", "15.60:wide").lines == [
         "1.17 -476",
         "01.17 -476",
@@ -123,7 +123,7 @@ def test_mentor_says_that_a_parameter_does_not_exist(mentor: Ask) -> None:
 def test_dc104_takes_no_node_and_raw_16_bit_values(busmaster: Command) -> None:
     with serve("dc104", 0) as server:
         dc104 = ("--protocol", "dc104")
-        assert busmaster("write", server.path, *dc104, "1=65535", "5=1,2", "--verify").lines == ["1 ok", "5 ok"]
+        assert busmaster("write", server.path, *dc104, "1=65535", "5=1,2", "--verify").lines == ["1 ok", "5 ok", "6 ok"]
         assert busmaster("read", server.path, *dc104, "1", "5", "6").lines == ["1 65535", "5 1", "6 2"]
         assert json.loads(busmaster("read", server.path, *dc104, "1", "--json").out)["node"] is None
         for wrong in ("1=-1", "1=65536", "1=1.5", "0=1", "256=1"):
@@ -137,7 +137,7 @@ def test_dc104_takes_no_node_and_raw_16_bit_values(busmaster: Command) -> None:
 def test_hcp_elements_end_at_99(busmaster: Command) -> None:
     with serve("hcp", 15) as server:
         hcp = ("--protocol", "hcp", "--node", "15")
-        assert busmaster("write", server.path, *hcp, "98=.5,-1", "--verify").out == "98 ok\n"
+        assert busmaster("write", server.path, *hcp, "98=.5,-1", "--verify").out == "98 ok\n99 ok\n"
         assert busmaster("read", server.path, *hcp, "98", "99").lines == ["98 0.5", "99 -1"]
         assert busmaster("read", server.path, *hcp, "100").status == 2
         assert busmaster("write", server.path, *hcp, "99=1,2").status == 2
@@ -163,7 +163,7 @@ def test_a_rate_that_no_device_has_is_said_once_and_the_command_goes_on(
 def test_decimals_of_a_write_are_said_with_it(mentor: Command) -> None:
     assert mentor("write", "1.17=-47.6", "--decimals", "1").out == "1.17 ok\n"
     assert mentor("read", "1.17").out == "1.17 -476\n"
-    assert mentor("write", "1.17=1.5,-2.5", "--decimals", "1").out == "1.17 ok\n"
+    assert mentor("write", "1.17=1.5,-2.5", "--decimals", "1").out == "1.17 ok\n1.18 ok\n"
     assert mentor("read", "1.17:2").lines == ["1.17 15", "1.18 -25"]
 
 

@@ -97,6 +97,7 @@ def test_run_as_json_is_a_line_a_cycle_under_the_files_names(line: Path) -> None
     assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "quality", "error", "late"}
 
 
+PLUG_IT_IN = "plug it in or start its emulator, or see `python -m serial.tools.list_ports`"
 SPARED = "busmaster: if 1% of all frames are lost, the schedule needs "
 UNLEARNED = TEXT.replace('timing = "learned"', "")
 FEW = UNLEARNED.replace("period = 0.02", "period = 60").replace("period = 0.1", "period = 60")
@@ -315,8 +316,7 @@ def test_r13_a_lost_port_and_why_it_does_not_come_back_are_told_on_standard_erro
             _, err = process.communicate(timeout=PATIENCE)
     assert told == [
         f"busmaster: the line is down: {link} was lost: it hung up\n",
-        f"busmaster: cannot connect: {link} does not exist; plug it in or start its emulator, "
-        "or see `python -m serial.tools.list_ports`\n",
+        f"busmaster: cannot connect: {link} does not exist; {PLUG_IT_IN}\n",
         "busmaster: the line is up\n",
     ]
     assert process.returncode == 130
