@@ -1,10 +1,10 @@
-"""Decides whether a transaction may be sent now (R6, R7, R11, R12). No other place decides this.
+"""Decides whether a transaction may be sent now (R6, R7, R11, R12). No other place decides this for a caller's request.
 
 A rule that rejects or delays requests is one condition here. docs/adding-a-rule.md shows how to add one.
 
 It is called when a request arrives, when a poll is due, when a transaction is next, and when a read may go before it.
 Two decisions are made elsewhere: whose turn it is and whether a sequence may begin (`Backlog`), and whether the reply
-could be mistaken for an overdue one (`Choice`).
+could be mistaken for an overdue one (`Choice`). Sync reads have no caller, and are sent without this decision.
 """
 
 from __future__ import annotations

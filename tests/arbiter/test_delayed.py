@@ -198,3 +198,19 @@ def test_the_places_of_ended_requests_are_released() -> None:
     assert delayed.due(1.0) == [kept]
     assert delayed.due(2.0) == []
     assert (delayed.live, deadlines.delayed) == (0, inf)
+
+
+def test_many_delayed_requests_are_not_sorted_anew_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    delayed, node = Delayed(Deadlines()), Bench().node()
+    rebuilt: list[int] = []
+    keep = Delayed._keep
+
+    def counted(self: Delayed, entries: list[tuple[float, int, Transaction]]) -> None:
+        rebuilt.append(len(entries))
+        keep(self, entries)
+
+    monkeypatch.setattr(Delayed, "_keep", counted)
+    for number in range(1000):
+        delayed.add(Transaction(node, hcp2.Read(1)), float(number))
+    assert len(rebuilt) <= 5
+    assert delayed.live == 1000
