@@ -257,8 +257,11 @@ def test_a_save_and_a_load_of_other_drives_go_on_after_the_port_was_lost(protoco
     assert "two.toml.part; the same command continues there" in lost.err
     again, rest = save("two")
     assert again.status == 0, again.err
-    assert "were read before; continuing" in again.err
-    assert rest < frames
+    counted = re.search(r"(\d+) of (\d+) were read before; continuing", again.err)
+    assert counted is not None
+    assert 0 < int(counted[1]) < int(counted[2])
+    # MSC: the unit sends its packet again, because the port was lost with the ACK, which costs frames of its own.
+    assert rest < frames or protocol == "msc"
     assert values("two") == values("whole")
 
     preset(device, case.other)
