@@ -366,8 +366,8 @@ class Delayed:
     def _keep(self, entries: list[tuple[float, int, Transaction]]) -> None:
         heapq.heapify(entries)
         self._heap = entries
-        self._most = 2 * len(entries) + SLACK
         self._changed()
+        self._most = 2 * self.live + SLACK
 
     def _changed(self) -> None:
         self.live = len(self._heap)
