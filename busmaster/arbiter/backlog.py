@@ -320,7 +320,7 @@ class Delayed:
     A write also stays in its node's queue of writes, so that no later write overtakes it.
     """
 
-    __slots__ = ("_deadlines", "_heap", "_most", "_order", "live")
+    __slots__ = ("_deadlines", "_heap", "_most", "_order", "_places", "live")
 
     def __init__(self, deadlines: Deadlines) -> None:
         self._deadlines = deadlines
@@ -328,6 +328,8 @@ class Delayed:
         self._most = SLACK
         """Number of entries at which those that have ended are removed."""
         self._order = count()
+        self._places: dict[Transaction, int] = {}
+        """The latest entry of each. The end of another write may release a delayed write, which is then added again."""
         self.live = 0
         """Number of entries, including those that have ended in the meantime."""
 
@@ -336,36 +338,45 @@ class Delayed:
         transaction.phase = PARKED
         if self.live >= self._most:
             # In bulk: at each addition, 900 waiting requests would block the line for 50 ms.
-            self._keep([entry for entry in self._heap if entry[2].phase is PARKED])
-        heapq.heappush(self._heap, (until, next(self._order), transaction))
+            self._keep([entry for entry in self._heap if self._is_delayed(entry)])
+        self._places[transaction] = place = next(self._order)
+        heapq.heappush(self._heap, (until, place, transaction))
         self._changed()
 
     def due(self, now: float) -> list[Transaction]:
         """Remove and return the transactions that may be sent now, in order. Those that have ended are left out."""
         due: list[Transaction] = []
         while self._heap and self._heap[0][0] <= now:
-            due.append(heapq.heappop(self._heap)[2])
+            entry = heapq.heappop(self._heap)
+            if self._is_delayed(entry):
+                due.append(entry[2])
+            if self._places.get(entry[2]) == entry[1]:
+                del self._places[entry[2]]
         self._changed()
-        return [transaction for transaction in due if transaction.phase is PARKED]
+        return due
 
     def waiting_of(self, priority: Priority, client: LineClient | None) -> int:
         """Return the number of delayed transactions of this class and client."""
         who = turn_of(client)
-        return sum(t.priority is priority and turn_of(t.client) is who for _, _, t in self._heap if t.phase is PARKED)
+        return sum(t.priority is priority and turn_of(t.client) is who for t in self._places if t.phase is PARKED)
 
     def of(self, hold: Hold) -> list[Transaction]:
         """Return the delayed transactions of a sequence."""
-        return [entry[2] for entry in self._heap if entry[2].client is hold and entry[2].phase is PARKED]
+        return [delayed for delayed in self._places if delayed.client is hold and delayed.phase is PARKED]
 
     def drain(self) -> list[Transaction]:
         """Remove and return all transactions, of which the writes are in a queue of writes too."""
-        left = [entry[2] for entry in self._heap if entry[2].phase is PARKED]
+        left = [delayed for delayed in self._places if delayed.phase is PARKED]
         self._keep([])
         return left
+
+    def _is_delayed(self, entry: tuple[float, int, Transaction]) -> bool:
+        return entry[2].phase is PARKED and self._places.get(entry[2]) == entry[1]
 
     def _keep(self, entries: list[tuple[float, int, Transaction]]) -> None:
         heapq.heapify(entries)
         self._heap = entries
+        self._places = {transaction: place for _, place, transaction in entries}
         self._changed()
         self._most = 2 * self.live + SLACK
 

@@ -210,9 +210,8 @@ class Dispatcher:
         node, counters = transaction.node, self.counters
         transaction.queued = now
         transaction.deadline = now + RETRY_PATIENCE
-        transaction.exchanges_ahead = (
-            counters.exchanges
-        )  # same as `_store_counts`, written out: this runs for every request
+        # same as `_store_counts`, written out: this runs for every request
+        transaction.exchanges_ahead = counters.exchanges
         transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING]
         # Checked again for each request and not only at the loss: requests keep arriving while the line is down.
         if self.fault is not None:

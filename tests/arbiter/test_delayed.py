@@ -214,3 +214,27 @@ def test_many_delayed_requests_are_not_sorted_anew_for_each(monkeypatch: pytest.
         delayed.add(Transaction(node, hcp2.Read(1)), float(number))
     assert len(rebuilt) <= 5
     assert delayed.live == 1000
+
+
+def test_r8_a_delayed_write_that_is_woken_early_is_sent_once(table: Table) -> None:
+    bench = table.bench
+    first, second = (bench.ask(table.slow, hcp2.Write(1, (value,))) for value in (1, 2))
+    bench.arbiter.cancel(second, bench.now)  # its end wakes the first, which is delayed again
+    bench.served(bench.ask(table.other))
+    bench.to(table.until)
+    bench.served(first)
+    bench.served(bench.ask(table.other))
+    assert bench.ended(first) == 1
+    assert len(bench.arbiter.dispatcher.backlog) == 0
+
+
+def test_r8_a_delayed_write_of_a_sequence_that_is_woken_early_ends_once(table: Table) -> None:
+    bench = table.bench
+    hold = bench.arbiter.exclusive(table.slow, None, 5.0)
+    first, second = (bench.ask(table.slow, hcp2.Write(1, (value,)), client=hold) for value in (1, 2))
+    bench.arbiter.cancel(second, bench.now)
+    bench.served(bench.ask(table.other))
+    bench.arbiter.release(hold, bench.now)
+    bench.listen()
+    assert bench.ended(first) == 1
+    assert isinstance(first.error, HoldEnded)

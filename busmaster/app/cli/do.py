@@ -164,7 +164,7 @@ class RecordedNode(HeldNode):
             try:
                 self._node.check(command, stop=stop)
             except InvalidCommand as error:
-                self._line.authorisation.refuse(self._wish(command), str(error))
+                self._line.authorisation.refuse(self._write_request(command), str(error))
                 raise
 
     @asynccontextmanager
@@ -186,10 +186,10 @@ class RecordedNode(HeldNode):
         """Do as the node does. A write is on record, however it ends."""
         if not command.writes:
             return await self._node.request(command, stops_seen=stops_seen, **options)
-        with self._line.authorisation.begin(self._wish(command)):
+        with self._line.authorisation.begin(self._write_request(command)):
             return await self._node.request(command, touches=touches, stops_seen=stops_seen, stop=stop, **options)
 
-    def _wish(self, command: Command[Any]) -> WriteRequest:
+    def _write_request(self, command: Command[Any]) -> WriteRequest:
         """Return the audit entry of a write: its point and value, or the command if no point matches."""
         for item in (*self._line.file.nodes[self._name].points, *self._handle.items()):
             point = self._line.point(f"{self._name}/{item}")
@@ -197,8 +197,8 @@ class RecordedNode(HeldNode):
                 changes = command.changes(self.profile)
                 if changes.keys() == set(point.command.places):
                     value = point.value_of(point.command.shown(changes))
-                    return self._wish_of(point.key, point, value)
-        return self._wish_of(f"{self._name}/{RAW_COMMAND}", None, str(command))
+                    return self._write_request_of(point.key, point, value)
+        return self._write_request_of(f"{self._name}/{RAW_COMMAND}", None, str(command))
 
-    def _wish_of(self, name: str, point: Point[Any] | None, value: Any) -> WriteRequest:
+    def _write_request_of(self, name: str, point: Point[Any] | None, value: Any) -> WriteRequest:
         return WriteRequest(interface="command line", by=self._by, name=name, point=point, value=value)

@@ -18,7 +18,7 @@ from busmaster.app.service.permission import Permission
 from busmaster.app.service.record import Outcome
 from busmaster.bounds import LONGEST_SAFE_STATE
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
-from busmaster.ext import Changing, Command, Handle, Send
+from busmaster.ext import Command, Handle, Send
 
 LOOK_AGAIN = 0.05
 """Seconds from a failure to the next try at the same node."""
@@ -54,7 +54,10 @@ class SafeWrite:
         node = Node.of(point)
         if node.address == node.profile.broadcast:
             raise InvalidCommand(f"{point.key} is a broadcast, which no node confirms; write the point of each node")
-        _check_limits(node, command)
+        # No limit applies when the safe state is sent, so a mistyped value would be. 0 usually stops a drive, so it is
+        # allowed below a minimum too.
+        if value != 0:
+            node.check(command)
         item, number = point.source.item, point.unscaled(value)
 
         def prepare(within: float) -> Send:
@@ -72,19 +75,6 @@ class SafeWrite:
 
         prepare(LONGEST_SAFE_STATE)  # what would be refused at the end is refused when the file is read
         return cls(point, value, node, command, prepare)
-
-
-def _check_limits(node: Node, command: Command[None]) -> None:
-    """Raise InvalidCommand for a value beyond a limit of the file. 0 is allowed below a minimum too: it is a stop.
-
-    The limits are not applied when the safe state is sent, so a mistyped value would be.
-    """
-    if not isinstance(command, Changing):
-        return
-    changes = command.changes(node.profile)
-    for limit in node.limits:
-        if limit.writable and limit.touched_by(changes) and (value := limit.value_after(changes)) != 0:
-            limit.check(value)
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,7 @@ class Listener:
     def __init__(self) -> None:
         self._lost = 0
         self._heard: list[tuple[float, bool, bytes, Attempt | None]] = []
-        self._passages: deque[TracedExchange] = deque()
+        self._exchanges: deque[TracedExchange] = deque()
         self._last: TracedExchange | None = None
         self._has_begun = False
         """An attempt has begun. Earlier bytes can be the reply to an attempt that was not recorded."""
@@ -82,9 +82,9 @@ class Listener:
         """Return the completed exchanges in their order, and the number of all that were dropped."""
         self._put_in_order()
         over: list[TracedExchange] = []
-        while self._passages and self._passages[0].is_over:
-            over.append(self._passages.popleft())
-        if not self._passages:
+        while self._exchanges and self._exchanges[0].is_over:
+            over.append(self._exchanges.popleft())
+        if not self._exchanges:
             self._last = None
         return over, self._lost
 
@@ -102,9 +102,9 @@ class Listener:
     def _begin(self, attempt: Attempt | None) -> TracedExchange:
         self._has_begun = True
         self._last = exchange = TracedExchange(attempt)
-        self._passages.append(exchange)
-        if len(self._passages) > MOST_KEPT:
-            self._passages.popleft()
+        self._exchanges.append(exchange)
+        if len(self._exchanges) > MOST_KEPT:
+            self._exchanges.popleft()
             self._lost += 1
         return exchange
 
@@ -122,11 +122,11 @@ class ExchangesBroadcast(Broadcast):
         try:
             while True:
                 parts: list[str] = []
-                passages, left_out = listener.take()
-                for first in range(0, len(passages), ENCODED_AT_ONCE):
+                exchanges, left_out = listener.take()
+                for first in range(0, len(exchanges), ENCODED_AT_ONCE):
                     if first:
                         await asyncio.sleep(0)
-                    parts.append(encoded(list(map(exchange_to_json, passages[first : first + ENCODED_AT_ONCE])))[1:-1])
+                    parts.append(encoded(list(map(exchange_to_json, exchanges[first : first + ENCODED_AT_ONCE])))[1:-1])
                 head = encoded({"now": self._bus.now(), "left_out": left_out})
                 yield "exchanges", f'{head[:-1]},"exchanges":[{",".join(parts)}]}}'
                 await asyncio.sleep(INTERVAL)

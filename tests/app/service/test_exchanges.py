@@ -146,7 +146,7 @@ def test_of_a_flood_no_more_is_kept_than_is_told() -> None:
     for number in range(10 * HEARD_AT_ONCE):
         listener.received(float(number), b"x" * 1000, None)
         assert len(listener._heard) < HEARD_AT_ONCE
-    assert sum(len(passage.said) for passage in listener._passages) <= 2
+    assert sum(len(passage.said) for passage in listener._exchanges) <= 2
 
 
 def test_of_too_many_exchanges_the_oldest_are_left_out_and_counted() -> None:
