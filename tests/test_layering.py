@@ -57,7 +57,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "emulator": {"emulator", "wire"} | BASE,
     "emulator.world": {"emulator", "wire", "arbiter"} | BASE,
     "emulator.memory": {"emulator", "transport"} | BASE,
-    "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
+    "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable"} | BASE,
     "capture": {"capture", "wire", "registry", "arbiter.tap", "files"} | BASE,
     "testing": LIBRARY - {"protocols"},
     "__init__": LIBRARY | ON_DEMAND,
@@ -111,7 +111,7 @@ OPEN: dict[str, set[str]] = {
 
 A protocol's folder is open to its own, to those that build on it, and to the root, which offers its handles.
 """
-LISTENING = {"capture.decode", "capture.frames", "capture.telegrams"}
+LISTENING = {"capture.decode", "contract.frames", "capture.telegrams"}
 PARTS: dict[str, set[str]] = {
     "codec": {"wire"} | BASE,
     "handle": {"bus.requester", "bus.parameters", "bus.points", "bus.handle"} | BASE,

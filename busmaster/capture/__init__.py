@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from busmaster.capture.decode import DEFAULT_GAP, Decoder
     from busmaster.capture.files import COUNT, SIZE
-    from busmaster.capture.frames import Direction, Frame, Kind
     from busmaster.capture.pcapng import CaptureError, CutOff, Packet, read_packets
     from busmaster.capture.recorder import Recorder
     from busmaster.capture.replay import Replayed, replay_packets
+    from busmaster.contract.frames import Direction, Frame, Kind
 
 __all__ = [
     "COUNT",
@@ -41,9 +41,9 @@ _ON_DEMAND = {
     "CutOff": "busmaster.capture.pcapng",
     "DEFAULT_GAP": "busmaster.capture.decode",
     "Decoder": "busmaster.capture.decode",
-    "Direction": "busmaster.capture.frames",
-    "Frame": "busmaster.capture.frames",
-    "Kind": "busmaster.capture.frames",
+    "Direction": "busmaster.contract.frames",
+    "Frame": "busmaster.contract.frames",
+    "Kind": "busmaster.contract.frames",
     "Packet": "busmaster.capture.pcapng",
     "Recorder": "busmaster.capture.recorder",
     "Replayed": "busmaster.capture.replay",

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.pcapng import Outcome, Packet
+from busmaster.contract.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
 from busmaster.registry import NodeKind, find, protocols
 
 

@@ -6,44 +6,11 @@ separated by position, because any byte may be a checksum. After a silence an in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
-
-from busmaster.capture.frames import Direction, Frame, Kind
-from busmaster.contract.exchange import Command
+from busmaster.contract.frames import Dialect, Direction, Frame, Kind
 
 LONGEST_FRAME = 250
 DEFAULT_GAP = 0.1
 """Seconds of silence that end an incomplete frame: longer than any adapter's buffering, shorter than a retry."""
-
-
-class Dialect(Protocol):
-    """Separates and reads the frames of one protocol, and infers their senders. It remembers the last request."""
-
-    starts: bytes
-    """Bytes that can begin a frame."""
-
-    def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
-        """Return the length of the frame at the beginning of `data`, which is never empty.
-
-        0: the frame is incomplete. Negative: this many bytes are not a frame. With `quiet` no more bytes follow, and
-        the length is never 0.
-        """
-        ...
-
-    def explain(self, raw: bytes, sender: Direction, /) -> Frame:
-        """Return the contents of a whole frame.
-
-        An UNKNOWN `sender` is inferred from the frame and the requests before it.
-        """
-        ...
-
-    def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
-        """Return the command of a request, with what the host sent later in the same exchange.
-
-        Raises InvalidCommand, ValueError or KeyError for a request that no command would send.
-        """
-        ...
 
 
 class Decoder:
@@ -145,5 +112,4 @@ __all__ = [
     "DEFAULT_GAP",
     "LONGEST_FRAME",
     "Decoder",
-    "Dialect",
 ]

@@ -32,7 +32,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple, Protocol
 
-from busmaster.capture.frames import Direction
+from busmaster.contract.frames import Direction
 from busmaster.registry import find, kinds
 
 LINK_TYPE = 157

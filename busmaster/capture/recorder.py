@@ -16,8 +16,8 @@ from types import TracebackType
 from busmaster.arbiter.tap import Attempt
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.files import COUNT, SIZE, CaptureFiles
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Packet, PcapngWriter
+from busmaster.contract.frames import Direction
 
 CAPACITY = 50_000
 """Events that can wait for the disk: minutes of a line at 57600 baud."""

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.contract.driver import Driver, Ending
 from busmaster.contract.exchange import Abandonable, Command, FrameError
+from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.registry import Protocol, find

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.wire.characters import made_of
 
 STX, ETX, EOT, ENQ, ACK, BEL, BS, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x15

@@ -17,8 +17,8 @@ from busmaster.errors import InvalidCommand
 
 if TYPE_CHECKING:  # so that a master does not import the emulator
     from busmaster.bus.handle import Handle
-    from busmaster.capture.decode import Dialect
     from busmaster.contract.exchange import Command
+    from busmaster.contract.frames import Dialect
     from busmaster.contract.profile import Profile
     from busmaster.emulator.device import Device
 

@@ -23,9 +23,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.errors import InvalidCommand
 from busmaster.registry import Protocol
 from busmaster.testing.cases import Case, NotConformant

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import Direction, Frame
+from busmaster.contract.frames import Direction, Frame
 from busmaster.registry import find
 
 HOST, NODE, UNKNOWN = Direction.HOST, Direction.NODE, Direction.UNKNOWN

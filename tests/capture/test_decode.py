@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.errors import InvalidCommand
 from busmaster.registry import find, kinds
 from busmaster.testing.damage import garbage_chunks

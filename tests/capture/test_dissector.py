@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture import DISSECTOR, pcapng
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
+from busmaster.contract.frames import Direction
 from busmaster.protocols._comms.elements import Element
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.comms_array import ELEMENTS as CONTROLLER

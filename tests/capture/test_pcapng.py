@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import CaptureError, Outcome, Packet, PcapngWriter, read_packets
+from busmaster.contract.frames import Direction
 from busmaster.registry import kinds
 
 HEAD = bytes.fromhex(

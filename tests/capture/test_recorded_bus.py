@@ -10,10 +10,10 @@ import anyio
 import pytest
 
 from busmaster.bus.bus import Bus
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.capture.replay import replay_packets
+from busmaster.contract.frames import Direction
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort

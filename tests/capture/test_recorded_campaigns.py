@@ -8,9 +8,9 @@ import pytest
 
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, PcapngWriter, read_packets
 from busmaster.capture.replay import replay_packets
+from busmaster.contract.frames import Direction
 from tests.tiers import in_turn_by_default
 from tests.verification.campaigns.hunt import Hunt
 from tests.verification.campaigns.kinds import KINDS

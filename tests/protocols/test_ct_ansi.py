@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, CtAnsiDrive, InvalidCommand, MemoryPort, NoSuchParameter, Refused, VerifyFailed
-from busmaster.capture.frames import Kind
 from busmaster.contract.exchange import Done
+from busmaster.contract.frames import Kind
 from busmaster.emulator.line import Line
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.device import EmulatedCtAnsi

@@ -11,8 +11,8 @@ import pytest
 
 from busmaster import ext
 from busmaster.bus.bus import Bus
-from busmaster.capture.frames import UNEXPECTED, Direction, Frame
 from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError
+from busmaster.contract.frames import UNEXPECTED, Direction, Frame
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort

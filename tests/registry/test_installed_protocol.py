@@ -16,10 +16,10 @@ from busmaster.app.config import emulated_line as line_of_file
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import FileError, Source
 from busmaster.app.line import ConfiguredLine
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.capture.replay import replay_packets
+from busmaster.contract.frames import Direction
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import discovery, find, kinds, make_device, protocols

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from busmaster.capture.decode import Dialect
-from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import Dialect, Direction, Frame, Kind
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.protocols.hcp import PROTOCOL as HCP
 from busmaster.protocols.hcp.capture import HcpDialect

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.telegrams import (
     ACK,
     ANSWERS,
@@ -19,6 +18,7 @@ from busmaster.capture.telegrams import (
     field_end,
 )
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.protocols._comms.codec import ReadElement, WriteElements
 from busmaster.wire.checks import xor
 

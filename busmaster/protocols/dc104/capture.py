@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.protocols.dc104.codec import Read, Write
 from busmaster.wire.checks import sum8
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.telegrams import (
     ACK,
     ANSWERS,
@@ -24,6 +23,7 @@ from busmaster.capture.telegrams import (
     number,
 )
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.ei_bisynch.codec import Read, ReadRun, Write
 from busmaster.wire.checks import bcc, xor

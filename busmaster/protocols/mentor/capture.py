@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.capture.telegrams import (
     ACK,
     ANSWERS,
@@ -24,6 +23,7 @@ from busmaster.capture.telegrams import (
     number,
 )
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
 from busmaster.wire.checks import bcc
 

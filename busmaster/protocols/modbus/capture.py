@@ -6,8 +6,8 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from busmaster.capture.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import UNEXPECTED, Direction, Frame, Kind
 from busmaster.protocols.modbus.codec import (
     BROADCAST,
     EXCEPTIONS,

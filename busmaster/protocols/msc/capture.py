@@ -6,8 +6,8 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from busmaster.capture.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
 from busmaster.contract.exchange import Command
+from busmaster.contract.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
 from busmaster.protocols.msc import codec
 from busmaster.wire.checks import sum16
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import read_packets
+from busmaster.contract.frames import Direction
 from busmaster.emulator.serve import TcpServer
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive

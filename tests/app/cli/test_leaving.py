@@ -17,8 +17,8 @@ import pytest
 
 from busmaster.app.line import open_line
 from busmaster.bus.requester import Priority
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import read_packets
+from busmaster.contract.frames import Direction
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_pty
 from busmaster.errors import Superseded, WriteUnconfirmed

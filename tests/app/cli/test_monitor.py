@@ -17,8 +17,8 @@ import pytest
 
 from busmaster.app.cli.monitor import Listener, json_text, plain_text
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import Frame
 from busmaster.capture.pcapng import Outcome, read_packets
+from busmaster.contract.frames import Frame
 from busmaster.errors import LineDown
 from busmaster.registry import find
 from tests.patience import PATIENCE

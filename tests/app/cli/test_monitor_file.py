@@ -24,7 +24,7 @@ from busmaster.app.config import load
 from busmaster.app.line import ConfiguredLine
 from busmaster.bus.samples import Quality, Sample
 from busmaster.capture.decode import Decoder
-from busmaster.capture.frames import Direction
+from busmaster.contract.frames import Direction
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import find
 from tests.app.cli.conftest import started

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from busmaster.app.cli import main
-from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
+from busmaster.contract.frames import Direction
 
 REQUEST = bytes.fromhex("07 46 46 02 36 39 05 08")
 REPLY = bytes.fromhex("02 36 39 34 30 39 36 03 07")

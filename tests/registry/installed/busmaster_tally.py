@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 
 from busmaster import InvalidCommand, Point, Refused
 from busmaster.bus.handle import Handle, unknown_item
-from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.contract.items import Item
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings

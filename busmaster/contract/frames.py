@@ -1,9 +1,13 @@
-"""The contents of a frame, in the form that recording, monitoring and replaying share."""
+"""Frames as a listener receives them, in the form that recording, monitoring and replaying share."""
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
+
+from busmaster.contract.exchange import Command
 
 UNEXPECTED = "unexpected"
 """Fault of a frame from a node without a request."""
@@ -80,9 +84,39 @@ class Frame:
                 return self.kind.upper()
 
 
+class Dialect(Protocol):
+    """Separates and reads the frames of one protocol, and infers their senders. It remembers the last request."""
+
+    starts: bytes
+    """Bytes that can begin a frame."""
+
+    def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
+        """Return the length of the frame at the beginning of `data`, which is never empty.
+
+        0: the frame is incomplete. Negative: this many bytes are not a frame. With `quiet` no more bytes follow, and
+        the length is never 0.
+        """
+        ...
+
+    def explain(self, raw: bytes, sender: Direction, /) -> Frame:
+        """Return the contents of a whole frame.
+
+        An UNKNOWN `sender` is inferred from the frame and the requests before it.
+        """
+        ...
+
+    def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
+        """Return the command of a request, with what the host sent later in the same exchange.
+
+        Raises InvalidCommand, ValueError or KeyError for a request that no command would send.
+        """
+        ...
+
+
 __all__ = [
     "UNACKED",
     "UNEXPECTED",
+    "Dialect",
     "Direction",
     "Frame",
     "Kind",
