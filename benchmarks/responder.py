@@ -30,7 +30,7 @@ LONGEST_REQUEST = 300
 class Wire:
     """One line: what it has heard, until when it is busy, and how long it lay dead before each request."""
 
-    __slots__ = ("_listening", "buffer", "busy_until", "dead", "delay", "fd", "requests", "said_at", "swallow", "tau")
+    __slots__ = ("_listening", "buffer", "busy_until", "dead", "delay", "fd", "requests", "sent_at", "swallow", "tau")
 
     def __init__(self, fd: int, tau: float, delay: float, swallow: bytes, listening: bool) -> None:
         self.fd = fd
@@ -39,7 +39,7 @@ class Wire:
         self.swallow = swallow
         self.buffer = b""
         self.busy_until = 0.0
-        self.said_at = 0.0
+        self.sent_at = 0.0
         self.requests = 0
         self.dead = array.array("d")
         self._listening: socket.socket | None = socket.socket(fileno=fd) if listening else None
@@ -89,7 +89,7 @@ class Responder:
             while due and due[0][0] <= clock():
                 _, _, wire, reply = heapq.heappop(due)
                 os.write(wire.fd, reply)
-                wire.said_at = clock()
+                wire.sent_at = clock()
 
     def _watch(self, wire: Wire) -> None:
         self._by_fd[wire.fd] = wire
@@ -125,11 +125,11 @@ class Responder:
             return
         wire.buffer = b""
         wire.requests += 1
-        if wire.said_at:
-            wire.dead.append(now - wire.said_at)
+        if wire.sent_at:
+            wire.dead.append(now - wire.sent_at)
         if not wire.tau and not wire.delay:
             os.write(wire.fd, b"".join(reply))
-            wire.said_at = time.monotonic()
+            wire.sent_at = time.monotonic()
             return
         at = max(now, wire.busy_until) + len(buffer) * wire.tau + wire.delay
         for part in reply:
@@ -149,7 +149,7 @@ class Responder:
         report = [{"requests": wire.requests, "dead": list(wire.dead)} for wire in self._wires]
         for wire in self._wires:
             wire.dead = array.array("d")
-            wire.said_at = 0.0
+            wire.sent_at = 0.0
         sys.stdout.write(json.dumps(report) + "\n")
         sys.stdout.flush()
 

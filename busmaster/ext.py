@@ -67,7 +67,7 @@ from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.items import Bit, Item
 from busmaster.contract.learning import Learned, documented
-from busmaster.contract.places import Changing, Placed, Telling
+from busmaster.contract.places import Changing, Placed, ReadsPlaces
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.files import FOLDER_MODE, MODE, check_regular, open_file, read_file
@@ -149,6 +149,7 @@ __all__ = [
     "Profile",
     "ReadAfterWrite",
     "ReadsAfterWrites",
+    "ReadsPlaces",
     "RecentUtilisation",
     "Request",
     "RequestOptions",
@@ -157,7 +158,6 @@ __all__ = [
     "Send",
     "SharedLine",
     "Tap",
-    "Telling",
     "Transaction",
     "Value",
     "Verdict",

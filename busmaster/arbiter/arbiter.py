@@ -202,10 +202,10 @@ class Arbiter:
         The process may have been suspended in between. The clock is read after the write (R2).
         """
         output = self._wire.output
-        said_at = output.said_at
-        late = now - said_at
+        sent_at = output.sent_at
+        late = now - sent_at
         if late > 0.0:
-            output.said_at = now
+            output.sent_at = now
             step = self._step  # Same as `step.shift`, written out: this runs for every request.
             step.end += late
             step.out += late
@@ -217,7 +217,7 @@ class Arbiter:
             # Not for an ACK within the exchange: its request left earlier, and the overdue reply can be as old as that
             # request.
             asked = self._wire.transaction
-            if late > LOOK_SLACK and output.begins and asked is not None and asked.started == said_at:
+            if late > LOOK_SLACK and output.begins and asked is not None and asked.started == sent_at:
                 asked.started = now
 
     def line_due(self, now: float) -> bool:
@@ -432,7 +432,7 @@ class Arbiter:
                 wire.learn(now)
         # MSC: the packet is acknowledged before its caller is notified, because the unit repeats it until then.
         if progress.send:
-            wire.say(progress.send, now)
+            wire.send(progress.send, now)
         wire.transaction = wire.exchange = None  # `trust.held` is None here: a held reply has been evaluated again
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, progress.value, now)
@@ -492,10 +492,10 @@ class Arbiter:
         # for the next 30 s ambiguous replies are held.
         both = error.what is TWO_ANSWERS
         if both:
-            self._in_sync.said_twice(now)
+            self._in_sync.answered_twice(now)
         self._trust.add_overdue(self._wire, heard=not no_reply, whole=error.whole or both)
         if error.send:
-            self._wire.say(error.send, now)
+            self._wire.send(error.send, now)
         self._end_exchange()
         if bug is None:
             self.dispatcher.attempt_failed(transaction, no_reply, error, now, ambiguous)
@@ -625,7 +625,7 @@ class Arbiter:
         """Send an acknowledgement for an unexpected packet (MSC). Returns True if `send` is not empty; then the line
         resynchronises."""
         if send:
-            self._wire.say(send, now)
+            self._wire.send(send, now)
             # `_resynchronise` below forgets pending echoes.
             overdue = self._echo.pending
             self._resynchronise(now)
@@ -879,7 +879,7 @@ class Arbiter:
         return data
 
     @property
-    def said_until(self) -> float:
+    def sent_until(self) -> float:
         """Time at which all sent bytes are on the wire, in seconds on the caller's clock, if the port holds none
         back."""
         return self._step.out

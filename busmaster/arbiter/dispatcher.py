@@ -261,7 +261,6 @@ class Dispatcher:
     def next(self, now: float) -> Transaction | None:
         """Remove and return the transaction to send now, or None."""
         while (transaction := self.backlog.pop(now)) is not None:
-            # same as `eligibility`, written out: this runs for every request (benchmark `turnaround`)
             verdict = eligibility(transaction, now, self.writes, self.fault)
             if verdict is OK or (acted := self._act_on(verdict, transaction, now)) is OK:
                 return transaction

@@ -87,12 +87,12 @@ class NodeRecord:
         "profile",
         "removed",
         "replies",
+        "reported_late",
         "retries",
         "slowest",
         "stops",
         "suspended_until",
         "timings",
-        "told_late",
         "unheard",
         "up_since",
         "usual",
@@ -144,7 +144,7 @@ class NodeRecord:
         self.max_reply_delay_until = inf
         """When a raised maximum reply delay is restored, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
-        self.told_late = 0.0
+        self.reported_late = 0.0
         """Time in seconds to the first byte of the latest reply that was reported as late."""
 
     def __repr__(self) -> str:

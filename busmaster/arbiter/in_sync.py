@@ -52,7 +52,7 @@ AMBIGUOUS_DELAYS = 3.0
 """A reply like one that was considered overtaken is ambiguous for this many maximum reply delays."""
 AMBIGUITY_PERIOD = 30.0
 """Seconds after a duplicate reply for which replies like recent ones are ambiguous."""
-SAID_MEMORY = 0.5
+ANSWER_MEMORY = 0.5
 """Seconds after a delivered reply in which a duplicate of it can arrive."""
 RECENT = 128
 """Number of exchanges whose replies may be duplicated: about as many as fit into the longest maximum reply delay."""
@@ -109,8 +109,8 @@ class InSync:
     __slots__ = (
         "_ambiguous",
         "_ambiguous_until",
+        "_answered",
         "_forgiven",
-        "_said",
         "alert",
         "last",
         "lone_bytes_until",
@@ -133,7 +133,7 @@ class InSync:
         self.lone_bytes_until = -inf
         """Until this time a single byte may be the reply to a frame that an earlier master left unfinished; inf until
         the first frame was sent."""
-        self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
+        self._answered: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
         self._ambiguous_until = inf if strict else -inf
 
     # overdue replies
@@ -289,7 +289,7 @@ class InSync:
         contained = any(len(key) > 1 and key in rest for key in recent)
         alike = any(_is(rest, key) for key in recent)
         if contained or (alike and not payers):
-            self.said_twice(now)
+            self.answered_twice(now)
         # The rest is part of an unknown reply, whose last byte may still arrive and look like an ACK.
         if payers or not alike:
             self.add_overdue((ANY_BYTE,), None, now, now)
@@ -349,17 +349,17 @@ class InSync:
 
     # ambiguous replies
 
-    def said_twice(self, now: float) -> None:
+    def answered_twice(self, now: float) -> None:
         """Record a duplicate reply: for AMBIGUITY_PERIOD, replies like recent ones are ambiguous."""
         # `max`: in a strict bus it is infinite.
         self._ambiguous_until = max(self._ambiguous_until, now + AMBIGUITY_PERIOD)
         self.alert = True
 
-    def said(self, answers: Sequence[bytes], now: float) -> None:
+    def note_answered(self, answers: Sequence[bytes], now: float) -> None:
         """Remember a delivered reply, to recognise a duplicate of it."""
         # Remembered only after a first duplicate: a healthy line must not pay for this with each reply.
         if now < self._ambiguous_until:
-            self._said.append((answers, now))
+            self._answered.append((answers, now))
 
     def has_ambiguity(self, now: float) -> bool:
         """Return True if a duplicate reply was received in the last AMBIGUITY_PERIOD seconds."""
@@ -399,10 +399,10 @@ class InSync:
             return True
         if now >= self._ambiguous_until:
             return False
-        for said, when in reversed(self._said):
-            if now - when > SAID_MEMORY:
+        for answered, when in reversed(self._answered):
+            if now - when > ANSWER_MEMORY:
                 return False
-            if any(key in answers for key in said):
+            if any(key in answers for key in answered):
                 return True
         return False
 

@@ -139,22 +139,22 @@ class Step:
         self.taint_until = -inf
         """Bytes received before this time cannot be its reply."""
 
-    def say(self, count: int, now: float) -> None:
+    def add_sent(self, count: int, now: float) -> None:
         """Add the wire time of `count` bytes, sent behind all earlier ones."""
         # Behind all earlier bytes: MSC's closing ACK and the next request are written in one call.
         self.out = max(self.out, now) + count * self.byte_time
 
-    def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
-        """Start a step: `said` bytes sent, at most `longest` bytes of reply. Returns when the reply must have begun."""
+    def begin(self, timing: ReplyTiming, sent: int, longest: int, now: float) -> float:
+        """Start a step: `sent` bytes sent, at most `longest` bytes of reply. Returns when the reply must have begun."""
         self.timing = timing
         self.longest = longest
         self.begun = False
         self.pause = 0.0
         out = self.out
         # no calls of `max`: this runs for every request
-        self.out = self.end = end = (out if out > now else now) + said * self.byte_time
-        if self.paced and said:  # if nothing is sent, the node continues by itself: MSC's packet follows its ACK
-            self.taint_until = now + TAINT_SHARE * said * self.byte_time
+        self.out = self.end = end = (out if out > now else now) + sent * self.byte_time
+        if self.paced and sent:  # if nothing is sent, the node continues by itself: MSC's packet follows its ACK
+            self.taint_until = now + TAINT_SHARE * sent * self.byte_time
         return end + timing.window + self.latency
 
     def gap_over(self, now: float) -> float:
@@ -255,7 +255,7 @@ HELD_LOOK = 0.002
 class Output:
     """The bytes to send on one line, and how the times of its step depend on when they leave."""
 
-    __slots__ = ("_echo", "_step", "begins", "held", "said_at", "waiting")
+    __slots__ = ("_echo", "_step", "begins", "held", "sent_at", "waiting")
 
     def __init__(self, step: Step, echo: Echo) -> None:
         self.waiting = b""
@@ -264,7 +264,7 @@ class Output:
         self._echo = echo
         self.held = False
         """The port had not sent all bytes when it was last queried."""
-        self.said_at = -inf
+        self.sent_at = -inf
         """The time from which the step of the last transmission is calculated."""
         self.begins = False
         """The last transmission contains a request, which starts when the port takes it."""
@@ -274,7 +274,7 @@ class Output:
         # A closing ACK alone starts no request; in front of one it does not hide it.
         self.begins = self.begins and bool(self.waiting)
         self.waiting += data
-        self.said_at = now
+        self.sent_at = now
         if self._echo.declared:
             self._echo.sent(data)
 
@@ -352,7 +352,7 @@ class OnWire:
         output = self.output  # same as `output.add`, written out: this runs for every request
         # `waiting` is nearly always empty, and the test is faster than adding to it
         output.waiting = output.waiting + request if output.waiting else request
-        output.said_at = now
+        output.sent_at = now
         output.begins = True
         if self._echo.declared:
             self._echo.sent(request)
@@ -398,10 +398,10 @@ class OnWire:
         assert self.exchange is not None
         return follow(self.exchange, progress, self._next_step, now)
 
-    def say(self, send: bytes, now: float) -> None:
+    def send(self, send: bytes, now: float) -> None:
         """Send bytes that close an exchange, or acknowledge an unexpected packet."""
         self.output.add(send, now)
-        self.step.say(len(send), now)
+        self.step.add_sent(len(send), now)
 
     def due_anew(self, now: float) -> float:
         """Return the deadline of the step, counted from now, because the sent bytes have only just left."""

@@ -61,7 +61,7 @@ class Trust:
                 latest = max(latest, step.past())
             if to_be_held or in_sync.has_ambiguity(now):
                 if progress.send:  # at once: MSC repeats its packet until it is acknowledged
-                    wire.say(progress.send, now)
+                    wire.send(progress.send, now)
                 self.held = Done(progress.value)
                 # Two byte times: the first byte of a second reply must be received, not only begun.
                 return max(now, latest) + 2 * step.byte_time
@@ -70,7 +70,7 @@ class Trust:
         # `started` is earlier than the end of the request: the safe side, because only a request sent after the maximum
         # reply delay of an overdue reply proves something about it.
         in_sync.answered(transaction.node, transaction.started, now, step.timing.late_after)
-        in_sync.said(answers, now)
+        in_sync.note_answered(answers, now)
         return None
 
     def add_overdue(self, wire: OnWire, *, heard: bool, whole: bool = False) -> None:

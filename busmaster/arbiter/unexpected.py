@@ -21,7 +21,7 @@ LATE_REPLY_MARGIN = 1.6
 LONGEST_MAX_REPLY_DELAY = 0.5
 LATE_REPLY_MEMORY = 1.0
 """Seconds after which unexpected bytes are no longer attributed to the last unanswered request."""
-TOLD_AGAIN = 1.25
+REPORT_AGAIN = 1.25
 """A late reply is reported again if it is this many times as late as the last one reported."""
 LOOKS = 10
 """Number of times per maximum reply delay that the line is read while an overdue reply may arrive."""
@@ -116,8 +116,8 @@ class UnexpectedBytes:
         self.unanswered(node, asked, timing.max_reply_delay)
         age = self.blame(first_byte)
         # R14: a node that is always late is reported once, not with every reply.
-        if age > timing.window and age > TOLD_AGAIN * node.told_late:
-            node.told_late = age
+        if age > timing.window and age > REPORT_AGAIN * node.reported_late:
+            node.reported_late = age
             self._events.append(RepliesLate(node, age, timing.window))
 
     def came(self, now: float) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.contract.exchange import Command
-from busmaster.contract.places import Changing, Placed, Telling
+from busmaster.contract.places import Changing, Placed, ReadsPlaces
 from busmaster.contract.profile import Profile
 
 
@@ -38,8 +38,8 @@ def composed(command: Command[Any], answers: Iterable[Answer], profile: Profile)
     """
     held: dict[Hashable, Any] = {}
     for answer in answers:
-        if isinstance(answer.command, Telling):
-            held |= answer.command.told(answer.value, profile)
+        if isinstance(answer.command, ReadsPlaces):
+            held |= answer.command.place_values(answer.value, profile)
     try:
         if isinstance(command, Placed):
             return [command.shown(held)]

@@ -223,8 +223,8 @@ class _Run:
     def _gather(self) -> None:
         """Store the bytes that the exchange sends next."""
         driver = self._driver
-        self._unsaid += b"".join(driver.said)
-        driver.said.clear()
+        self._unsaid += b"".join(driver.sent)
+        driver.sent.clear()
         if driver.ending is not None and not self._closed:
             self._closed = True
             self._unsaid += driver.ending.send

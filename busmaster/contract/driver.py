@@ -86,7 +86,7 @@ class Driver:
     """One exchange, run by a host without a clock: the caller reports when a window or an inter-byte timeout has
     expired.
 
-    `said`: bytes that the host sends after the request, per step. `timing`: that of the current step; `begun`: True if
+    `sent`: bytes that the host sends after the request, per step. `timing`: that of the current step; `begun`: True if
     a byte of it was received. `ending`: the result, None before the end. `noise_tolerant`: that of the profile; bytes
     before a reply that cannot begin one are skipped.
     """
@@ -96,7 +96,7 @@ class Driver:
         self._noise_tolerant = noise_tolerant
         self._silent = False
         self.timing: ReplyTiming = exchange.timing
-        self.said: list[bytes] = []
+        self.sent: list[bytes] = []
         self.begun = False
         self.ending: Ending | None = None
 
@@ -135,7 +135,7 @@ class Driver:
 
     def abandon(self) -> None:
         """End it instead of sending its next bytes (see `Abandonable`)."""
-        self.said.clear()
+        self.sent.clear()
         self.fail(cast("Abandonable", self.exchange).abandon())
 
     def _take(self, call: Callable[[Any], Progress[Any]], argument: object) -> None:
@@ -153,7 +153,7 @@ class Driver:
         self.timing = step.timing
         self.begun = False
         if step.send:
-            self.said.append(step.send)
+            self.sent.append(step.send)
 
 
 __all__ = ["MOST_STEPS", "Driver", "Ending", "EndlessExchange", "follow", "without_noise"]

@@ -28,10 +28,10 @@ class Placed(Protocol):
 
 
 @runtime_checkable
-class Telling(Protocol):
+class ReadsPlaces(Protocol):
     """A read whose result contains the value of each place, such as a block."""
 
-    def told(self, value: Any, profile: Profile, /) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile, /) -> Mapping[Hashable, Any]:
         """Return the value of each place for the result `value`, as far as known."""
         ...
 

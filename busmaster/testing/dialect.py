@@ -66,8 +66,8 @@ def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
     for step in case.steps:
         yield Direction.NODE, step
         driver.feed(step)
-        yield from ((Direction.HOST, word) for word in driver.said[heard:])
-        heard = len(driver.said)
+        yield from ((Direction.HOST, word) for word in driver.sent[heard:])
+        heard = len(driver.sent)
     ending = driver.ending
     if ending is not None and ending.send:
         yield Direction.HOST, ending.send

@@ -131,10 +131,10 @@ class _Kit:
         driver = self.listen(case.command, case.address)
         turns: list[list[bytes]] = [[]]
         for step in case.steps:
-            said = len(driver.said)
+            said = len(driver.sent)
             driver.feed(step)
             turns[-1].append(step)
-            if len(driver.said) > said:
+            if len(driver.sent) > said:
                 turns.append([])
         return turns
 
@@ -163,7 +163,7 @@ class _Kit:
                 yield f"{case}: the reply {_hex(case.steps)} gives {ending} in place of {case.raises.__name__}"
         elif not ending.delivered or ending.value != case.value or ending.rest:
             yield f"{case}: the reply {_hex(case.steps)} gives {ending} in place of {case.value!r}"
-        elif exchange.answered and len(b"".join(driver.said)) == sum(step.sent for step in exchange.later):
+        elif exchange.answered and len(b"".join(driver.sent)) == sum(step.sent for step in exchange.later):
             yield from self._check_announced(case, exchange, ending)
 
     def _check_announced(self, case: Case, exchange: Exchange[Any], ending: Ending) -> Iterator[str]:
@@ -186,7 +186,7 @@ class _Kit:
             for chunks in splits(run):
                 self.tally["splits"] += 1
                 parts = self.hear(case, *before, *chunks)
-                if parts.said != whole.said or not _alike(parts.ending, whole.ending):
+                if parts.sent != whole.sent or not _alike(parts.ending, whole.ending):
                     yield f"{case}: {run.hex(' ')} gives {whole.ending}, and {parts.ending} as {_hex(chunks)}"
             if whole.ending is not None and whole.ending.delivered:
                 more = self.hear(case, *before, run + UNEXPECTED).ending
@@ -198,9 +198,9 @@ class _Kit:
             for length in range(1, len(run)):
                 self.tally["truncations"] += 1
                 driver = self.hear(case, *before)
-                said = len(driver.said)
+                said = len(driver.sent)
                 driver.feed(run[:length])
-                early = driver.ending is not None or len(driver.said) > said
+                early = driver.ending is not None or len(driver.sent) > said
                 ending = driver.run_out()
                 if early or ending.delivered or ending.is_whole or ending.is_bug:
                     when = "at once" if early else "when time runs out"
@@ -294,7 +294,7 @@ class _Kit:
         It is empty for a broadcast, a refusal, and a case with a repetition.
         """
         driver = self.hear(case, *case.steps)
-        repeated = len(b"".join(driver.said)) != sum(step.sent for step in driver.exchange.later)
+        repeated = len(b"".join(driver.sent)) != sum(step.sent for step in driver.exchange.later)
         return b"" if repeated or case.raises is not None else b"".join(self.turns(case)[0])
 
     def check_foreign(self, foreign: Iterable[Foreign]) -> Iterator[str]:
@@ -335,7 +335,7 @@ class _Kit:
     def _converse(self, command: Command[Any], address: int, device: Callable[[bytes], bytes]) -> Ending:
         driver = self.listen(command, address)
         driver.feed(device(driver.exchange.request))
-        for said in driver.said:
+        for said in driver.sent:
             driver.feed(device(said))
         ending = driver.run_out()
         if ending.send:

@@ -286,7 +286,7 @@ class Pump(asyncio.Protocol):
         elif self._loop is not None:
             if self._look is not None:
                 self._look.cancel()
-            self._look = self._loop.call_later(self.arbiter.said_until - now, self._look_again)
+            self._look = self._loop.call_later(self.arbiter.sent_until - now, self._look_again)
 
     def _look_again(self) -> None:
         self._check_output(self.clock())

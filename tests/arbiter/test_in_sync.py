@@ -393,7 +393,7 @@ def test_r15_of_two_answers_in_one_chunk_neither_is_believed_though_nothing_is_o
 def asked_alike(bench: Bench) -> tuple[Transaction, NodeRecord]:
     """A read on the wire whose answer is like one that was delivered a moment ago."""
     node = up(bench)
-    bench.arbiter._in_sync.said((bytes.fromhex("023031"),), bench.now)
+    bench.arbiter._in_sync.note_answered((bytes.fromhex("023031"),), bench.now)
     read = bench.ask(node, retries=0)
     assert bench.sent() == request_of(1)
     return read, node

@@ -36,7 +36,7 @@ def test_a_reply_ends_it_with_its_value_and_what_comes_later_is_left_over() -> N
 def test_it_goes_from_step_to_step_with_bytes_that_came_in_one_chunk() -> None:
     driver = reading_packet().feed(ACK + PACKET)
     assert driver.ending == Ending(1234, send=ACK)
-    assert driver.said == []
+    assert driver.sent == []
 
 
 def test_the_step_that_is_awaited_has_its_own_times_and_has_not_begun() -> None:
@@ -50,7 +50,7 @@ def test_the_step_that_is_awaited_has_its_own_times_and_has_not_begun() -> None:
 
 def test_what_the_host_says_between_steps_is_told_in_order() -> None:
     driver = reading_packet().feed(ACK, BAD)
-    assert driver.said == [NAK]
+    assert driver.sent == [NAK]
     assert driver.ending is None
     driver.feed(PACKET)
     assert driver.ending == Ending(1234, send=ACK)
@@ -70,7 +70,7 @@ def test_silence_ends_it_and_says_that_nothing_came() -> None:
 def test_a_cut_packet_is_asked_for_again_until_there_is_no_more_patience() -> None:
     driver = reading_packet().feed(ACK, PACKET[:9])
     ending = driver.run_out()
-    assert driver.said[0] == NAK
+    assert driver.sent[0] == NAK
     assert isinstance(ending.error, FrameError)
 
 
@@ -87,7 +87,7 @@ def test_a_refusal_and_a_bug_end_it_too_and_only_one_is_a_bug() -> None:
 def test_a_host_in_a_hurry_abandons_what_would_be_said_again() -> None:
     driver = reading_packet().feed(ACK, BAD)
     driver.abandon()
-    assert driver.said == []
+    assert driver.sent == []
     assert driver.ending is not None
     assert driver.ending.send == ACK
     assert isinstance(driver.ending.error, FrameError)
@@ -133,7 +133,7 @@ class Odd:
 def test_an_exchange_that_wants_one_step_after_the_other_is_found_out(end: Any) -> None:
     driver = Driver(Odd(Expect(hcp2.PROFILE.timings.read, Sizes(1, 1), NAK)))
     assert isinstance(end(driver).error, EndlessExchange)
-    assert len(driver.said) == MOST_STEPS
+    assert len(driver.sent) == MOST_STEPS
 
 
 def test_an_ending_says_what_it_was() -> None:
@@ -202,7 +202,7 @@ def test_as_many_steps_in_a_row_as_the_limit_says_are_followed(steps: int) -> No
     driver = Driver(Counted(None, steps=steps))
     ending = driver.feed(b"1").ending
     assert ending is not None
-    assert (ending.delivered, len(driver.said)) == (steps <= MOST_STEPS, MOST_STEPS)
+    assert (ending.delivered, len(driver.sent)) == (steps <= MOST_STEPS, MOST_STEPS)
 
 
 @dataclass

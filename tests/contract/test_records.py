@@ -16,9 +16,10 @@ import busmaster.wire
 from busmaster.contract.arguments import Between
 from busmaster.contract.driver import Ending
 from busmaster.contract.exchange import Done, Expect, LaterStep, Sizes
+from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.contract.items import Bit, Item
 from busmaster.contract.learning import Learned
-from busmaster.contract.places import Changing, Placed, Telling
+from busmaster.contract.places import Changing, Placed, ReadsPlaces
 from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
@@ -89,8 +90,9 @@ RECORDS: tuple[Any, ...] = (
     Reply(1, b"DREAD,", 4),
 )
 """One of each kind that never changes."""
-CHANGING = (Expect(TIMING, Sizes(1, 2)), Done(5))
-"""Made for each reply and read once: where freezing them would cost each exchange something."""
+CHANGING = (Expect(TIMING, Sizes(1, 2)), Done(5), Frame(Kind.ACK, Direction.NODE, b"\x06"))
+"""Made for each reply and read once, where freezing them would cost each exchange something; and the frame, whose times
+the decoder adds."""
 BASES = {ReadElement, WriteElements, modbus._Read, msc._AtAddress, msc._OfFlag}
 """What only their heirs are made of."""
 
@@ -149,7 +151,7 @@ def test_a_step_has_slots_and_compares_by_value(record: Any) -> None:
 
 def test_a_read_can_be_asked_for_its_places_and_what_it_tells_and_a_write_for_what_it_changes() -> None:
     for command in (hcp.Read(1), hcp.Write(1, (5,)), mentor.Read(1, 17), mentor.Write(1, 17, 5)):
-        asked = [isinstance(command, kind) for kind in (Placed, Telling, Changing)]
+        asked = [isinstance(command, kind) for kind in (Placed, ReadsPlaces, Changing)]
         assert asked == [not command.writes, not command.writes, command.writes]
 
 

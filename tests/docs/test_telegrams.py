@@ -60,7 +60,7 @@ class Telegrams:
                 driver.feed(data)
                 continue
             closing = driver.ending.send if driver.ending is not None else b""
-            says = [driver.exchange.request, *driver.said, closing][turn]
+            says = [driver.exchange.request, *driver.sent, closing][turn]
             assert data == says, f"{self}: the host says {says.hex(' ')!r}, not {data.hex(' ')}"
             turn += 1
         self.check_outcome(driver.run_out())

@@ -164,8 +164,8 @@ def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(arguments: dict[
 
 
 def test_a_run_tells_the_value_of_each_parameter() -> None:
-    assert ReadRun(1, 17, 3).told((5, 6, 7), PROFILE) == {(1, 17): 5, (1, 18): 6, (1, 19): 7}
-    assert ReadRun(1, 19, 2, step=-1).told((5, 6), PROFILE) == {(1, 19): 5, (1, 18): 6}
+    assert ReadRun(1, 17, 3).place_values((5, 6, 7), PROFILE) == {(1, 17): 5, (1, 18): 6, (1, 19): 7}
+    assert ReadRun(1, 19, 2, step=-1).place_values((5, 6), PROFILE) == {(1, 19): 5, (1, 18): 6}
 
 
 def test_a_write_says_what_its_parameter_holds_then_in_the_parameters_own_unit() -> None:

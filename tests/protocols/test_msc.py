@@ -60,7 +60,7 @@ REPLIES: dict[str, tuple[Command[Any], int, object]] = {
 def answer(command: Command[Any], unit: int, reply: bytes) -> Any:
     """The value of an exchange that is answered with an ACK and this packet in one chunk."""
     driver = Driver(command.open(unit, PROFILE.timings)).feed(ACK + reply)
-    assert driver.said == []
+    assert driver.sent == []
     assert driver.ending == Ending(driver.ending and driver.ending.value, send=ACK)
     return driver.ending.value
 

@@ -89,7 +89,7 @@ class Asking:
         raise FrameError("cut short") if self.buffer else no_reply()
 
 
-class Telling(Asking):
+class ReadsPlaces(Asking):
     """A write: the reply is the request."""
 
     sizes = Sizes(8, 8)
@@ -134,7 +134,7 @@ class ReadRegister:
 class WriteRegister:
     register: int
     value: int
-    exchange: type[Asking] = Telling
+    exchange: type[Asking] = ReadsPlaces
     writes: ClassVar[bool] = True
     idempotent: ClassVar[bool] = True
 

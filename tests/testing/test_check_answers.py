@@ -17,7 +17,7 @@ from tests.testing.modbus import (
     REPLY,
     Asking,
     ReadRegister,
-    Telling,
+    ReadsPlaces,
     WriteRegister,
     checked,
     find,
@@ -90,7 +90,7 @@ def test_commands_whose_replies_could_be_exchanged_and_that_share_no_answer_are_
 
 
 def test_a_broadcast_that_says_by_what_it_is_answered_is_found() -> None:
-    class Broadcasting(Telling):
+    class Broadcasting(ReadsPlaces):
         answered = False
 
         def expired(self, started: bool, /) -> Done[Any]:

@@ -173,9 +173,9 @@ def touched(kind: NodeKind, command: Any) -> tuple[tuple[int, ...], tuple[int, .
     exchange = command.open(address, kind.profile.timings)
     driver = Driver(exchange).feed(reply(exchange.request))
     said = 0
-    while driver.ending is None and said < len(driver.said):
+    while driver.ending is None and said < len(driver.sent):
         said += 1
-        driver.feed(reply(driver.said[said - 1]))
+        driver.feed(reply(driver.sent[said - 1]))
     return tuple(spy.read_from), tuple(spy.written_to)
 
 

@@ -25,7 +25,7 @@ from busmaster.app.line import ConfiguredLine
 from busmaster.capture import Direction, Frame, Kind
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import Stream
-from busmaster.ext import Changing, Command, Driver, Placed, Telling
+from busmaster.ext import Changing, Command, Driver, Placed, ReadsPlaces
 from busmaster.registry import Protocol, find
 from busmaster.statistics import Timeline
 
@@ -217,8 +217,8 @@ class Overheard:
         told: Mapping[Hashable, Any] = {}
         if isinstance(command, Changing):
             told = {place: now for place, now in command.changes(node.profile).items() if now is not None}
-        elif isinstance(command, Telling):
-            told = command.told(value, node.profile)
+        elif isinstance(command, ReadsPlaces):
+            told = command.place_values(value, node.profile)
         for place in told:
             for point in self._by_place.get((node.address, place), ()):
                 assert isinstance(point.command, Placed)

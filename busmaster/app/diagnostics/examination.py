@@ -217,7 +217,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
         return
     settings = where.settings
     byte_time = 0.0 if settings is None else settings.byte_time
-    wire.say(HARMLESS)
+    wire.send(HARMLESS)
     heard = await wire.hear_all(ECHOING + len(HARMLESS) * byte_time + where.receive_latency)
     tell(diagnosis.echo(HARMLESS, heard, where.echo))
     if patient.protocol is None:

@@ -84,7 +84,7 @@ class Wire(asyncio.Protocol):
         self.closed.set()
         self._arrived.set()
 
-    def say(self, data: bytes) -> float:
+    def send(self, data: bytes) -> float:
         """Send `data`, and return when it was handed to the port. Raises LineDown if that is gone."""
         if self.transport is None or self.closed.is_set():
             raise self._loss()
@@ -226,7 +226,7 @@ class Prober:
     def _say(self, data: bytes) -> float:
         """Send `data`, and return the time when it will have left: at once, if its duration is not known."""
         self._echo.sent(data)
-        return self._wire.say(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
+        return self._wire.send(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
 
 
 class _Hearing:
@@ -244,9 +244,9 @@ class _Hearing:
         """Take the next bytes, and return until when to wait for more."""
         driver = self.driver
         self._hear(now, data)
-        driver.said.clear()
+        driver.sent.clear()
         driver.feed(data)
-        for send in driver.said:
+        for send in driver.sent:
             now = say(send)
         # else the node would be left with something unacknowledged
         if driver.ending is not None and driver.ending.send:

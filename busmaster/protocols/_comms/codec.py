@@ -50,7 +50,7 @@ class ReadElement:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[self.element]
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {self.element: value}
 
     @staticmethod

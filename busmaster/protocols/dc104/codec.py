@@ -106,7 +106,7 @@ class Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[self.parameter]
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {self.parameter: value}
 
     def open(self, address: int, timings: Timings, /) -> Reading:

@@ -82,7 +82,7 @@ class Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[place_of(self.name)]
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {place_of(self.name): value}
 
     def open(self, address: int, timings: Timings) -> Reading:
@@ -115,7 +115,7 @@ class ReadRun:
     def __str__(self) -> str:
         return f"read {', '.join(self.names)}"
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {place_of(name): one for name, one in zip(self.names, value, strict=True)}
 
     def open(self, address: int, timings: Timings) -> RunReading:

@@ -241,16 +241,16 @@ class EmulatedBisynch(Device):
             error = self._write(frame[TEXT_AT + 1 : -2])
         if error:
             self.values[b"EE"] = error
-        self._say(NAK if error else ACK, now)
+        self._reply(NAK if error else ACK, now)
 
     def _answer_read(self, name: bytes, now: float) -> None:
         parameter = self._found(name)
         if parameter is None or not parameter.readable:
             self.values[b"EE"] = NO_MNEMONIC if parameter is None else WRITE_ONLY
-            self._say(NO_SUCH_PARAMETER, now)
+            self._reply(NO_SUCH_PARAMETER, now)
             return
         self._last = name
-        self._say(self._telegram(name, self._text(parameter, self.value(name[-2:], now))), now)
+        self._reply(self._telegram(name, self._text(parameter, self.value(name[-2:], now))), now)
 
     def _found(self, name: bytes) -> Parameter | None:
         """Return the parameter with this name, which may begin with the channel of its only loop."""
@@ -297,7 +297,7 @@ class EmulatedBisynch(Device):
         summed = name + text + b"\x03"
         return b"\x02" + summed + bytes((self._check(summed),))
 
-    def _say(self, data: bytes, now: float) -> None:
+    def _reply(self, data: bytes, now: float) -> None:
         self.reply(data.translate(EVEN_PARITY) if self._parity else data, now)
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
@@ -359,8 +359,8 @@ def make_device(
 ) -> EmulatedBisynch:
     """Make an instrument with further parameters; if it is lively, it heats up."""
     instrument = EmulatedBisynch(address, **options)
-    for item, said in (parameters or {}).items():
-        instrument.parameters[run_of(item, 1)[0]] = parameter_of(**said)
+    for item, settings in (parameters or {}).items():
+        instrument.parameters[run_of(item, 1)[0]] = parameter_of(**settings)
     if lively:
         instrument.values[b"SL"] = 200.0 + 10 * (address % 8)
     return instrument

@@ -96,7 +96,7 @@ class Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[self.menu, self.number]
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {(self.menu, self.number): value}
 
     def open(self, address: int, timings: Timings) -> Reading:
@@ -134,7 +134,7 @@ class ReadRun:
         last = self.number + self.step * (self.count - 1)
         return f"{first} to {self.menu:02d}.{last:02d}" if self.step else f"{first}, {self.count} times"
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {(self.menu, self.number + self.step * i): one for i, one in enumerate(value)}
 
     def open(self, address: int, timings: Timings) -> RunReading:

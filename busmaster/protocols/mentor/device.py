@@ -236,7 +236,7 @@ class EmulatedMentor(Device):
         if not legal:
             malformed = length > TEXT_AT and frame[TEXT_AT] != STX
             if malformed and self.refuse_malformed and self._is_mine(frame):
-                self._say(NAK, now)
+                self._reply(NAK, now)
             self._ground()
 
     def _is_mine(self, frame: bytes | bytearray) -> bool:
@@ -271,15 +271,15 @@ class EmulatedMentor(Device):
         # The guide does not define whether short commands work after a write. By default they do not.
         if taken and self.short_after_write:
             self._last = int(frame[6:10])
-        self._say(ACK if taken else NAK, now)
+        self._reply(ACK if taken else NAK, now)
 
     def _answer_read(self, parameter: int, now: float) -> None:
         """Reply to a read. Short commands start from this parameter, even if it does not exist."""
         self._last = parameter
         if parameter not in self.parameters:
-            self._say(NO_SUCH_PARAMETER, now)
+            self._reply(NO_SUCH_PARAMETER, now)
         else:
-            self._say(self._telegram(parameter, now), now)
+            self._reply(self._telegram(parameter, now), now)
 
     def _write(self, name: bytes, data: bytes, now: float) -> bool:
         parameter = self.parameters.get(int(name)) if name.isdigit() else None
@@ -308,7 +308,7 @@ class EmulatedMentor(Device):
             return int(data) * FINE
         return None
 
-    def _say(self, data: bytes, now: float) -> None:
+    def _reply(self, data: bytes, now: float) -> None:
         self.reply(data.translate(EVEN_PARITY) if self._parity else data, now)
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
@@ -359,11 +359,11 @@ def make_device(
 ) -> EmulatedMentor:
     """Make a drive with further parameters; if it is lively, it runs."""
     drive = device(address, ripple=(0.01 if lively else 0.0) if ripple is None else ripple, **options)
-    for item, said in (parameters or {}).items():
+    for item, settings in (parameters or {}).items():
         match = ITEM.fullmatch(item)
         if match is None:
             raise InvalidCommand(f"{item!r} is not a parameter: write 7.05")
-        drive.parameters[int(match[1]) * 100 + int(match[2])] = parameter_of(**said)
+        drive.parameters[int(match[1]) * 100 + int(match[2])] = parameter_of(**settings)
     if lively:
         drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
     return drive

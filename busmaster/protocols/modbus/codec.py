@@ -203,7 +203,7 @@ class _Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return tuple(values[place] for place in self.places)
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return dict(zip(self.places, value, strict=True))
 
 
@@ -290,7 +290,7 @@ class MergedRead:
     def __str__(self) -> str:
         return str(self.whole)
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         """Return the value of each place."""
         return {
             place: one
@@ -387,9 +387,9 @@ class WriteRegisters:
     def open(self, address: int, timings: Timings, /) -> Conversation[None]:
         count = len(self.values)
         if count == 1:
-            return _tell(struct.pack(">BBHH", address, WRITE_REGISTER, self.first, self.values[0]), timings)
+            return _write_exchange(struct.pack(">BBHH", address, WRITE_REGISTER, self.first, self.values[0]), timings)
         header = struct.pack(">BBHH", address, WRITE_REGISTERS, self.first, count)
-        return _tell(header, timings, struct.pack(f">B{count}H", 2 * count, *self.values))
+        return _write_exchange(header, timings, struct.pack(f">B{count}H", 2 * count, *self.values))
 
 
 @dataclass(frozen=True, slots=True)
@@ -418,11 +418,13 @@ class WriteCoils:
     def open(self, address: int, timings: Timings, /) -> Conversation[None]:
         count = len(self.values)
         if count == 1:
-            return _tell(struct.pack(">BBHH", address, WRITE_COIL, self.first, ON if self.values[0] else OFF), timings)
+            return _write_exchange(
+                struct.pack(">BBHH", address, WRITE_COIL, self.first, ON if self.values[0] else OFF), timings
+            )
         header = struct.pack(">BBHH", address, WRITE_COILS, self.first, count)
         states = sum(on << place for place, on in enumerate(self.values))
         size = (count + 7) // 8
-        return _tell(header, timings, bytes((size,)) + states.to_bytes(size, "little"))
+        return _write_exchange(header, timings, bytes((size,)) + states.to_bytes(size, "little"))
 
 
 @lru_cache(maxsize=4096)
@@ -439,7 +441,7 @@ def _registers(count: int) -> Callable[[bytes], tuple[int, ...]]:
     return struct.Struct(f">{count}H").unpack
 
 
-def _tell(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
+def _write_exchange(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
     """Begin a write: the unit repeats its first six bytes."""
     return Conversation(Frames(header + data, header, 0), timings.write, _nothing)
 

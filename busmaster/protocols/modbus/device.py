@@ -166,7 +166,7 @@ class EmulatedModbus(Device):
         # An incomplete request is dropped. A missing function is refused after the silence that ends its frame.
         unknown = len(frame) >= SHORTEST and frame[0] == self.address and self._length(frame) is None
         if unknown and crc(frame[:-2]) == frame[-2:]:
-            self._say(bytes((frame[1] | EXCEPTION, ILLEGAL_FUNCTION)), now)
+            self._reply(bytes((frame[1] | EXCEPTION, ILLEGAL_FUNCTION)), now)
 
     @property
     def _pause(self) -> float:
@@ -201,7 +201,7 @@ class EmulatedModbus(Device):
         except Illegal as refusal:
             answer = bytes((function | EXCEPTION, refusal.args[0]))
         if frame[0] != BROADCAST:
-            self._say(answer, now)
+            self._reply(answer, now)
 
     def _read(self, function: int, first: int, count: int, now: float) -> bytes:
         if not 1 <= count <= MOST[function]:
@@ -255,7 +255,7 @@ class EmulatedModbus(Device):
             for place, value in enumerate(values, first):
                 self.traceable.write(place, value)
 
-    def _say(self, answer: bytes, now: float) -> None:
+    def _reply(self, answer: bytes, now: float) -> None:
         body = bytes((self.address,)) + answer
         self.reply(body + crc(body), now)
 

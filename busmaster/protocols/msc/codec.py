@@ -78,7 +78,7 @@ class DataRead(_Reading, _AtAddress):
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values["data", self.address]
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {("data", self.address): value}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[int]:
@@ -102,7 +102,7 @@ class DataWrite(_Writing, _AtAddress):
         return _data_changes(profile, self.address, (self.value,))
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
-        return _tell(address, timings, b"DWRITE," + struct.pack(">Hi", self.address, self.value))
+        return _write_exchange(address, timings, b"DWRITE," + struct.pack(">Hi", self.address, self.value))
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class BlockRead(_Reading, _AtAddress):
     def __str__(self) -> str:
         return f"read {BLOCK} values from data {self.address}"
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         """Return its values by their addresses; only the first if the address step is not known."""
         step = _step_of(profile)
         return {("data", self.address + i * (step or 0)): one for i, one in enumerate(value if step else value[:1])}
@@ -140,7 +140,7 @@ class BlockWrite(_Writing, _AtAddress):
         return _data_changes(profile, self.address, self.values)
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
-        return _tell(address, timings, b"BWRITE," + struct.pack(f">H{BLOCK}i", self.address, *self.values))
+        return _write_exchange(address, timings, b"BWRITE," + struct.pack(f">H{BLOCK}i", self.address, *self.values))
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class SetFlag(_Writing, _OfFlag):
         return {("flag", self.flag): True}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
-        return _tell(address, timings, b"SFLAG," + self.flag.to_bytes(2, "big"))
+        return _write_exchange(address, timings, b"SFLAG," + self.flag.to_bytes(2, "big"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,7 @@ class ClearFlag(_Writing, _OfFlag):
         return {("flag", self.flag): False}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
-        return _tell(address, timings, b"CFLAG," + self.flag.to_bytes(2, "big"))
+        return _write_exchange(address, timings, b"CFLAG," + self.flag.to_bytes(2, "big"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +185,7 @@ class ReadFlag(_Reading, _OfFlag):
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values["flag", self.flag]
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {("flag", self.flag): value}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[bool]:
@@ -199,7 +199,7 @@ class ReadFlags(_Reading):
     def __str__(self) -> str:
         return "read all flags"
 
-    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+    def place_values(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
         return {("flag", flag): flag in value for flag in range(FLAGS)}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[frozenset[int]]:
@@ -326,7 +326,7 @@ def _ask(
     return PacketExchange(packet(unit, name + operands), timings, Reply(unit, name, payload), decode)
 
 
-def _tell(unit: int, timings: Timings, body: bytes) -> PacketExchange[None]:
+def _write_exchange(unit: int, timings: Timings, body: bytes) -> PacketExchange[None]:
     return PacketExchange(packet(unit, body), timings, None, _nothing)
 
 

@@ -414,5 +414,5 @@ class Run(Point[tuple[int, ...]]):
         """Raise InvalidCommand unless there are as many values as in the run."""
         count = len(values) if isinstance(values, Sized) else None
         if count != self.count:
-            said = repr(values) if count is None else count
-            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {said}")
+            given = repr(values) if count is None else count
+            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {given}")

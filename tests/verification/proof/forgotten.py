@@ -176,7 +176,7 @@ def past_silences(view: View) -> None:
     world.arbiter._up_at = -inf  # for nodes that are added later
     if not world.frozen:
         output = world.arbiter._wire.output
-        output.said_at, output.begins = -inf, False  # set with what is said next, and read when that is written
+        output.sent_at, output.begins = -inf, False  # set with what is said next, and read when that is written
 
 
 def past_late_replies(view: View) -> None:
@@ -253,7 +253,7 @@ def _ordered(view: View, first: Time, second: Time) -> bool:
 def past_overdue_replies(view: View) -> None:
     """Of an overdue reply that has lapsed is asked only how long it was in time, and whether it was so before the
     request that is on the wire. Of doubts, whether they are over, and only of the latest entry of each key: an entry is
-    asked for by its key, and all entries of one key are removed together. Of what was said, whether it is SAID_MEMORY
+    asked for by its key, and all entries of one key are removed together. Of what was said, whether it is ANSWER_MEMORY
     ago. Of the last exchanges, what would answer them, in no order: that RECENT exchanges later it is forgotten is left
     out."""
     world, book = view.world, view.world.arbiter._in_sync
@@ -279,8 +279,8 @@ def past_overdue_replies(view: View) -> None:
         book.lone_bytes_until = -inf
     if view.past(book._ambiguous_until):
         book._ambiguous_until = -inf
-    while book._said and view.past(book._said[0][1], in_sync.SAID_MEMORY, strictly=True):
-        book._said.popleft()
+    while book._answered and view.past(book._answered[0][1], in_sync.ANSWER_MEMORY, strictly=True):
+        book._answered.popleft()
 
 
 def _latest_of_each(view: View, entries: list[tuple[bytes, float]]) -> list[tuple[bytes, float]]:

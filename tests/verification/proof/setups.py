@@ -114,7 +114,7 @@ class Setup:
     doubt: float = 0.2
     """In place of AMBIGUITY_PERIOD."""
     said_memory: float = 0.1
-    """In place of SAID_MEMORY."""
+    """In place of ANSWER_MEMORY."""
     slowest: tuple[float, ...] = (0.0,)
     """What a node's slowest reply may be known to be, each time that it is asked for; 0 if it was never timed."""
     learned: tuple[float, float] | None = None

@@ -128,7 +128,7 @@ class AnyStep:
     def nothing(self, *arguments: Any) -> None:
         pass
 
-    add_overdue = lapse = forgive = answered = said = said_twice = heard = came_up = stood_alone = nothing
+    add_overdue = lapse = forgive = answered = note_answered = answered_twice = heard = came_up = stood_alone = nothing
 
     def perhaps(self, *arguments: Any, **named: Any) -> bool:
         return bool(choose(2))
@@ -181,7 +181,7 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(in_sync, "LAPSE", setup.lapse)
     put(in_sync, "RECENT", 2)
     put(in_sync, "AMBIGUITY_PERIOD", setup.doubt)
-    put(in_sync, "SAID_MEMORY", setup.said_memory)
+    put(in_sync, "ANSWER_MEMORY", setup.said_memory)
     put(choice, "LONGEST_ALIKE", setup.alike)
     put(choice, "LONGEST_STEADY", setup.alike + 1)
     put(choice.Alike, "_was_untimely", _may_be_untimely)
