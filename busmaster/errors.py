@@ -79,8 +79,8 @@ class BusError(Exception):
         """Keep all attributes. A cause that is not a BusError may not be picklable, so only its text is kept."""
         state, cause = dict(self.__dict__), self.__cause__
         if cause is not None:
-            told = isinstance(cause, BusError)
-            state["__cause__"] = cause if told else Exception(f"{type(cause).__name__}: {cause}")
+            is_bus_error = isinstance(cause, BusError)
+            state["__cause__"] = cause if is_bus_error else Exception(f"{type(cause).__name__}: {cause}")
         return type(self), (self.what,), state
 
     def __str__(self) -> str:

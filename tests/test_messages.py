@@ -22,7 +22,20 @@ CLICK = {"UsageError", "ClickException", "BadParameter"}
 ENDINGS = {"fail", "lost", "_end"}
 """Methods that end a request with an error: its class, its message and its hint."""
 LOGS = {"debug", "info", "warning", "error", "exception", "critical", "log"}
-NOTES = {"note", "complain", "tell", "_tell", "say", "_say"}
+NOTES = {
+    "note",
+    "complain",
+    "tell",
+    "_tell",
+    "say",
+    "_say",
+    "report",
+    "_report",
+    "_report_event",
+    "_report_once",
+    "show",
+    "notify",
+}
 """Functions and methods that print a line, or pass it on to be printed."""
 NAMES = {"Modbus", "Python"}
 """First words with a capital."""

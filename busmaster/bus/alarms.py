@@ -64,15 +64,15 @@ BusEvent: TypeAlias = Event | AlarmChanged
 
 
 class Alarms:
-    """The alarms of one line. `tell` is called with each change.
+    """The alarms of one line. `notify` is called with each change.
 
     A value that could not be read neither begins nor ends an alarm.
     """
 
-    def __init__(self, tell: Callable[[AlarmChanged], None]) -> None:
+    def __init__(self, notify: Callable[[AlarmChanged], None]) -> None:
         self.states: Mapping[Point[Any], AlarmChanged | None] = {}
         """The alarm of each watched point, or None. Replaced as a whole, so that it can be read from any thread."""
-        self._tell = tell
+        self._notify = notify
         self._groups: Counter[Point[Any]] = Counter()
         """Number of poll groups that watch each point."""
 
@@ -83,7 +83,7 @@ class Alarms:
     def look(self, points: Iterable[Point[Any]], samples: Mapping[Point[Any], Sample[Any]]) -> None:
         """Report the alarms that begin or end with the samples of these points."""
         changed: dict[Point[Any], AlarmChanged | None] = {}
-        told: list[AlarmChanged] = []
+        changes: list[AlarmChanged] = []
         for point in points:
             sample = samples.get(point)
             if sample is None or sample.error is not None or not isinstance(sample.value, int | float):
@@ -94,12 +94,12 @@ class Alarms:
                 continue
             now = _begun(point, sample.value)
             if before is not None:
-                told.append(replace(before, value=sample.value, active=False))
+                changes.append(replace(before, value=sample.value, active=False))
             if now is not None:
-                told.append(now)
+                changes.append(now)
             if before is not None or now is not None or point not in self.states:
                 changed[point] = now
-        self._become({**self.states, **changed} if changed else self.states, told)
+        self._become({**self.states, **changed} if changed else self.states, changes)
 
     def forget(self, points: Iterable[Point[Any]]) -> None:
         """Stop watching these points for one poll group. Ends the alarms of points that no other group watches."""
@@ -111,10 +111,10 @@ class Alarms:
             ended = [replace(alarm, value=None, active=False) for alarm in gone.values() if alarm is not None]
             self._become({point: alarm for point, alarm in self.states.items() if point not in gone}, ended)
 
-    def _become(self, states: Mapping[Point[Any], AlarmChanged | None], told: Iterable[AlarmChanged]) -> None:
+    def _become(self, states: Mapping[Point[Any], AlarmChanged | None], changes: Iterable[AlarmChanged]) -> None:
         self.states = states
-        for alarm in told:
-            self._tell(alarm)
+        for alarm in changes:
+            self._notify(alarm)
 
 
 def _begun(point: Point[Any], value: float) -> AlarmChanged | None:

@@ -499,8 +499,8 @@ class Bus:
             self._groups_changed()
 
     def _groups_changed(self) -> None:
-        for told in self._line.on_groups:
-            told()
+        for notify in self._line.on_groups:
+            notify()
 
     def _on_written(self, write: Transaction, when: float) -> None:
         self._line.touched(write, when)

@@ -227,7 +227,7 @@ class Node:
         for command in (probe, *sync_reads):
             if command is not None and getattr(command, "writes", False):
                 raise InvalidCommand(f"{self.label}: a probe or sync read must read, and {command} writes")
-        if any(said and said != now for said, now in zip(before, wanted, strict=True)):
+        if any(earlier and earlier != now for earlier, now in zip(before, wanted, strict=True)):
             raise InvalidCommand(
                 f"{self.label} is already in use, and was requested again with another probe or other sync reads. "
                 "Give all handles of an address the same options, or leave them out in all but the first"

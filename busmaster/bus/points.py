@@ -86,10 +86,12 @@ class Point(Generic[T]):
         def decode(raw: Any) -> bool:
             return bit_of(raw if of_word is None else of_word(raw), number)
 
-        told = self.meaning.of_bit(name)
+        of_bit = self.meaning.of_bit(name)
         # For the type checker: `replace` would return a Point[T].
         word: Any = self
-        bit: Point[bool] = replace(word, item=f"{self.item}.{name}", unit="", decode=decode, encode=None, meaning=told)
+        bit: Point[bool] = replace(
+            word, item=f"{self.item}.{name}", unit="", decode=decode, encode=None, meaning=of_bit
+        )
         return bit
 
     def limit(

@@ -96,7 +96,7 @@ class PollGroup(Cycles):
         """Those of its points that are read after a confirmed write to them."""
         self._between: dict[Point[Any], Sample[Any]] = {}
         """Samples read since the end of the last cycle: the running cycle may have read before the write."""
-        self._told_outdated: dict[Point[Any], Sample[Any]] = {}
+        self._reported_outdated: dict[Point[Any], Sample[Any]] = {}
         """The sample of each point that was last reported as stale."""
         self._tally = Tally(self._poll)
         self._good_at: dict[Point[Any], float] = {}
@@ -163,7 +163,7 @@ class PollGroup(Cycles):
         for point in points:
             self._points.pop(point, None)
             self._good_at.pop(point, None)
-            self._told_outdated.pop(point, None)
+            self._reported_outdated.pop(point, None)
         self._points_changed()
 
     def pause(self) -> None:
@@ -277,7 +277,7 @@ class PollGroup(Cycles):
             for done in poll.results
             if done.error is None
         ]
-        self._tell(snapshot)
+        self._publish(snapshot)
         self._line.alarms.look(self._watched, self._samples)
         # Only once: a new choice with each change of a mean would make the cycles differ all the time.
         if poll.cycles == WEIGHED_AGAIN:
@@ -362,7 +362,7 @@ class PollGroup(Cycles):
         finished = reading.ended_at
         wall = finished + self._wall_offset
         times = (latest.due, reading.started, finished)
-        self._tell_change(ReadAfterWrite(self.name, latest.cycle, *times, self._poll.missed, wall, fresh))
+        self._publish_change(ReadAfterWrite(self.name, latest.cycle, *times, self._poll.missed, wall, fresh))
         self._line.alarms.look([point for point in self._watched if point in fresh], fresh)
 
     def report_outdated(self, record: NodeRecord, when: float) -> None:
@@ -377,14 +377,14 @@ class PollGroup(Cycles):
         outdated = {}
         for point in self._points if to_all else self.points_of(record):
             sample = latest.samples.get(point)
-            if sample is None or not sample.quality.is_current or self._told_outdated.get(point) is sample:
+            if sample is None or not sample.quality.is_current or self._reported_outdated.get(point) is sample:
                 continue
             if self._line.is_stale(point, before):
-                self._told_outdated[point] = sample
+                self._reported_outdated[point] = sample
                 outdated[point] = sample._replace(quality=Quality.STALE, wall=wall)
         if outdated:
             times = (latest.due, latest.started, when)
-            self._tell_change(Outdated(self.name, latest.cycle, *times, self._poll.missed, wall, outdated))
+            self._publish_change(Outdated(self.name, latest.cycle, *times, self._poll.missed, wall, outdated))
 
     def _use_readings(self) -> None:
         """Keep values that were read after a write, if the finished cycle has read them before the write."""

@@ -193,8 +193,8 @@ class SharedLine:
     def note_stop(self, record: NodeRecord) -> None:
         """Implement `Node.note_stop`."""
         self.arbiter.note_stop(record)
-        for told in self.on_stop:
-            told(record)
+        for notify in self.on_stop:
+            notify(record)
 
     def forget_node(self, node: Requester, record: NodeRecord) -> None:
         """Remove a node that is no longer used, and its state."""
@@ -251,8 +251,8 @@ class SharedLine:
         # Not isinstance: that would calculate the text of a `Rounding` twice, for every write.
         if text := getattr(write.command, "rounded", ""):
             self.logbook.rounded(write.node, text, self.now())
-        for told in self.on_touched:
-            told(write.node, when)
+        for notify in self.on_touched:
+            notify(write.node, when)
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
         """Return True if a write to this node, or to a point of it, has ended since then."""

@@ -233,13 +233,13 @@ class Cycles:
         finally:
             consumer.close()
 
-    def _tell(self, snapshot: Snapshot) -> None:
+    def _publish(self, snapshot: Snapshot) -> None:
         self.latest = snapshot
-        self._tell_change(snapshot)  # first: outputs must get a cycle before a program acts on it
+        self._publish_change(snapshot)  # first: outputs must get a cycle before a program acts on it
         for consumer in self._consumers:
             consumer.put(snapshot)
 
-    def _tell_change(self, snapshot: Snapshot) -> None:
+    def _publish_change(self, snapshot: Snapshot) -> None:
         for consumer in self._consumers_of_changes:
             consumer.put(snapshot)
 

@@ -99,7 +99,7 @@ class Assembler:
         self, write: Callable[[Packet], object], *, protocol: str = "", echo: bool = False, offset: float = 0.0
     ) -> None:
         self._write = write
-        self._kinds = {spoken.name: spoken.kinds[0] for spoken in protocols()}
+        self._kinds = {known.name: known.kinds[0] for known in protocols()}
         self._kind = find(protocol) if protocol else None
         if self._kind is not None:
             self._kinds[self._kind.protocol.name] = self._kind
@@ -109,21 +109,21 @@ class Assembler:
         self._offset = offset
         self._decoders: dict[str, Decoder] = {}
         self._asked: Attempt | None = None
-        self._told = False
+        self._is_sender_known = False
         self._sender = Direction.UNKNOWN
         self._exchange = _Exchange(self._kind)
         self._now = 0.0
 
     def overheard(self, now: float, data: bytes, sender: Direction = Direction.UNKNOWN) -> None:
         """Process bytes of a line that is only listened to."""
-        self._now, self._told = now, False
+        self._now, self._is_sender_known = now, False
         self._decode(now, data, sender)
 
     def passed(self, now: float, data: bytes, sender: Direction, attempt: Attempt | None) -> None:
         """Process bytes of an owned line with the attempt on the wire. Bytes of the HOST are whole frames."""
         if sender is not self._sender or sender is Direction.HOST:
             self._rest()
-        self._now, self._told, self._sender, self._asked = now, True, sender, attempt
+        self._now, self._is_sender_known, self._sender, self._asked = now, True, sender, attempt
         if sender is Direction.HOST and self._echo:
             self._echo_pending += data
             self._sent = data
@@ -165,18 +165,18 @@ class Assembler:
 
     def _take(self, frame: Frame) -> None:
         """Create the packet of one frame."""
-        if self._told:
+        if self._is_sender_known:
             frame.sender = self._sender  # its bytes may not show it
         from_host = frame.sender is Direction.HOST
         asks = from_host and frame.kind in (Kind.READ, Kind.WRITE)
-        if asks and not self._told:
+        if asks and not self._is_sender_known:
             self._release()
             self._exchange = _Exchange(self._kind, None, frame)
         exchange = self._exchange
         if asks and exchange.request is None:
             exchange.request = frame
         packet = Packet(self._micros(frame.time), self._name, frame.sender, frame.raw, frame.node, joined=frame.joined)
-        unexpected = self._told and self._asked is None and not from_host
+        unexpected = self._is_sender_known and self._asked is None and not from_host
         if not (unexpected or exchange.released):
             self._mark(packet)
         if unexpected or (not from_host and exchange.is_behind(frame)):
@@ -186,7 +186,7 @@ class Assembler:
             exchange.last, exchange.answer = frame, packet
         elif frame.kind is Kind.NAK:
             exchange.last = None  # the host wants it again
-        elif frame.fault and not self._told:
+        elif frame.fault and not self._is_sender_known:
             packet.comment = frame.fault
         if exchange.released:
             self._write(packet)
@@ -205,7 +205,7 @@ class Assembler:
     def _overdue_reply(self) -> str:
         """Return the possible origin of an unexpected frame, or ""."""
         attempt = self._exchange.attempt
-        late = self._told and attempt is not None and attempt.verdict is Verdict.NO_REPLY
+        late = self._is_sender_known and attempt is not None and attempt.verdict is Verdict.NO_REPLY
         return f"perhaps a late reply to {attempt.command}" if late and attempt is not None else ""
 
     @property

@@ -27,7 +27,7 @@ class Decoder:
         """The bytes in the buffer arrived in one piece with the bytes before them."""
         self._started = 0.0
         self._heard = 0.0
-        self._spoken = 0.0
+        self._last_end = 0.0
         self._sender = Direction.UNKNOWN
 
     def feed(self, data: bytes, now: float, sender: Direction = Direction.UNKNOWN) -> list[Frame]:
@@ -75,9 +75,9 @@ class Decoder:
         frame.ended = self._heard
         frame.joined = self._joined
         if frame.answers:
-            frame.delay = self._started - self._spoken
+            frame.delay = self._started - self._last_end
         if frame.sender is Direction.HOST or frame.answers:
-            self._spoken = self._heard
+            self._last_end = self._heard
         return frame
 
     def _reject(self, raw: bytes, frames: list[Frame]) -> None:

@@ -50,7 +50,7 @@ class Recorder:
     """A tap that writes a capture. Raises OSError if `path` cannot be written.
 
     Existing files are never overwritten: `path` gets a number then, and so do further files after `size` bytes. The
-    last `count` files are kept (see `CaptureFiles`). While the disk is full, up to `capacity` events wait. `say` is
+    last `count` files are kept (see `CaptureFiles`). While the disk is full, up to `capacity` events wait. `report` is
     called from a thread when that begins and ends.
 
     `port`: name of the line in the file. `protocol`: needed if nothing else determines it (see `Assembler`). `echo`:
@@ -67,14 +67,14 @@ class Recorder:
         capacity: int = CAPACITY,
         size: int = SIZE,
         count: int = COUNT,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.dropped = 0
         """Events lost because `capacity` events waited, and those that could not be written before the end."""
         self.error: OSError | None = None
         """The error while nothing can be written."""
         self._capacity = capacity
-        self._say = say
+        self._report = report
         self._events: deque[_Passed | Attempt] = deque()
         self._stop = threading.Event()
         self._port = port
@@ -198,14 +198,14 @@ class Recorder:
             work()
         except OSError as error:
             if self.error is None:
-                self._say(f"the capture rests: {self.path}: {error.strerror}")
+                self._report(f"the capture rests: {self.path}: {error.strerror}")
             self.error = error
             return False
         self._unwritten = 0
         if self.error is not None:
             self.error = None
             lost = f"{self.dropped} events are lost" if self.dropped else "nothing is lost"
-            self._say(f"the capture goes on: {self.path}; {lost}")
+            self._report(f"the capture goes on: {self.path}; {lost}")
         return True
 
     def _handle(self, event: _Passed | Attempt) -> None:

@@ -75,7 +75,7 @@ class Replayed:
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Received:
     """A packet, its position in the capture, and its frame."""
 
     number: int
@@ -101,12 +101,12 @@ class _Run:
     arbiter may have allowed for an adapter that holds bytes back. Which of the two happened is not recorded.
     """
 
-    def __init__(self, asked: _Heard, command: Command[Any], profile: Profile, pauses: bool = False) -> None:
+    def __init__(self, asked: _Received, command: Command[Any], profile: Profile, pauses: bool = False) -> None:
         self.asked = asked
         self._command = command
         self._profile = profile
         self._pauses = pauses
-        self._told: list[_Heard] = []
+        self._received: list[_Received] = []
         self._last: int | None = None
         """When the node last sent bytes, in microseconds."""
         exchange = command.open(asked.frame.node or 0, profile.timings)
@@ -115,7 +115,7 @@ class _Run:
         self._answered = False
         self._heard = b""
         """Bytes received in one piece, which may continue."""
-        self._unsaid = b""
+        self._unsent = b""
         """Bytes that the host must send next."""
         self._closed = False
         self._over = False
@@ -129,7 +129,7 @@ class _Run:
         if exchange.request != asked.packet.frame:
             self._differs = f"the request would be {exchange.request.hex(' ')}"
 
-    def note(self, heard: _Heard) -> None:
+    def note(self, heard: _Received) -> None:
         """Add the recorded outcome and values."""
         packet = heard.packet
         if packet.outcome not in (Outcome.NONE, Outcome.UNEXPECTED):
@@ -137,14 +137,14 @@ class _Run:
         if heard.frame.kind is Kind.VALUE and not heard.frame.fault:
             self._values += numbers_in(heard.frame.value)
 
-    def node_says(self, heard: _Heard) -> None:
+    def add_reply(self, heard: _Received) -> None:
         """Pass bytes of the node to the reader, if the exchange has not ended."""
         if self._over and not any(heard.exchange):
             return
         if not self._driver.exchange.answered:
             self.note(heard)
             return  # a broadcast has no reply: bytes behind it are unexpected
-        self._told.append(heard)
+        self._received.append(heard)
         self._pause(heard.packet.micros)
         self.note(heard)
         self._given_up = None
@@ -153,22 +153,22 @@ class _Run:
         self._heard += heard.packet.frame
         self._answered = self._answered or bool(heard.packet.frame)
 
-    def host_says(self, heard: _Heard) -> bool:
+    def add_request(self, heard: _Received) -> bool:
         """Return True if these are the bytes that this exchange sends next; else the exchange has ended."""
         if self._over or self._differs:
             return False
-        self._told.append(heard)
+        self._received.append(heard)
         self._last = None
         frame = heard.packet.frame
         self._hand_over()
-        if not self._unsaid:
+        if not self._unsent:
             self._driver.expire()
             self._gather()
-        if not self._unsaid.startswith(frame):
+        if not self._unsent.startswith(frame):
             self._abandon()
-        self._over = not self._unsaid.startswith(frame)
+        self._over = not self._unsent.startswith(frame)
         if not self._over:
-            self._unsaid = self._unsaid[len(frame) :]
+            self._unsent = self._unsent[len(frame) :]
             self._given_up = self._if_abandoned(frame)
             self.note(heard)
         return not self._over
@@ -179,10 +179,10 @@ class _Run:
         if not found.changed:
             return found
         run = _Run(self.asked, self._command, self._profile, pauses=True)
-        for heard in self._told:
+        for heard in self._received:
             if heard.packet.direction is not Direction.HOST:
-                run.node_says(heard)
-            elif not run.host_says(heard):
+                run.add_reply(heard)
+            elif not run.add_request(heard):
                 break
         by_pauses = run._end()
         return found if by_pauses.changed else by_pauses
@@ -223,24 +223,24 @@ class _Run:
     def _gather(self) -> None:
         """Store the bytes that the exchange sends next."""
         driver = self._driver
-        self._unsaid += b"".join(driver.sent)
+        self._unsent += b"".join(driver.sent)
         driver.sent.clear()
         if driver.ending is not None and not self._closed:
             self._closed = True
-            self._unsaid += driver.ending.send
+            self._unsent += driver.ending.send
 
-    def _if_abandoned(self, said: bytes) -> Result | None:
+    def _if_abandoned(self, data: bytes) -> Result | None:
         """Return the result if the exchange had been aborted with these bytes."""
         if not self._abandonable or self._driver.ending is not None:
             return None
         failure = cast("Abandonable", self._driver.exchange).abandon()
-        return result_of(Ending(error=failure)) if isinstance(failure, FrameError) and failure.send == said else None
+        return result_of(Ending(error=failure)) if isinstance(failure, FrameError) and failure.send == data else None
 
     def _abandon(self) -> None:
         """Abort the exchange: it would have sent again, but the host had no more time for that (R9)."""
-        if self._abandonable and self._unsaid and self._driver.ending is None:
+        if self._abandonable and self._unsent and self._driver.ending is None:
             self._driver.abandon()
-            self._unsaid = b""
+            self._unsent = b""
             self._gather()
 
 
@@ -265,9 +265,13 @@ def replay_packets(packets: Iterable[Packet]) -> Iterator[Replayed]:
         of_run = run is not None and one.exchange == run.asked.exchange
         if one.packet.direction is not Direction.HOST:
             if run is not None and of_run and (any(one.exchange) or one.packet.outcome is not Outcome.UNEXPECTED):
-                run.node_says(one)
+                run.add_reply(one)
             continue
-        if (run is not None and of_run and run.host_says(one)) or not one.is_request or (of_run and any(one.exchange)):
+        if (
+            (run is not None and of_run and run.add_request(one))
+            or not one.is_request
+            or (of_run and any(one.exchange))
+        ):
             continue
         if run is not None:
             yield run.end()
@@ -281,7 +285,7 @@ def replay_packets(packets: Iterable[Packet]) -> Iterator[Replayed]:
         yield run.end()
 
 
-def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
+def listen(packets: Iterable[Packet]) -> Iterator[_Received]:
     """Yield each packet with its frame."""
     decoders: dict[str, Decoder] = {}
     for number, packet in enumerate(packets, 1):
@@ -291,10 +295,10 @@ def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
         if packet.protocol and packet.frame:
             decoder = decoders[packet.protocol]
             frame = (decoder.feed(packet.frame, packet.micros / 1e6, packet.direction) + decoder.quiet())[-1]
-        yield _Heard(number, packet, frame)
+        yield _Received(number, packet, frame)
 
 
-def open_run(heard: Sequence[_Heard], place: int) -> _Run:
+def open_run(heard: Sequence[_Received], place: int) -> _Run:
     """Return a new exchange for a recorded request. Raises InvalidCommand if no command would send it."""
     asked = heard[place]
     continued = []
@@ -323,7 +327,7 @@ def command_of(protocol: Protocol, request: Frame, continued: Sequence[Frame] = 
         raise InvalidCommand(f"no command of ours: {request.text}") from error
 
 
-def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:
+def recorded_outcome(heard: Sequence[_Received], place: int) -> Outcome:
     """Return the recorded outcome of the exchange that begins at `place`."""
     outcome = heard[place].packet.outcome
     for follower in heard[place + 1 :]:
@@ -334,7 +338,7 @@ def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:
     return outcome
 
 
-def _replayed(asked: _Heard, command: str, recorded: Result, now: Result) -> Replayed:
+def _replayed(asked: _Received, command: str, recorded: Result, now: Result) -> Replayed:
     return Replayed(asked.number, asked.packet.micros, asked.packet.node, command, recorded, now)
 
 

@@ -15,21 +15,21 @@ from busmaster.emulator.collision import Collision
 from busmaster.emulator.device import NEVER, Device
 from busmaster.emulator.disturbance import misses
 
-Say = Callable[[Device, float, bytes], None]
+Send = Callable[[Device, float, bytes], None]
 """A device will transmit: the start time and the bytes."""
 TakeBack = Callable[[Device, float], None]
 """A device has restarted at this time: its pending transmissions are discarded."""
 
 
 class AttachedDevices:
-    """The devices of a line. `say` is called with their replies, `take_back` after a restart."""
+    """The devices of a line. `send` is called with their replies, `take_back` after a restart."""
 
-    def __init__(self, say: Say, take_back: TakeBack, chance: Chance, tau: float) -> None:
+    def __init__(self, send: Send, take_back: TakeBack, chance: Chance, tau: float) -> None:
         self.devices: list[Device] = []
         self.wakeup = NEVER
         """Earliest time at which a device must be woken."""
         self.cut_off: frozenset[Device] = frozenset()
-        self._say = say
+        self._send = send
         self._take_back = take_back
         self._chance = chance
         self._tau = tau
@@ -130,11 +130,11 @@ class AttachedDevices:
             device.restarted = False
             self._take_back(device, now)
         if device.outbox:
-            said = device.outbox[:]
+            replies = device.outbox[:]
             device.outbox.clear()
             if now >= device.away_until and not device.faults.dead:
-                for start, data in said:
-                    self._say(device, max(start, now), data)
+                for start, data in replies:
+                    self._send(device, max(start, now), data)
         device.lag = 0.0
         if device.attentive:
             self._attentive[device] = None

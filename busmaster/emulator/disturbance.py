@@ -38,15 +38,17 @@ def misses(device: Device, start: float, end: float, request: bool, chance: Chan
     return False
 
 
-Said = tuple[float, bytes, int]
+Transmission = tuple[float, bytes, int]
 """When it starts, the bytes, and the chunks they reach the host in (0: as the line does it)."""
 
 
-def distort(faults: Faults, said: Said, device: Device | None, tau: float, chance: Chance) -> list[Said]:
+def distort(
+    faults: Faults, transmission: Transmission, device: Device | None, tau: float, chance: Chance
+) -> list[Transmission]:
     """Return what becomes of a frame transmitted by `device` (None: the host): possibly nothing, possibly several
     frames."""
-    start, data, chunk = said
-    more: list[Said] = []
+    start, data, chunk = transmission
+    more: list[Transmission] = []
     for name, rate in faults.speaking:
         if chance.random() >= rate:
             continue

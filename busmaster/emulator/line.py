@@ -28,7 +28,7 @@ from busmaster.emulator.attached_devices import AttachedDevices
 from busmaster.emulator.chance import Chance, NoChance
 from busmaster.emulator.collision import Collision
 from busmaster.emulator.device import NEVER, Device
-from busmaster.emulator.disturbance import Said, distort, flipped
+from busmaster.emulator.disturbance import Transmission, distort, flipped
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.misheard import misheard
 
@@ -119,7 +119,7 @@ class Line:
         self._inbox = b""
         self._arrived = 0.0
         self._arrivals: deque[tuple[float, bytes]] = deque()
-        self._attached = AttachedDevices(self._say, self._take_back, self.chance, self.tau)
+        self._attached = AttachedDevices(self._transmit, self._take_back, self.chance, self.tau)
         for device in devices:
             self.add(device)
 
@@ -186,7 +186,7 @@ class Line:
         if self.host is not None:
             data = self._as_devices_hear(data, start)
         self._sent_by = start + len(data) * self.tau
-        self._say(None, start, data)
+        self._transmit(None, start, data)
 
     def receive(self, now: float) -> bytes:
         """Return the bytes that have completely arrived at the host's port by `now` and were not delivered before."""
@@ -227,14 +227,14 @@ class Line:
 
     # Talks begin, meet and end
 
-    def _say(self, talker: Device | None, start: float, data: bytes) -> None:
+    def _transmit(self, talker: Device | None, start: float, data: bytes) -> None:
         if not self.faults.speaking and (talker is None or not talker.faults.speaking):
             self._join(Talk(talker, start, start + len(data) * self.tau, data, True, 0))
             return
-        said: list[Said] = [(start, data, 0)]
+        transmissions: list[Transmission] = [(start, data, 0)]
         if talker is not None:
-            said = distort(talker.faults, said[0], talker, self.tau, self.chance)
-        for one in said:
+            transmissions = distort(talker.faults, transmissions[0], talker, self.tau, self.chance)
+        for one in transmissions:
             for begin, some, chunk in distort(self.faults, one, talker, self.tau, self.chance):
                 clean = begin == start and some == data
                 self._join(Talk(talker, begin, begin + len(some) * self.tau, some, clean, chunk))

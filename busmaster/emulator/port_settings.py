@@ -34,20 +34,20 @@ def words(descriptor: int) -> bytes:
 def set_rate(descriptor: int, baudrate: int) -> None:
     """Set a terminal's rate, if the kernel permits it."""
     with contextlib.suppress(OSError):
-        said = list(TERMIOS2.unpack(words(descriptor) or bytes(TERMIOS2.size)))
-        said[CONTROL] = said[CONTROL] & ~termios.CBAUD | OTHER_RATE
-        said[RATES] = [baudrate, baudrate]
-        fcntl.ioctl(descriptor, SET, TERMIOS2.pack(*said))
+        attributes = list(TERMIOS2.unpack(words(descriptor) or bytes(TERMIOS2.size)))
+        attributes[CONTROL] = attributes[CONTROL] & ~termios.CBAUD | OTHER_RATE
+        attributes[RATES] = [baudrate, baudrate]
+        fcntl.ioctl(descriptor, SET, TERMIOS2.pack(*attributes))
 
 
 def differing(terminal: bytes, line: LineSettings) -> LineSettings | None:
     """Return the settings of a terminal with these words; None if they are those of the line, or unknown."""
     if len(terminal) != TERMIOS2.size:
         return None
-    said = TERMIOS2.unpack(terminal)
-    odd = bool(said[CONTROL] & termios.PARODD)
+    attributes = TERMIOS2.unpack(terminal)
+    odd = bool(attributes[CONTROL] & termios.PARODD)
     parity = "O" if odd else "N" if line.parity == "O" else line.parity
-    port = replace(line, baudrate=said[RATES][-1] or line.baudrate, parity=parity)
+    port = replace(line, baudrate=attributes[RATES][-1] or line.baudrate, parity=parity)
     return None if port == line else port
 
 

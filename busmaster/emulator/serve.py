@@ -129,9 +129,9 @@ class LineServer(ABC):
                 timeout = 0.0
         for source in select.select([self._bell, *self._sources()], (), (), timeout)[0]:
             if source != self._bell:
-                said = self._read(source)
-                if said:
-                    self.line.send(said, time.monotonic())
+                data = self._read(source)
+                if data:
+                    self.line.send(data, time.monotonic())
                 continue
             os.read(self._bell, CHUNK)
             while not self._actions.empty():

@@ -168,7 +168,7 @@ class World:
             self.arbiter.data_received(data, self.now)
             self._pump()
 
-    def _say(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         """Send the arbiter's bytes on the line."""
         if self._record is not None:
             self._record(f"{self.now:.6f} > {data.hex(' ')}")
@@ -183,7 +183,7 @@ class World:
         while True:
             data = arbiter.poll_transmit()
             if data is not None:
-                self._say(data)
+                self._send(data)
             event = arbiter.poll_event()
             if event is None:
                 if data is None:
@@ -194,12 +194,12 @@ class World:
                     self.tap.attempted(event)
                 continue
             if self._record is not None:
-                self._record(f"{self.now:.6f} {told(event)}")
+                self._record(f"{self.now:.6f} {described(event)}")
             if self._on_event is not None:
                 self._on_event(event)
 
 
-def told(event: Event) -> str:
+def described(event: Event) -> str:
     """Return an event as one line of text, the same on every run."""
     match event:
         case Transaction():

@@ -70,7 +70,7 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
     steps = [(len(exchange.request), exchange.timing, exchange.sizes)]
     steps += ((step.sent, step.timing, step.sizes) for step in exchange.later)
     for sent, timing, sizes in steps:
-        said = before + sent * byte_time + receive_latency
+        request_end = before + sent * byte_time + receive_latency
         begins = timing.max_reply_delay + byte_time
         whole = (
             begins + sizes.longest * byte_time + timing.inter_byte_timeout
@@ -79,8 +79,8 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
         # Each byte delays the silence. But a line without silence becomes NOISY: requests do not wait longer, but fail
         # with LineNoisy.
         trickles = min(begins + sizes.longest * quiet, whole + NOISY_AFTER + quiet)
-        worst = max(worst, said + trickles + quiet)
-        before = said + whole
+        worst = max(worst, request_end + trickles + quiet)
+        before = request_end + whole
     return worst + exchange.closing * byte_time + exchange.timing.driver_release_time
 
 

@@ -31,7 +31,7 @@ from busmaster.registry import Protocol
 from busmaster.testing.cases import Case, NotConformant
 from busmaster.testing.damage import bytewise
 
-Said = tuple[Direction, bytes]
+Transmission = tuple[Direction, bytes]
 APART = 0.5
 """Seconds between noise and what follows it: longer than a listener waits for the rest of a frame."""
 NOISE = b"\xff\xff"
@@ -45,20 +45,20 @@ def check_dialect(protocol: Protocol, cases: Iterable[Case]) -> None:
 
 
 def _check(protocol: Protocol, case: Case) -> Iterator[str]:
-    said = list(_conversation(protocol, case))
-    frames = _hear(protocol, said)
-    pieces = [(sender, byte) for sender, data in said for byte in bytewise(data)]
+    transmissions = list(_conversation(protocol, case))
+    frames = _hear(protocol, transmissions)
+    pieces = [(sender, byte) for sender, data in transmissions for byte in bytewise(data)]
     if (found := _hear(protocol, pieces)) != frames:
-        yield f"one byte at a time it is {_told(found)} instead of {_told(frames)}"
-    if (found := _hear(protocol, said, NOISE)) != frames:
-        yield f"after noise it is {_told(found)} instead of {_told(frames)}"
+        yield f"one byte at a time it is {_described(found)} instead of {_described(frames)}"
+    if (found := _hear(protocol, transmissions, NOISE)) != frames:
+        yield f"after noise it is {_described(found)} instead of {_described(frames)}"
     yield from _check_request(protocol, case, frames)
     if case.steps:
         yield from _check_answer(case, frames)
     yield from _check_written(protocol, case.command)
 
 
-def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
+def _conversation(protocol: Protocol, case: Case) -> Iterator[Transmission]:
     """Yield the bytes of both sides, including the closing byte of the host."""
     driver = Driver(case.command.open(case.address, protocol.profile.timings))
     yield Direction.HOST, driver.exchange.request
@@ -73,11 +73,11 @@ def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
         yield Direction.HOST, ending.send
 
 
-def _hear(protocol: Protocol, said: Iterable[Said], noise: bytes = b"") -> list[Frame]:
+def _hear(protocol: Protocol, transmissions: Iterable[Transmission], noise: bytes = b"") -> list[Frame]:
     """Return the frames without their times, and without noise before them."""
     decoder = Decoder(protocol.dialect())
     frames = decoder.feed(noise, 0.0) if noise else []
-    for sender, data in said:
+    for sender, data in transmissions:
         frames += decoder.feed(data, APART, sender)
     frames = [frame for frame in frames + decoder.quiet() if not (noise and frame.raw == noise)]
     for frame in frames:
@@ -91,7 +91,7 @@ def _check_request(protocol: Protocol, case: Case, frames: Sequence[Frame]) -> I
     request = frames[0]
     wanted = Kind.WRITE if case.command.writes else Kind.READ
     if request.raw != asked or request.kind is not wanted or request.sender is not Direction.HOST or request.fault:
-        yield f"its request {asked.hex(' ')} is {_told(frames[:1])}, not a {wanted.value} of the host"
+        yield f"its request {asked.hex(' ')} is {_described(frames[:1])}, not a {wanted.value} of the host"
         return
     if profile.addressed and request.node != case.address:
         yield f"its request is decoded as one to {request.node}"
@@ -100,7 +100,7 @@ def _check_request(protocol: Protocol, case: Case, frames: Sequence[Frame]) -> I
         command = protocol.dialect().command(request, continued)
         again = command.open(case.address, profile.timings).request
     except (InvalidCommand, ValueError, KeyError) as error:
-        yield f"its request {_told(frames[:1])} gives no command: {error}"
+        yield f"its request {_described(frames[:1])} gives no command: {error}"
         return
     if again != asked or (continued and str(command) != str(case.command)):
         yield f"its request is decoded as {command}, which sends {again.hex(' ')} instead of {asked.hex(' ')}"
@@ -109,11 +109,11 @@ def _check_request(protocol: Protocol, case: Case, frames: Sequence[Frame]) -> I
 def _check_answer(case: Case, frames: Sequence[Frame]) -> Iterator[str]:
     answers = [frame for frame in frames if frame.sender is Direction.NODE]
     if not answers or not answers[-1].answers or answers[-1].fault:
-        yield f"its reply is {_told(answers[-1:])}, which does not end the request"
+        yield f"its reply is {_described(answers[-1:])}, which does not end the request"
         return
     refused = answers[-1].kind in (Kind.NAK, Kind.EOT)
     if refused is not (case.raises is not None):
-        yield f"its reply is {_told(answers[-1:])}, {'a refusal' if refused else 'not a refusal'}"
+        yield f"its reply is {_described(answers[-1:])}, {'a refusal' if refused else 'not a refusal'}"
 
 
 def _check_written(protocol: Protocol, command: Command[Any]) -> Iterator[str]:
@@ -126,5 +126,5 @@ def _check_written(protocol: Protocol, command: Command[Any]) -> Iterator[str]:
         yield f"it is converted to JSON, and back to {back!r}"
 
 
-def _told(frames: Sequence[Frame]) -> str:
+def _described(frames: Sequence[Frame]) -> str:
     return "; ".join(f"{f.kind.value} {f.text!r}" + (f" [{f.fault}]" if f.fault else "") for f in frames) or "nothing"

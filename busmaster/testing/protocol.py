@@ -131,10 +131,10 @@ class _Kit:
         driver = self.listen(case.command, case.address)
         turns: list[list[bytes]] = [[]]
         for step in case.steps:
-            said = len(driver.sent)
+            sent_before = len(driver.sent)
             driver.feed(step)
             turns[-1].append(step)
-            if len(driver.sent) > said:
+            if len(driver.sent) > sent_before:
                 turns.append([])
         return turns
 
@@ -198,9 +198,9 @@ class _Kit:
             for length in range(1, len(run)):
                 self.tally["truncations"] += 1
                 driver = self.hear(case, *before)
-                said = len(driver.sent)
+                sent_before = len(driver.sent)
                 driver.feed(run[:length])
-                early = driver.ending is not None or len(driver.sent) > said
+                early = driver.ending is not None or len(driver.sent) > sent_before
                 ending = driver.run_out()
                 if early or ending.delivered or ending.is_whole or ending.is_bug:
                     when = "at once" if early else "when time runs out"
@@ -335,8 +335,8 @@ class _Kit:
     def _converse(self, command: Command[Any], address: int, device: Callable[[bytes], bytes]) -> Ending:
         driver = self.listen(command, address)
         driver.feed(device(driver.exchange.request))
-        for said in driver.sent:
-            driver.feed(device(said))
+        for sent_before in driver.sent:
+            driver.feed(device(sent_before))
         ending = driver.run_out()
         if ending.send:
             device(ending.send)

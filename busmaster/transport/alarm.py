@@ -146,19 +146,19 @@ def kernel_timer(loop: asyncio.AbstractEventLoop, on_expiry: Callable[[], None])
     try:
         timer = KernelTimer()
     except OSError as error:
-        tell_once(str(error))
+        warn_once(str(error))
         return None
     try:
         # A loop that is not built on descriptors, for example one made for tests.
         loop.add_reader(timer.descriptor, on_expiry)
     except NotImplementedError:
         timer.close()
-        tell_once(f"a {type(loop).__name__} cannot read descriptors")
+        warn_once(f"a {type(loop).__name__} cannot read descriptors")
         return None
     return timer
 
 
 @cache
-def tell_once(why: str) -> None:
+def warn_once(why: str) -> None:
     """Log that pauses are rounded up."""
     logger.info("pauses of the line are rounded up to the next millisecond: %s", why)

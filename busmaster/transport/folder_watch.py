@@ -79,7 +79,7 @@ def watch_folders(
         watch = watch or FolderWatch(loop, on_change)
         watch.follow(folders)
     except OSError as error:
-        tell_once(str(error))
+        warn_once(str(error))
         if watch is not None:
             watch.close()
         return None
@@ -87,6 +87,6 @@ def watch_folders(
 
 
 @cache
-def tell_once(why: str) -> None:
+def warn_once(why: str) -> None:
     """Log that a port which comes back is noticed a little later."""
     logger.info("polling for ports that come back, because folders cannot be watched: %s", why)

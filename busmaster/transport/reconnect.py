@@ -57,7 +57,7 @@ class Connection:
         self._link: _Link | None = None
         self._device: Identity | None = None
         self._seen: Hashable | None = None
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._closing = asyncio.Event()
         self._stirred = asyncio.Event()
         """Set if a device may have appeared: check now."""
@@ -72,7 +72,7 @@ class Connection:
         # None behind a serial server: its address is its identity.
         self._device = transport.get_extra_info("identity")
         self._link = link
-        self._told.clear()  # it was open in the meantime: the same cause is reported again
+        self._reported.clear()  # it was open in the meantime: the same cause is reported again
         if self._closing.is_set():  # closed during the opening, when there was nothing to close
             await self.close()
 
@@ -81,7 +81,7 @@ class Connection:
         try:
             await self.open()
         except Exception as error:  # not only LineDown: another error would silently end the reconnecting
-            self._tell("open", error)
+            self._report("open", error)
 
     def accept_device(self) -> None:
         """Accept any device that has the port's name at the next opening, which follows soon."""
@@ -180,16 +180,16 @@ class Connection:
             # Also while nothing is open, so that the next change is one against now.
             self._seen = self.endpoint.presence()
         except Exception as error:
-            self._tell("look", error)
+            self._report("look", error)
         return self._seen is not None and self._seen != before
 
-    def _tell(self, doing: str, error: Exception) -> None:
+    def _report(self, doing: str, error: Exception) -> None:
         """Report why this failed, unless the cause is the same as at the last attempt."""
         cause = self._cause(error)
         # R14: a port that is missing for a night would fill the log with an attempt every 5 s.
-        if self._on_failed is None or self._told.get(doing) == str(cause):
+        if self._on_failed is None or self._reported.get(doing) == str(cause):
             return
-        self._told[doing] = str(cause)
+        self._reported[doing] = str(cause)
         try:
             self._on_failed(cause)
         except Exception as bug:

@@ -85,7 +85,7 @@ def test_only_its_own_old_files_are_removed(tmp_path: Path) -> None:
 def test_a_full_disk_is_said_and_what_passed_meanwhile_is_recorded_when_it_has_room(tmp_path: Path) -> None:
     said: list[str] = []
     with small_disk(tmp_path, 64) as disk:
-        with Recorder(tmp_path / "line.pcapng", say=said.append) as tap:
+        with Recorder(tmp_path / "line.pcapng", report=said.append) as tap:
             exchange(tap, 1)
             until(lambda: Path(tap.path).stat().st_size > 0 and transactions(Path(tap.path)) == [1])
             disk.fill()

@@ -155,7 +155,7 @@ def test_without_a_kernel_timer_the_loops_serves_and_the_log_says_so(
         """A C library of a system that knows no timerfd."""
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Without())
-    alarm_module.tell_once.cache_clear()
+    alarm_module.warn_once.cache_clear()
     with caplog.at_level(logging.INFO, "busmaster"):
         start, end = asyncio.run(rung(0.002))
         asyncio.run(rung(0.002))

@@ -281,7 +281,7 @@ async def test_where_no_folder_can_be_watched_the_clock_serves_and_the_log_says_
     monkeypatch.setattr(folder_watch, "call_system", refuse)
     monkeypatch.setattr(reconnect, "LOOK_EVERY", 0.01)
     monkeypatch.setattr(reconnect, "LOOK_ANYWAY", NEVER)
-    folder_watch.tell_once.cache_clear()
+    folder_watch.warn_once.cache_clear()
     caplog.set_level(logging.INFO, "busmaster")
     ours, back = ends
     usb_dev.plug(ours.path, "A500ABC", node="ttyUSB0")

@@ -179,13 +179,13 @@ def connected(command: F, *, or_file: bool = False, port: bool = True) -> F:
 
         def connection(port: str) -> Connection:
             if or_file and is_line_file(port):
-                spoken = none_but_the_files(port)
+                chosen = none_but_the_files(port)
             elif protocol is None:
                 raise click.UsageError("protocol missing; use --protocol P, or a LINE.toml instead of the port")
             else:
-                spoken = protocol
-            own = take_options(handle_options(), spoken, dict(given))
-            return Connection(port, spoken, baud, echo, timeout, retries, capture, own)
+                chosen = protocol
+            own = take_options(handle_options(), chosen, dict(given))
+            return Connection(port, chosen, baud, echo, timeout, retries, capture, own)
 
         return command(connection=connection if where is None else connection(where), **options)
 
@@ -213,8 +213,8 @@ def none_but_the_files(path: str) -> str:
     context = click.get_current_context()
     for parameter in context.command.get_params(context):
         name = parameter.name or ""
-        said = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        if said and isinstance(parameter, click.Option) and name not in NOT_THE_FILES:
+        is_set = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if is_set and isinstance(parameter, click.Option) and name not in NOT_THE_FILES:
             raise click.UsageError(f"{path} already defines the line; leave out {parameter.opts[0]}")
     return ""
 

@@ -61,11 +61,11 @@ class AuditLog(logging.Handler):
         self._waiting.append((f"audit: {record.getMessage()}", level))
 
     def _print(self) -> None:
-        told, last = 0, False
+        reported, last = 0, False
         while not last:
             last = self._stop.wait(TICK)
             while self._waiting:
                 note(*self._waiting.popleft())
-            if (lost := self._lost) > told:
-                note(f"audit: {lost - told} writes are not listed here; standard error was blocked", Level.WARNING)
-                told = lost
+            if (lost := self._lost) > reported:
+                note(f"audit: {lost - reported} writes are not listed here; standard error was blocked", Level.WARNING)
+                reported = lost

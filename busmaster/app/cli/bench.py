@@ -266,14 +266,14 @@ class Run:
             plot(report, self.picture)
 
     def _status(self, report: BenchReport) -> int:
-        status = tell_excess(report.exceeded(self.budgets))
+        status = print_excess(report.exceeded(self.budgets))
         if not report.values:
             note("no value was received; check the port, the protocol and the nodes", Level.ERROR)
             return FAILED
         return status
 
 
-def tell_excess(texts: Sequence[str]) -> int:
+def print_excess(texts: Sequence[str]) -> int:
     """Print on standard error which budgets are exceeded, and return the exit status."""
     for text in texts:
         note(f"budget exceeded: {text}", Level.ERROR)
@@ -355,8 +355,8 @@ def bars(report: BenchReport) -> Iterator[str]:
 def compare(context: click.Context, first: str, second: str, budgets: Sequence[Budget], as_json: bool) -> int:
     """Print how the second report differs from the first, and return the exit status."""
     for parameter in context.command.get_params(context):
-        said = parameter.name and context.get_parameter_source(parameter.name) is click.core.ParameterSource.COMMANDLINE
-        if said and parameter.name not in ("compare", "budgets", "as_json"):
+        source = context.get_parameter_source(parameter.name or "")
+        if source is click.core.ParameterSource.COMMANDLINE and parameter.name not in ("compare", "budgets", "as_json"):
             raise click.UsageError(f"--compare does not measure; leave out {parameter.human_readable_name}")
     before, after = read_report(first), read_report(second)
     excess = after.exceeded(budgets, before=before)  # first: a budget of something that is not measured is wrong usage
@@ -365,7 +365,7 @@ def compare(context: click.Context, first: str, second: str, budgets: Sequence[B
         emit(ratios_json(before, after, found))
     else:
         emit_all(comparison(before, after, found))
-    return tell_excess(excess)
+    return print_excess(excess)
 
 
 def read_report(path: str) -> BenchReport:

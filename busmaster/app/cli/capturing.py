@@ -72,7 +72,7 @@ def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = F
     context = click.get_current_context(silent=True)
     limits = context.meta if context is not None else {}
     held: list[str] = []
-    say = held.append if sys.stdout.isatty() and sys.stdin.isatty() else note
+    report = held.append if sys.stdout.isatty() and sys.stdin.isatty() else note
     try:
         recorder = Recorder(
             path,
@@ -81,7 +81,7 @@ def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = F
             echo=echo,
             size=limits.get(f"{LIMITS}.capture_mb", SIZE // MEGABYTE) * MEGABYTE,
             count=limits.get(f"{LIMITS}.capture_files", COUNT),
-            say=say,
+            report=report,
         )
     except OSError as error:
         raise click.UsageError(f"--capture {path}: {error.strerror}") from None

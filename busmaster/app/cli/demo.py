@@ -100,7 +100,7 @@ async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:
     for drive, percent in zip(itertools.cycle(drives), speeds, strict=False):
         await anyio.sleep(COMMAND_EVERY)
         if await attempt(watch, drive, drive.set_speed_reference, percent):
-            watch.tell(f"{drive.node.label}: speed reference {percent:g} %")
+            watch.show(f"{drive.node.label}: speed reference {percent:g} %")
 
 
 async def attempt(watch: Watch, drive: MicroFlexDrive, order: Callable[..., Awaitable[object]], *values: float) -> bool:
@@ -111,6 +111,6 @@ async def attempt(watch: Watch, drive: MicroFlexDrive, order: Callable[..., Awai
     try:
         await order(*values)
     except BusError as error:
-        watch.tell(f"{drive.node.label}: {error.what}")
+        watch.show(f"{drive.node.label}: {error.what}")
         return False
     return True

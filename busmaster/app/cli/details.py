@@ -18,11 +18,11 @@ QUALITIES = {"late": "came late", "stale": "older than a write to it"}
 
 
 def details_text(
-    row: Row, node: Node | None, group: Group | None, told: Mapping[str, Any], frame: Frame | None, width: int
+    row: Row, node: Node | None, group: Group | None, details: Mapping[str, Any], frame: Frame | None, width: int
 ) -> Text:
-    """Return the details of a point, for `width` columns. `told` is the description from the line's owner."""
+    """Return the details of a point, for `width` columns. `details` is the description from the line's owner."""
     lines = [Text(f"{row.name}  ({row.key})", "bold")]
-    facts = _facts(row, node, group, made_printable(dict(told)), frame)
+    facts = _facts(row, node, group, made_printable(dict(details)), frame)
     lines += [Text.assemble((f"{name:<9}", "bold"), text) for name, text in facts]
     numbers = [number for _, number in row.past if number is not None]
     if numbers:
@@ -37,7 +37,7 @@ def details_text(
 
 
 def _facts(
-    row: Row, node: Node | None, group: Group | None, told: Mapping[str, Any], frame: Frame | None
+    row: Row, node: Node | None, group: Group | None, details: Mapping[str, Any], frame: Frame | None
 ) -> Iterator[tuple[str, str]]:
     value = f"{value_text(row.value, row.precision)} {row.unit}".rstrip()
     age = f", requested {age_text(frame.now - row.asked)} ago" if frame and row.asked is not None else ""
@@ -48,7 +48,7 @@ def _facts(
             f"the bit is {row.alarm}" if row.alarm in ("set", "clear") else f"value beyond its {row.alarm} limit",
         )
     if row.error:
-        yield "error", f"{row.error}; {told['hint']}" if told.get("hint") else row.error
+        yield "error", f"{row.error}; {details['hint']}" if details.get("hint") else row.error
     if node is not None:
         state = "offline" if frame and frame.state == "offline" else node.health
         times = f"p50 {node.p50 * 1000:.1f}, p99 {node.p99 * 1000:.1f} ms"
@@ -56,26 +56,26 @@ def _facts(
         yield "node", f"{node.kind or node.protocol} {node.address}, {state}: {counts}"
     if group is not None:
         yield "group", f"{group.name}, every {group.period * 1000:g} ms{', paused' if group.paused else ''}"
-    if told.get("gone"):
-        yield "", str(told["gone"])
-    elif told:
-        yield "limits", _limits_text(row, told)
-        yield "asks", str(told["command"])
-        if told.get("timeline"):
-            yield "exchange", _exchange_text(told["timeline"])
+    if details.get("gone"):
+        yield "", str(details["gone"])
+    elif details:
+        yield "limits", _limits_text(row, details)
+        yield "asks", str(details["command"])
+        if details.get("timeline"):
+            yield "exchange", _exchange_text(details["timeline"])
 
 
-def _limits_text(row: Row, told: Mapping[str, Any]) -> str:
+def _limits_text(row: Row, details: Mapping[str, Any]) -> str:
     texts = []
-    for limit in told["limits"]:
-        said = [
+    for limit in details["limits"]:
+        bounds = [
             f"{word} {number_text(limit[name])}"
             for name, word in (("minimum", "from"), ("maximum", "to"), ("max_step", "in steps of at most"))
             if limit[name] is not None
         ]
-        texts.append(" ".join(said) if limit["writable"] else "may not be written")
+        texts.append(" ".join(bounds) if limit["writable"] else "may not be written")
     written = "; ".join(text for text in texts if text) or ("any value" if row.writable else "it is read-only")
-    alarms = [f"{name} {number_text(told[name])}" for name in ("low", "high") if told.get(name) is not None]
+    alarms = [f"{name} {number_text(details[name])}" for name in ("low", "high") if details.get(name) is not None]
     return f"{'written ' * row.writable}{written}" + (f"; alarm {', '.join(alarms)}" if alarms else "")
 
 

@@ -68,7 +68,7 @@ def command(
     job = Job(*parsed(lambda text: what_to_try(text, names, nodes), port))
     if output is not None and Path(output).exists():
         raise click.UsageError(f"{output} exists and is not overwritten; choose another name")
-    tell_plan(job)
+    print_plan(job)
     if not yes and not sys.stdin.isatty():
         raise click.UsageError(
             "confirmation required, but there is no terminal; nothing was sent; use --yes to skip the question"
@@ -107,7 +107,7 @@ def what_to_try(
     return where, steps(wanted, nodes, allowed)
 
 
-def tell_plan(job: Job) -> None:
+def print_plan(job: Job) -> None:
     """Print the steps and their duration."""
     tried = job.tried
     settings = list(dict.fromkeys(step.settings for step in tried))

@@ -54,14 +54,14 @@ def command(
     patient = patient_of(Connection(port, protocol or "", baud, echo, timeout), nodes)
     wrong = 0
 
-    def tell(finding: Finding) -> None:
+    def report(finding: Finding) -> None:
         nonlocal wrong
         wrong += not finding.ok
         emit_all([json_line(**asdict(finding), time=utc(time.time()))] if as_json else lines_of(finding))
 
     name = patient.endpoint.name
     with capturing(capture, port=name, protocol=protocol or "", echo=patient.endpoint.echo) as recorder:
-        until_ended(examine, patient, tell, recorder)
+        until_ended(examine, patient, report, recorder)
     if wrong:
         note(f"{name}: {wrong} thing{'' if wrong == 1 else 's'} to fix")
         return FAILED

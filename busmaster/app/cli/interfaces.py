@@ -55,13 +55,13 @@ def following(line: str | None, *, read_only: bool) -> Following:
         note(f"{error}; the interface starts, and waits for the line", Level.WARNING)
     followed = Following(_Meant(line), token=token, read_only=read_only)
 
-    def tell() -> None:
+    def report() -> None:
         if isinstance(followed.state, Connected):
             note(f"connected to line {followed.state.about['line']}{' (read-only)' if followed.read_only else ''}")
         else:
             note(followed.state.why, Level.WARNING)
 
-    followed.on_state(tell)
+    followed.on_state(report)
     return followed
 
 

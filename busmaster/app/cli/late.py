@@ -41,7 +41,7 @@ class LateNodes:
             _, age = self._ages.pop(error.address)
             error.hint = advice(age)
 
-    def tell(self) -> None:
+    def print_advice(self) -> None:
         """Print advice on standard error, once for each late node."""
         for label, age in self._ages.values():
             note(f"{label}: {advice(age, in_file=self._in_file)}", Level.WARNING)
@@ -70,4 +70,4 @@ async def late_nodes(bus: Bus | RemoteBus, *, in_file: bool = False) -> AsyncIte
     finally:
         await asyncio.sleep(0)  # it receives the last events
         listening.cancel()
-        late.tell()
+        late.print_advice()

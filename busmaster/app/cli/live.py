@@ -106,7 +106,7 @@ class Screen(App[int]):
         """What q does, in words."""
         self.words = ""
         self.order = ORDERS[0]
-        self.said: tuple[float, str] | None = None
+        self.last_message: tuple[float, str] | None = None
         """What became of the last wish, and when."""
         self.away = ""
         """Why the line's owner is not there, "" while it is."""
@@ -216,7 +216,7 @@ class Screen(App[int]):
             lines.append(Text(fit(f" {self.away}", width), "bold"))
         if row is not None and row.error:
             lines.append(Text(fit(f" {row.name}: {row.error}", width), "bold"))
-        happened = [*frame.events, *([self.said] if self.said else [])]
+        happened = [*frame.events, *([self.last_message] if self.last_message else [])]
         began = frame.now - frame.elapsed
         for when, text in sorted(happened)[-EVENTS if self.size.height >= 24 else -1 :]:
             lines.append(Text(fit(f" {when - began:7.1f} s  {text}", width)))
@@ -228,22 +228,22 @@ class Screen(App[int]):
 
     # what the person wishes
 
-    def _wish(self, what: str, doing: Callable[[], Coroutine[Any, Any, None]], done: str = "") -> None:
+    def _start_request(self, what: str, doing: Callable[[], Coroutine[Any, Any, None]], done: str = "") -> None:
         """Run a command in the background, and show its result."""
 
         async def run() -> None:
             try:
                 await doing()
             except (BusError, InvalidCommand) as error:
-                self._say(f"{what}: {error.what if isinstance(error, BusError) else error}")
+                self._show_message(f"{what}: {error.what if isinstance(error, BusError) else error}")
             else:
                 if done:
-                    self._say(done)
+                    self._show_message(done)
 
         self.run_worker(run(), exit_on_error=False)
 
-    def _say(self, text: str) -> None:
-        self.said = (self.picture.frame.now if self.picture.frame else 0.0), text
+    def _show_message(self, text: str) -> None:
+        self.last_message = (self.picture.frame.now if self.picture.frame else 0.0), text
         self.draw()
 
     def action_leave(self, status: int) -> None:
@@ -278,12 +278,12 @@ class Screen(App[int]):
         groups = self._chosen(all_groups)
         paused = not all(group.paused for group in groups)
         for group in groups:
-            self._wish(f"pause {group.name}", partial(self.line.pause, group.name, paused))
+            self._start_request(f"pause {group.name}", partial(self.line.pause, group.name, paused))
 
     def action_demand(self, all_groups: bool) -> None:
         """Poll the row's group, or all groups, now."""
         for group in self._chosen(all_groups):
-            self._wish(f"poll {group.name}", partial(self.line.demand, group.name))
+            self._start_request(f"poll {group.name}", partial(self.line.demand, group.name))
 
     def action_suspend(self) -> None:
         """Suspend or resume the row's node, after a confirmation."""
@@ -297,7 +297,7 @@ class Screen(App[int]):
         def take(meant: bool | None) -> None:
             if meant:
                 seconds = 0.0 if rests else SUSPENDED_FOR
-                self._wish(question, partial(self.line.suspend, node.protocol, node.address, seconds))
+                self._start_request(question, partial(self.line.suspend, node.protocol, node.address, seconds))
 
         self.push_screen(AskYes(f"{question}?"), take)
 
@@ -307,13 +307,14 @@ class Screen(App[int]):
         if row is None or frame is None:
             return
         if self.read_only or frame.read_only or not row.writable:
-            self._say(f"{row.name} is read-only" if not row.writable else "this view is read-only")
+            self._show_message(f"{row.name} is read-only" if not row.writable else "this view is read-only")
             return
 
         def take(text: str | None) -> None:
             if text is not None:
                 name = f"{row.name} = {text}"
-                self._wish(name, partial(self.line.write, row.group, row.key, parse_value(text)), f"{name} written")
+                writing = partial(self.line.write, row.group, row.key, parse_value(text))
+                self._start_request(name, writing, f"{name} written")
 
         self.push_screen(AskValue(row.name, row.unit), take)
 
@@ -328,18 +329,18 @@ class Screen(App[int]):
             await self.push_screen(shown)
             while shown.is_attached:
                 try:
-                    told = await self.line.details(row.group, row.key)
+                    details = await self.line.details(row.group, row.key)
                 except (BusError, InvalidCommand) as error:
-                    told = {"gone": str(error)}
-                shown.update(self._details(row, told))
+                    details = {"gone": str(error)}
+                shown.update(self._details(row, details))
                 await asyncio.sleep(ASKED_EVERY)
 
         self.run_worker(follow(), exit_on_error=False)
 
-    def _details(self, row: Row, told: Mapping[str, Any]) -> Text:
+    def _details(self, row: Row, details: Mapping[str, Any]) -> Text:
         now = next((one for one in self.picture.rows if one.identity == row.identity), row)
         node, group = self._of_node.get((row.protocol, row.address)), self._of_group.get(row.group)
-        return details_text(now, node, group, told, self.picture.frame, max(20, self.size.width - 4))
+        return details_text(now, node, group, details, self.picture.frame, max(20, self.size.width - 4))
 
 
 def keys_line(width: int, leave: str, shown: str) -> Text:

@@ -72,7 +72,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     """Listen to the line of a file until Ctrl-C. Nothing is ever sent."""
     protocol = only_protocol(file)
     kind = find(protocol)
-    line = ConfiguredLine(silent(file), tell=note, asks=False)  # never entered: its bus opens no port
+    line = ConfiguredLine(silent(file), report=note, asks=False)  # never entered: its bus opens no port
     points = {point for group in file.groups for point in line.members(group)}
     clock = wall_clock()
     overheard = Overheard(kind.protocol, points, clock)
@@ -81,7 +81,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
         fields = {**cycle_fields(snapshot, snapshot.wall_at), "time": utc(snapshot.wall_at(snapshot.finished))}
         emit_all([json_line(**fields)] if as_json else plain_values(snapshot))
 
-    async def tell(events: Stream[BusEvent]) -> None:
+    async def report(events: Stream[BusEvent]) -> None:
         async for event in events:
             if isinstance(event, AlarmChanged):
                 note(event.text, Level.WARNING if event.active else Level.NOTICE)
@@ -89,7 +89,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     async def run(recorder: Recorder | None) -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(feed, line, overheard, show)
-            tasks.start_soon(tell, line.bus.events())
+            tasks.start_soon(report, line.bus.events())
             await listen(file.port, Decoder(kind.protocol.dialect()), overheard.heard, recorder, clock)
 
     with capturing(capture, port=file.port.name, protocol=protocol) as recorder:
@@ -125,12 +125,12 @@ class Listener(asyncio.Protocol):
     def __init__(
         self,
         decoder: Decoder,
-        tell: Callable[[Frame], None],
+        report: Callable[[Frame], None],
         recorder: Recorder | None = None,
         clock: Clock | None = None,
     ) -> None:
         self._decoder = decoder
-        self._tell = tell
+        self._report = report
         self._recorder = recorder
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -183,7 +183,7 @@ class Listener(asyncio.Protocol):
         try:
             for frame in frames:
                 frame.earlier = self._earlier
-                self._tell(frame)
+                self._report(frame)
         except OSError as error:
             if not self.lost.done():
                 self.lost.set_exception(error)
@@ -192,12 +192,12 @@ class Listener(asyncio.Protocol):
 async def listen(
     endpoint: Endpoint,
     decoder: Decoder,
-    tell: Callable[[Frame], None],
+    report: Callable[[Frame], None],
     recorder: Recorder | None = None,
     clock: Clock | None = None,
 ) -> None:
     """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be printed."""
-    listener = Listener(decoder, tell, recorder, clock)
+    listener = Listener(decoder, report, recorder, clock)
     transport = await endpoint.open(lambda: listener)
     try:
         await listener.lost

@@ -90,13 +90,13 @@ def is_journal(stream: TextIO, device_and_inode: str) -> bool:
 class SteadyOutput:
     """Standard output for programs that must continue if it fails: disk full, terminal closed.
 
-    Lost lines are counted. `tell` is called on the caller's thread when a failure begins and ends.
+    Lost lines are counted. `report` is called on the caller's thread when a failure begins and ends.
     """
 
-    def __init__(self, tell: Callable[[str, Level], object]) -> None:
+    def __init__(self, report: Callable[[str, Level], object]) -> None:
         self.lost = 0
         """Lines that could not be printed."""
-        self._tell = tell
+        self._report = report
         self._error = ""
         self._torn = False
 
@@ -117,11 +117,11 @@ class SteadyOutput:
             self._torn = False
             if self._error:
                 self._error = ""
-                self._tell(f"standard output works again; {self.lost} lines were lost", Level.NOTICE)
+                self._report(f"standard output works again; {self.lost} lines were lost", Level.NOTICE)
 
     def _failed(self, error: str, written: bytes, lines: int) -> None:
         self._torn = bool(self._torn and not written) or not (written or b"\n").endswith(b"\n")
         self.lost += lines - written.count(b"\n")
         if error != self._error:
             self._error = error
-            self._tell(f"standard output failed: {error}; polling continues, these lines are lost", Level.WARNING)
+            self._report(f"standard output failed: {error}; polling continues, these lines are lost", Level.WARNING)

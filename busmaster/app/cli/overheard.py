@@ -49,10 +49,10 @@ def only_protocol(file: LineFile) -> str:
     Raises InvalidCommand for a file with several kinds of nodes: a listener reads one.
     """
     names = {node.protocol for node in file.nodes.values()}
-    spoken = {find(name).protocol.name for name in names}
-    if len(spoken) > 1:
-        raise InvalidCommand(f"monitor supports one protocol per line, and the file has {', '.join(sorted(spoken))}")
-    return names.pop() if len(names) == 1 else spoken.pop()
+    used = {find(name).protocol.name for name in names}
+    if len(used) > 1:
+        raise InvalidCommand(f"monitor supports one protocol per line, and the file has {', '.join(sorted(used))}")
+    return names.pop() if len(names) == 1 else used.pop()
 
 
 class HeardGroup:
@@ -214,16 +214,16 @@ class Overheard:
     def _found(self, node: Node, command: Command[Any], value: Any) -> dict[Point[Any], Any]:
         """Return the value that each point of the exchange would have read."""
         found: dict[Point[Any], Any] = dict.fromkeys(self._by_command.get((node.address, command), ()), value)
-        told: Mapping[Hashable, Any] = {}
+        known: Mapping[Hashable, Any] = {}
         if isinstance(command, Changing):
-            told = {place: now for place, now in command.changes(node.profile).items() if now is not None}
+            known = {place: now for place, now in command.changes(node.profile).items() if now is not None}
         elif isinstance(command, ReadsPlaces):
-            told = command.place_values(value, node.profile)
-        for place in told:
+            known = command.place_values(value, node.profile)
+        for place in known:
             for point in self._by_place.get((node.address, place), ()):
                 assert isinstance(point.command, Placed)
                 with suppress(KeyError):  # only a part of it was received
-                    found.setdefault(point, point.command.shown(told))
+                    found.setdefault(point, point.command.shown(known))
         return found
 
     def _deliver(self, found: Mapping[Point[Any], Any], came: float) -> None:

@@ -364,7 +364,7 @@ async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabl
             if not dry_run and not await may_be_written(target, enabled):
                 return FAILED
             plan = await prepare(target, wanted)
-            tell_plan(plan, target)
+            print_plan(plan, target)
             status = FAILED if any(not left.expected for left in plan.left) else OK
             if dry_run or not plan.changes:
                 return status
@@ -409,7 +409,7 @@ async def prepare(target: Target, wanted: SetFile) -> ParameterLoad:
     return plan
 
 
-def tell_plan(plan: ParameterLoad, target: Target) -> None:
+def print_plan(plan: ParameterLoad, target: Target) -> None:
     """Print the changes, and the excluded parameters with the reason."""
     rows = [
         (
@@ -462,18 +462,18 @@ async def carry_out(plan: ParameterLoad, target: Target) -> int:
             if outcome.result is Result.WRITTEN:
                 emit(f"{outcome.change.parameter.item} ok")
             else:
-                tell_failure(outcome)
+                print_failure(outcome)
     finally:
         # A signal or an internal error: report the remaining changes too.
         for number, change in enumerate(plan.changes[len(outcomes) :]):
             result = Result.UNCONFIRMED if number == 0 else Result.NOT_WRITTEN
-            tell_failure(Outcome(change, result, "the command was interrupted"))
+            print_failure(Outcome(change, result, "the command was interrupted"))
     written = sum(outcome.result is Result.WRITTEN for outcome in outcomes)
     note(f"{target.label}: {written} of {len(plan.changes)} written")
     return OK if written == len(plan.changes) else FAILED
 
 
-def tell_failure(outcome: Outcome) -> None:
+def print_failure(outcome: Outcome) -> None:
     """Report the result of a change that was not written on standard error."""
     level = Level.CRITICAL if outcome.result is Result.UNCONFIRMED else Level.ERROR
     note(f"{called(outcome.change.parameter)}: {outcome.result.value}: {outcome.why}", level)

@@ -13,7 +13,7 @@ from busmaster.app.cli.app import OK, WRONG_USAGE
 from busmaster.app.cli.lines import file_argument, load
 from busmaster.app.cli.output import Level, columns, emit, note
 from busmaster.app.config import LineFile
-from busmaster.app.line.points_table import COLUMNS, ITEM, LIMITED_BY, NODE, ORIGIN, POINT, points_csv, rows, said_text
+from busmaster.app.line.points_table import COLUMNS, ITEM, LIMITED_BY, NODE, ORIGIN, POINT, entry_text, points_csv, rows
 from busmaster.app.line.points_taking import BadRows, taken, write_beside
 from busmaster.bounds import LONGEST_FILE
 from busmaster.errors import InvalidCommand
@@ -67,7 +67,7 @@ def page(file: LineFile) -> Iterator[str]:
     texts = [
         {NODE: row.node, POINT: row.point, ITEM: row.point}
         | {LIMITED_BY: ", ".join(row.limited_by), ORIGIN: row.origin}
-        | {key: said_text(row.said, key) for key in row.said}
+        | {key: entry_text(row.entries, key) for key in row.entries}
         for row in rows(file)
     ]
     if not texts:
@@ -89,8 +89,8 @@ def paragraphs(texts: Sequence[Mapping[str, str]], used: Sequence[str], width: i
     for text in texts:
         item = "" if text[ITEM] == text[POINT] else f" ({text[ITEM]})"
         yield f"{text[NODE]}/{text[POINT]}{item}"
-        said = ", ".join(f"{key} {text[key]}" for key in used if key not in (NODE, POINT, ITEM) and text.get(key))
-        yield from textwrap.wrap(said, width, initial_indent="    ", subsequent_indent="    ")
+        line = ", ".join(f"{key} {text[key]}" for key in used if key not in (NODE, POINT, ITEM) and text.get(key))
+        yield from textwrap.wrap(line, width, initial_indent="    ", subsequent_indent="    ")
 
 
 def print_csv(data: bytes) -> None:

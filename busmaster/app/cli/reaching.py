@@ -70,11 +70,11 @@ def owner_to_use(endpoint: Endpoint, capture: str | None) -> Owner | None:
     if owner is not None:
         if capture is not None:
             raise click.UsageError(f"{owner.port} {RECORD_THERE}")
-        tell_owner(owner)
+        print_owner(owner)
     return owner
 
 
-def tell_owner(owner: Owner) -> None:
+def print_owner(owner: Owner) -> None:
     """Report on standard error which process owns the line."""
     note(f"{owner.port} is owned by process {owner.pid}; using it through {owner.address}")
 
@@ -109,9 +109,9 @@ def device_of(name: str, *, by_tcp: bool) -> set[Hashable]:
 def check_settings(connection: Connection, about: Mapping[str, Any]) -> None:
     """Raise UsageError for given line settings that differ from the owner's."""
     wanted = None if is_served(connection.port) else connection.endpoint().settings
-    said = set(parse_qs(connection.port.partition("?")[2]))
-    baud = wanted.baudrate if wanted is not None and "baudrate" in said else connection.baud
-    framing = wanted.framing if wanted is not None and not said.isdisjoint(FRAMING) else None
+    in_url = set(parse_qs(connection.port.partition("?")[2]))
+    baud = wanted.baudrate if wanted is not None and "baudrate" in in_url else connection.baud
+    framing = wanted.framing if wanted is not None and not in_url.isdisjoint(FRAMING) else None
     differs = [
         *([f"{baud} baud"] if about["baudrate"] and baud not in (None, about["baudrate"]) else []),
         *([framing] if about["framing"] and framing not in (None, about["framing"]) else []),

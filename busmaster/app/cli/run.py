@@ -19,7 +19,7 @@ from busmaster.app.cli.lines import file_argument, load, other_port, port_option
 from busmaster.app.cli.output import Level, note, number_text
 from busmaster.app.cli.plan import losses_text
 from busmaster.app.cli.reaching import check_no_owner
-from busmaster.app.cli.safe import tell_unsafe
+from busmaster.app.cli.safe import print_unsafe
 from busmaster.app.cli.serving import secrets_of, served, service_of
 from busmaster.app.cli.systemd import ServiceManager
 from busmaster.app.cli.watching import Watch, follow
@@ -30,7 +30,7 @@ from busmaster.errors import InvalidCommand
 
 SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
-WORTH_SAYING = 0.005
+WORTH_PRINTING = 0.005
 """Share of the line that learned reply times must save to be suggested."""
 CLOSE_WITHIN = 2.0
 """Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
@@ -108,15 +108,15 @@ class Running:
     async def run(self) -> int:
         """Run the line until a signal, send its safe state, and return the exit status."""
         entered = False
-        self.line.outputs.tell = self._tell_of_output
+        self.line.outputs.report = self._print_output_event
         service = service_of(self.line)  # now: it keeps what happens as the line is opened
         if service is not None:
-            service.tell = self._tell_of_refusals
+            service.tell = self._print_refusals
         try:
             async with self.line:
                 entered = True
                 try:
-                    async with served(service, tell=self._view.silent) as self.watch.service:
+                    async with served(service, announce=self._view.silent) as self.watch.service:
                         return await self._poll()
                 finally:
                     await self._leave()
@@ -128,14 +128,14 @@ class Running:
     async def _poll(self) -> int:
         for group in self.line.groups.values():
             self.watch.add(group)
-        self._say_what_is_polled()
+        self._print_what_is_polled()
         self._manager.ready()
 
         async def beside() -> None:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._manager.show_life, self.line.bus)
                 tasks.start_soon(self._hear_hangups)
-                tasks.start_soon(self._say_what_learning_would_gain)
+                tasks.start_soon(self._print_gain_of_learning)
                 try:
                     await anyio.sleep_forever()
                 finally:
@@ -144,7 +144,7 @@ class Running:
 
         return await follow(self.watch, beside)
 
-    def _say_what_is_polled(self) -> None:
+    def _print_what_is_polled(self) -> None:
         if not self.line.groups:
             note("nothing is polled, because the file has no poll group; add [groups.NAME]", Level.WARNING)
         if self.line.safe_state:
@@ -153,11 +153,11 @@ class Running:
         else:
             note("no safe state: at the end, nodes keep the values that were written last (see [safe])")
 
-    async def _say_what_learning_would_gain(self) -> None:
+    async def _print_gain_of_learning(self) -> None:
         """Report once how much of the line learned reply times would save, if a node has none."""
         if self.line.groups and any(node.could_learn for node in self.line.file.nodes.values()):
             losses = (await self.line.bus.plan()).losses
-            if losses.documented - losses.learned >= WORTH_SAYING:
+            if losses.documented - losses.learned >= WORTH_PRINTING:
                 note(losses_text(losses))
 
     async def _hear_hangups(self) -> None:
@@ -183,7 +183,7 @@ class Running:
                 self.watch.service.line.title = file.title
             self.watch.replace_groups(self.line.groups.values())
             note(f"{self._path} was reloaded", Level.NOTICE)
-            self._say_what_is_polled()
+            self._print_what_is_polled()
         self._manager.ready()
 
     def _checked_file(self) -> tuple[LineFile, dict[str, bytes]]:
@@ -196,11 +196,11 @@ class Running:
         ConfiguredLine(file, port=self.line.bus.endpoint)
         return file, secrets_of(file)
 
-    def _tell_of_output(self, text: str) -> None:
+    def _print_output_event(self, text: str) -> None:
         down = any(counts.error for counts in self.line.outputs.statistics())
         self.watch.announce(text, Level.WARNING if down else Level.NOTICE)
 
-    def _tell_of_refusals(self, text: str) -> None:
+    def _print_refusals(self, text: str) -> None:
         """Report what the service refused, unless the screen shows it among the events of the line."""
         if self.watch.may_print():
             note(text, Level.WARNING)
@@ -218,7 +218,7 @@ class Running:
         self._manager.stopping()
         if self.line.safe_state:
             outcomes = await self.line.safe_state.enter(self.line.authorisation, self._why())
-            self.left_safely = tell_unsafe(outcomes) == OK
+            self.left_safely = print_unsafe(outcomes) == OK
             if self.left_safely:
                 note(f"safe state confirmed: {', '.join(outcomes)}", Level.NOTICE)
 

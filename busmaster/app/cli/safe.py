@@ -14,7 +14,7 @@ from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.lines import file_argument, keep, load, other_port, port_option
 from busmaster.app.cli.output import Level, emit, note
-from busmaster.app.cli.reaching import RECORD_THERE, owner_of, tell_owner
+from busmaster.app.cli.reaching import RECORD_THERE, owner_of, print_owner
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.remote import RemoteBus, connect
@@ -49,7 +49,7 @@ def command(path: str, port: str | None, capture: str | None) -> int:
             return until_ended(leave, line)
         if capture is not None:
             note(f"{owner.port} {RECORD_THERE}", Level.WARNING)
-        tell_owner(owner)
+        print_owner(owner)
         return until_ended(leave_through, connect(owner.address, safe_only=True), line.safe_state.values)
 
 
@@ -68,7 +68,7 @@ def recorded(capture: str | None, endpoint: Endpoint) -> Iterator[Recorder | Non
 async def leave_through(remote: RemoteBus, values: Mapping[str, float]) -> int:
     """Have the program that owns the line send its safe state, which is to be this one, and return the exit status."""
     async with remote:
-        return tell_outcomes(await remote.enter_safe_state(values))
+        return print_outcomes(await remote.enter_safe_state(values))
 
 
 async def leave(line: ConfiguredLine) -> int:
@@ -76,10 +76,10 @@ async def leave(line: ConfiguredLine) -> int:
     records: list[WriteRecord] = []
     line.authorisation.record = records.append
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(tell_of_port, line.bus.events())
+        tasks.start_soon(print_port_events, line.bus.events())
         async with line.bus:
             outcomes = await line.safe_state.enter(line.authorisation, "busmaster safe")
-    status = tell_outcomes(outcomes)
+    status = print_outcomes(outcomes)
     # only now: no output, be it broken, is in the way of a stop
     try:
         await keep(line.audit(note), records)
@@ -88,22 +88,22 @@ async def leave(line: ConfiguredLine) -> int:
     return status
 
 
-async def tell_of_port(events: Stream[BusEvent]) -> None:
+async def print_port_events(events: Stream[BusEvent]) -> None:
     """Report on standard error why the port cannot be opened, until the bus is closed."""
     async for event in events:
         if isinstance(event, PortFailed):
             note(event_text(event), Level.ERROR)
 
 
-def tell_outcomes(outcomes: Mapping[str, BusError | None]) -> int:
+def print_outcomes(outcomes: Mapping[str, BusError | None]) -> int:
     """Print each point that was confirmed, name each that was not, and return the exit status."""
     for name, error in outcomes.items():
         if error is None:
             emit(f"{name} ok")
-    return tell_unsafe(outcomes)
+    return print_unsafe(outcomes)
 
 
-def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:
+def print_unsafe(outcomes: Mapping[str, BusError | None]) -> int:
     """Name each point that was not confirmed on standard error, and return the exit status."""
     unsafe = {name: error for name, error in outcomes.items() if error is not None}
     for name, error in unsafe.items():

@@ -63,7 +63,7 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
         if silent:
             # so long the last one's answer may still take, and the silence behind it shows whose it was
             await anyio.sleep(connection.max_reply_delay + SILENCE)
-        late.tell()
+        late.print_advice()
         for line in [line async for line in in_other_protocols(bus, connection.profile, silent)]:
             note(line)
 

@@ -38,10 +38,10 @@ def service_of(line: ConfiguredLine) -> Service | None:
 
 
 @asynccontextmanager
-async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Service | None]:
+async def served(service: Service | None, *, announce: bool) -> AsyncIterator[Service | None]:
     """Serve a line, and yield its service; None if that is not possible. The line runs in any case.
 
-    With `tell`, the addresses are printed.
+    With `announce`, the addresses are printed.
     """
     if service is None:
         yield None
@@ -53,7 +53,7 @@ async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Servic
         yield None
         return
     try:
-        if tell:
+        if announce:
             by_tcp = "" if service.tcp_address is None else f" and {service.tcp_address}"
             note(f"{service.line.title} is served at {service.address}{by_tcp}", Level.NOTICE)
         yield service

@@ -36,7 +36,7 @@ class ServiceManager:
         wanted = micros.isdecimal() and environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.interval = int(micros) / 1e6 if wanted and path else 0.0
 
-    def tell(self, **fields: str | int) -> None:
+    def notify(self, **fields: str | int) -> None:
         """Send these fields, as one message."""
         if self._socket is not None:
             text = "\n".join(f"{name}={value}" for name, value in fields.items())
@@ -47,15 +47,15 @@ class ServiceManager:
 
     def ready(self) -> None:
         """Report that the service is ready; also after `reloading`."""
-        self.tell(READY=1)
+        self.notify(READY=1)
 
     def reloading(self) -> None:
         """Report that the service reloads its file, until it is `ready`."""
-        self.tell(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
+        self.notify(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
 
     def stopping(self) -> None:
         """Report that the service stops in an orderly way."""
-        self.tell(STOPPING=1)
+        self.notify(STOPPING=1)
 
     def close(self) -> None:
         """Close the socket; nothing is sent any more."""
@@ -70,7 +70,7 @@ class ServiceManager:
         movement = Movement(bus)
         while True:
             if movement.goes_on(self.interval):
-                self.tell(WATCHDOG=1)
+                self.notify(WATCHDOG=1)
             await anyio.sleep(max(AT_LEAST, self.interval / 2))
 
 

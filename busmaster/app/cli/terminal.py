@@ -18,16 +18,16 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else json.dumps(c)[1:-1] for c in text)
 
 
-def made_printable(told: Any) -> Any:
-    """Return a copy of `told` without control characters in its texts."""
-    match told:
+def made_printable(value: Any) -> Any:
+    """Return a copy of `value` without control characters in its texts."""
+    match value:
         case str():
-            return printable(told)
+            return printable(value)
         case dict():
-            if set(told) == {"float"}:  # a number that JSON does not have
-                return float(told["float"])
-            return {name: made_printable(part) for name, part in told.items()}
+            if set(value) == {"float"}:  # a number that JSON does not have
+                return float(value["float"])
+            return {name: made_printable(part) for name, part in value.items()}
         case list():
-            return [made_printable(part) for part in told]
+            return [made_printable(part) for part in value]
         case _:
-            return told
+            return value

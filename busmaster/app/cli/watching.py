@@ -133,14 +133,14 @@ class Watch:
         self._troubles.add(what)
         return trouble
 
-    def tell(self, text: str) -> None:
+    def show(self, text: str) -> None:
         """Add to what the screen shows of the last events."""
         if self.service is not None:
             self.service.line.journal.note(text)
 
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
-        self.tell(text)
+        self.show(text)
         if self.may_print():
             note(text, level)
 

@@ -100,11 +100,11 @@ async def write(
             written = items_of(handle, one)
             if as_json:
                 more = {"items": written} if len(written) > 1 else {}
-                tell(one.item, as_json, node=connection.node_number(address), item=one.item, **more)
+                print_written(one.item, as_json, node=connection.node_number(address), item=one.item, **more)
             else:
                 # Each of several: the comma of 10=2,5 may have been meant as a decimal point.
                 for item in written:
-                    tell(item, as_json)
+                    print_written(item, as_json)
 
 
 def items_of(handle: Handle, one: Assignment) -> list[str]:
@@ -124,7 +124,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
         async with line.bus, late_nodes(line.bus, in_file=True):
             for request, send in prepared:
                 await pass_on(line, request, send)
-                tell(request.name, as_json, point=request.name)
+                print_written(request.name, as_json, point=request.name)
     finally:
         await keep(audit, records)
 
@@ -136,10 +136,10 @@ async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs,
     async with remote, late_nodes(remote, in_file=True):
         for name, send in prepared:
             await send()
-            tell(name, as_json, point=name)
+            print_written(name, as_json, point=name)
 
 
-def tell(name: str, as_json: bool, **fields: Any) -> None:
+def print_written(name: str, as_json: bool, **fields: Any) -> None:
     """Print that `name` has been written, as a line or as JSON with these fields."""
     emit(json_line(**fields, ok=True, time=utc(time.time())) if as_json else f"{name} ok")
 

@@ -98,8 +98,8 @@ def check_suits(section: PointSection, point: Point[Any], kind: NodeKind) -> Non
 def _misfits(section: PointSection, point: Point[Any], kind: NodeKind) -> Iterator[tuple[str, str]]:
     """Yield what does not suit, each with its key."""
     given, meaning, sort = section.table, section.meaning, sort_of(point, kind)
-    said = [key for key in (*LIMITS, *MEANINGS) if key in given]
-    for key in said:
+    listed = [key for key in (*LIMITS, *MEANINGS) if key in given]
+    for key in listed:
         if sort == "run" and key not in ("precision", "deadband", "heartbeat"):
             yield key, f"is not possible for {section.item}, a run of values; make each value a point of its own"
         if sort == "text" and key != "heartbeat" and (key != "deadband" or meaning.deadband):
@@ -109,7 +109,7 @@ def _misfits(section: PointSection, point: Point[Any], kind: NodeKind) -> Iterat
     if sort in NO_QUANTITIES and meaning.deadband:
         yield "deadband", f"of a {sort} must be 0, because every change is reported"
     for key in ("bits", "labels"):
-        if key not in said:
+        if key not in listed:
             continue
         if sort == "set" and key == "labels":
             yield key, f"is not possible for {section.item}, which is a set of flags; name them by bits"

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 from busmaster.app.config.source import FileError, Key, Source, Walk
 
-Said: TypeAlias = Mapping[str, Any]
+Entries: TypeAlias = Mapping[str, Any]
 """The keys of one point and their values."""
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -35,21 +35,21 @@ def key_text(*names: str) -> str:
     return ".".join(name if BARE.fullmatch(name) else toml_text(name) for name in names)
 
 
-def rewritten(source: Source, points: Mapping[tuple[str, str], Said]) -> str:
+def rewritten(source: Source, points: Mapping[tuple[str, str], Entries]) -> str:
     """Return the file's text in which these points, by node section and name, have exactly these keys.
 
     Raises FileError for a point that is written in a form that cannot be changed.
     """
     editing = _Editing(source)
     wanted = deepcopy(source.data)
-    added: dict[str, dict[str, Said]] = {}
-    for (node, name), said in points.items():
+    added: dict[str, dict[str, Entries]] = {}
+    for (node, name), entries in points.items():
         held = source.data["nodes"][node].get("points", {})
-        wanted["nodes"][node].setdefault("points", {})[name] = said
+        wanted["nodes"][node].setdefault("points", {})[name] = entries
         if name in held:
-            editing.change(("nodes", node, "points", name), held[name], said)
+            editing.change(("nodes", node, "points", name), held[name], entries)
         else:
-            added.setdefault(node, {})[name] = said
+            added.setdefault(node, {})[name] = entries
     for node, new in added.items():
         editing.add(("nodes", node, "points"), new)
     text = editing.text()
@@ -79,27 +79,27 @@ class _Editing:
             place = max(place, end)
         return "".join(pieces) + self._before[place:]
 
-    def change(self, point: Key, held: Said, said: Said) -> None:
+    def change(self, point: Key, held: Entries, entries: Entries) -> None:
         """Give an existing point exactly these keys."""
         pair = self._walk.pairs.get(point)
         if pair is not None:  # position = { ... }
-            self._edits.append((pair.value, pair.end, self._inline(point, held, said)))
+            self._edits.append((pair.value, pair.end, self._inline(point, held, entries)))
             return
         for key in held:
-            if key not in said:
+            if key not in entries:
                 self._drop((*point, key))
-            elif held[key] != said[key]:
-                self._replace((*point, key), said[key])
-        new = [((key,), said[key]) for key in said if key not in held]
+            elif held[key] != entries[key]:
+                self._replace((*point, key), entries[key])
+        new = [((key,), entries[key]) for key in entries if key not in held]
         if new and not self._append(point, new):
             raise self._unable(point)
 
-    def add(self, table: Key, points: Mapping[str, Said]) -> None:
+    def add(self, table: Key, points: Mapping[str, Entries]) -> None:
         """Add points to a node's."""
-        if self._append(table, [((name,), said) for name, said in points.items()]):
+        if self._append(table, [((name,), entries) for name, entries in points.items()]):
             return
         node = self._walk.bodies.get(table[:-1], len(self._before))
-        lines = (f"{key_text(name)} = {toml_text(said)}" for name, said in points.items())
+        lines = (f"{key_text(name)} = {toml_text(entries)}" for name, entries in points.items())
         self._insert_lines(node, ["", f"[{key_text(*map(str, table))}]", *lines])
 
     # inside
@@ -128,15 +128,16 @@ class _Editing:
             self._insert_lines(last.end, [f"{key_text(*way, *names)} = {toml_text(value)}" for names, value in pairs])
         return bool(dotted)
 
-    def _inline(self, point: Key, held: Said, said: Said) -> str:
+    def _inline(self, point: Key, held: Entries, entries: Entries) -> str:
         """Return an inline table; values that did not change are written as they were."""
-        return f"{{ {', '.join(self._members(point, held, said))} }}" if said else "{}"
+        return f"{{ {', '.join(self._members(point, held, entries))} }}" if entries else "{}"
 
-    def _members(self, point: Key, held: Said, said: Said) -> Iterator[str]:
-        for key in (*(key for key in held if key in said), *(key for key in said if key not in held)):
+    def _members(self, point: Key, held: Entries, entries: Entries) -> Iterator[str]:
+        for key in (*(key for key in held if key in entries), *(key for key in entries if key not in held)):
             pair = self._walk.pairs.get((*point, key))
-            kept = pair is not None and held[key] == said[key]
-            yield f"{key_text(key)} = {self._before[pair.value : pair.end] if pair and kept else toml_text(said[key])}"
+            kept = pair is not None and held[key] == entries[key]
+            text = self._before[pair.value : pair.end] if pair and kept else toml_text(entries[key])
+            yield f"{key_text(key)} = {text}"
 
     def _replace(self, way: Key, value: Any) -> None:
         pair = self._walk.pairs.get(way)

@@ -61,7 +61,7 @@ def unexpected(heard: bytes, protocol: str | None) -> Finding:
     """Return the finding about bytes that were received before any request."""
     if not heard:
         return Finding("silence", True, "no unexpected bytes were received")
-    known = [] if protocol is None else spoken(heard, protocol)
+    known = [] if protocol is None else known_frames(heard, protocol)
     if known:
         return Finding(
             "silence",
@@ -77,7 +77,7 @@ def unexpected(heard: bytes, protocol: str | None) -> Finding:
     )
 
 
-def spoken(heard: bytes, protocol: str) -> list[str]:
+def known_frames(heard: bytes, protocol: str) -> list[str]:
     """Return the whole frames in these bytes, in words."""
     decoder = Decoder(find(protocol).protocol.dialect())
     frames = [*decoder.feed(heard, 0.0), *decoder.quiet()]

@@ -38,7 +38,7 @@ STRANGERS = 4
 RATES = (9600, 19200, 38400, 57600, 115200, 4800, 2400)
 FRAMINGS = ((8, "N"), (7, "E"), (8, "E"))
 
-Tell = Callable[[Finding], None]
+Report = Callable[[Finding], None]
 
 
 class Progress(Protocol):
@@ -91,30 +91,30 @@ class Patient:
         return f"nodes {', '.join(str(address) for address in addresses)}"
 
 
-async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
+async def examine(patient: Patient, report: Report, tap: Tap | None = None) -> None:
     """Report all findings, in this order. A finding that makes the others pointless is the last."""
     where = patient.endpoint
     if isinstance(where, SerialPort):
         inspect = functools.partial(adapters.inspect, where.path, low_latency=where.low_latency)
         found = await anyio.to_thread.run_sync(inspect)
         for finding in found:
-            tell(finding)
+            report(finding)
         if not all(finding.ok for finding in found if finding.topic in ("port", "permission", "holders")):
             return
     if isinstance(where, TcpPort):
         what = "the adapter checks do not apply to a TCP port"
         advice = "check the server's own: line settings, and bytes passed on at once (ser2net: chardelay: false)"
-        tell(Finding("adapter", True, what, advice))
+        report(Finding("adapter", True, what, advice))
     try:
         async with opened(where, tap) as wire:
             for finding in opening(patient, wire):
-                tell(finding)
+                report(finding)
             if isinstance(where, SerialPort) and where.low_latency:
                 for finding in await anyio.to_thread.run_sync(_opened_latency, wire):
-                    tell(finding)
-            await examine_line(patient, wire, tell)
+                    report(finding)
+            await examine_line(patient, wire, report)
     except LineDown as error:
-        tell(Finding("port", False, error.what, error.hint))
+        report(Finding("port", False, error.what, error.hint))
 
 
 def _opened_latency(wire: Wire) -> list[Finding]:
@@ -202,7 +202,7 @@ def driver(descriptor: int, wanted: bool | None = None, *, switched: bool = Fals
             )
 
 
-async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
+async def examine_line(patient: Patient, wire: Wire, report: Report) -> None:
     """Report the findings on an open line. A finding that makes the others pointless is the last."""
     where = patient.endpoint
     assert wire.port is not None
@@ -211,17 +211,17 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     wire.marked.clear()
     heard = await wire.hear_all(LISTENING)
     talk = diagnosis.unexpected(heard, patient.protocol)
-    tell(talk)
+    report(talk)
     # A possible master must not be disturbed. Noise does not prevent requests.
-    if heard and (patient.protocol is None or diagnosis.spoken(heard, patient.protocol)):
+    if heard and (patient.protocol is None or diagnosis.known_frames(heard, patient.protocol)):
         return
     settings = where.settings
     byte_time = 0.0 if settings is None else settings.byte_time
     wire.send(HARMLESS)
     heard = await wire.hear_all(ECHOING + len(HARMLESS) * byte_time + where.receive_latency)
-    tell(diagnosis.echo(HARMLESS, heard, where.echo))
+    report(diagnosis.echo(HARMLESS, heard, where.echo))
     if patient.protocol is None:
-        tell(Finding("nodes", True, "no request was sent", "name the protocol with --protocol, and perhaps --nodes"))
+        report(Finding("nodes", True, "no request was sent", "name the protocol with --protocol, and perhaps --nodes"))
         return
     profile = patient.profile
     timings = profile.timings if patient.timings is None else patient.timings
@@ -229,20 +229,20 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
     records = await ask_all(patient, prober)
     for finding in uart.findings(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
-        tell(finding)
+        report(finding)
     if isinstance(where, SerialPort) and where.rts is not None:
         assert wire.transport is not None
         starts = [start for record in records for start in record.starts]
         released = wire.transport.get_extra_info("released")
         for finding in diagnosis.turnaround(starts, released, byte_time if wire.paced else 0.0):
-            tell(finding)
+            report(finding)
     if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):
-            tell(finding)
+            report(finding)
     else:
-        tell(diagnosis.nobody(patient.crowd(patient.addresses), profile, settings))
+        report(diagnosis.nobody(patient.crowd(patient.addresses), profile, settings))
     if not any(record.answers for record in records):
-        await try_settings(patient, wire, prober, tell)
+        await try_settings(patient, wire, prober, report)
 
 
 async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
@@ -268,14 +268,14 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
     return records
 
 
-async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell) -> None:
+async def try_settings(patient: Patient, wire: Wire, prober: Prober, report: Report) -> None:
     """Try, because no node replies, whether one does at another rate or framing. Restores the port's settings."""
     where = patient.endpoint
     settings = where.settings
     if not wire.tunable or settings is None:
         return
     if not wire.paced and not isinstance(where, Rfc2217Port):
-        tell(Finding("settings", True, "a pseudo-terminal has no baud rate: no other was tried"))
+        report(Finding("settings", True, "a pseudo-terminal has no baud rate: no other was tried"))
         return
     asked = patient.addresses[:STRANGERS]
     candidates = other_settings(settings)
@@ -290,7 +290,7 @@ async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell)
     finally:
         with anyio.CancelScope(shield=True), contextlib.suppress(LineDown):
             await wire.tune(settings)
-    tell(diagnosis.other_rate(found, candidate, patient.crowd(asked), len(candidates)))
+    report(diagnosis.other_rate(found, candidate, patient.crowd(asked), len(candidates)))
 
 
 async def answers_at(

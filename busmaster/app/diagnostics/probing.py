@@ -205,7 +205,7 @@ class Prober:
         )
         self._echo.forget()
         wire.attempt = attempt
-        hearing.asked = self._say(hearing.driver.exchange.request)
+        hearing.asked = self._send(hearing.driver.exchange.request)
         wait = hearing.driver.timing.max_reply_delay if patience is None else patience
         until = hearing.asked + wait + wire.latency
         while (chunk := await wire.hear(until)) is not None:
@@ -213,7 +213,7 @@ class Prober:
             if data is None:
                 hearing.collide(chunk[1])
             elif data:
-                until = hearing.take(chunk[0], data, self._say) + wire.latency
+                until = hearing.take(chunk[0], data, self._send) + wire.latency
             if hearing.driver.ending is not None:
                 break
         attempt.end(*hearing.verdict(), wire.clock())
@@ -223,7 +223,7 @@ class Prober:
             rest = await wire.hear_all(wait if alone else max(QUIET, hearing.driver.timing.inter_byte_timeout))
         return hearing.probe(self._echo.strip(rest) or b"")
 
-    def _say(self, data: bytes) -> float:
+    def _send(self, data: bytes) -> float:
         """Send `data`, and return the time when it will have left: at once, if its duration is not known."""
         self._echo.sent(data)
         return self._wire.send(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
@@ -240,17 +240,17 @@ class _Hearing:
         self._raw = b""
         self._collided = False
 
-    def take(self, now: float, data: bytes, say: Callable[[bytes], float]) -> float:
+    def take(self, now: float, data: bytes, send: Callable[[bytes], float]) -> float:
         """Take the next bytes, and return until when to wait for more."""
         driver = self.driver
         self._hear(now, data)
         driver.sent.clear()
         driver.feed(data)
-        for send in driver.sent:
-            now = say(send)
+        for part in driver.sent:
+            now = send(part)
         # else the node would be left with something unacknowledged
         if driver.ending is not None and driver.ending.send:
-            say(driver.ending.send)
+            send(driver.ending.send)
         return now + (driver.timing.inter_byte_timeout if driver.begun else driver.timing.max_reply_delay)
 
     def collide(self, data: bytes) -> None:
@@ -286,9 +286,9 @@ class _Hearing:
         # a refusal is a reply: a device without this item is as healthy as any
         text = value_text(result) if verdict is Verdict.OK else f"{result}; the device does not have this item"
         left_over = b"" if self.driver.ending is None else self.driver.ending.rest
-        told = f"{self._command}: {text}"
+        description = f"{self._command}: {text}"
         raw = self._raw + rest
-        return Probe(Outcome.ANSWERED, self.start, told, raw, left_over + rest, verdict is Verdict.REFUSED)
+        return Probe(Outcome.ANSWERED, self.start, description, raw, left_over + rest, verdict is Verdict.REFUSED)
 
     def _hear(self, now: float, data: bytes) -> None:
         if self.start is None:

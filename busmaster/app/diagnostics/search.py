@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from busmaster import Endpoint, LineSettings
-from busmaster.app.diagnostics.diagnosis import garbage, speed, spoken
+from busmaster.app.diagnostics.diagnosis import garbage, known_frames, speed
 from busmaster.app.diagnostics.examination import OPENING, Course, unseen
 from busmaster.app.diagnostics.probing import Outcome, Probe, Prober, Wire
 from busmaster.app.diagnostics.steps import LISTENING, Step, ranges
@@ -25,7 +25,7 @@ SLOW = 10.0
 MEASURED = 10
 """Number of requests to a node that measure its reply time."""
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Discovery:
 
 
 class Search:
-    """Searches for nodes on an open port. `tell` is called with findings on the way, in words.
+    """Searches for nodes on an open port. `report` is called with findings on the way, in words.
 
     `stop_offered` is called before many addresses are tried on a slow line. It informs the user how to stop, and
     returns a function that returns whether the user has done so.
@@ -72,13 +72,13 @@ class Search:
         self,
         wire: Wire,
         endpoint: Endpoint,
-        tell: Tell,
+        report: Report,
         progress: Course = unseen,
         stop_offered: Callable[[], Callable[[], bool]] = lambda: lambda: False,
     ) -> None:
         self._wire = wire
         self._endpoint = endpoint
-        self._tell = tell
+        self._report = report
         self._progress = progress
         self._echo = endpoint.echo
         self._stop_offered = stop_offered
@@ -100,7 +100,7 @@ class Search:
                 if one is None or await self._tuned(one):
                     heard = await wire.hear_all(RECOGNISING, quiet=RECOGNISING) or heard
                     for step in tried:
-                        known = spoken(heard, step.kind.protocol.kinds[0].name) if step.settings == one else []
+                        known = known_frames(heard, step.kind.protocol.kinds[0].name) if step.settings == one else []
                         if len(known) >= RECOGNISED:
                             return f"another master is active, with {step.kind.profile.title}{_at(one)}: {known[0]}"
                 bar.advance()
@@ -137,13 +137,13 @@ class Search:
 
     async def _finish(self, asked: Sequence[Step], found: dict[tuple[str, int], Found], discovery: Discovery) -> None:
         """Try the other addresses of the protocols of which nodes have replied, and note those that were not tried."""
-        spoken = {node.protocol.name for node in found.values()}
-        due = [step for step in asked if step.kind.protocol.name in spoken and step.rest]
+        known_frames = {node.protocol.name for node in found.values()}
+        due = [step for step in asked if step.kind.protocol.name in known_frames and step.rest]
         discovery.not_asked = {step.kind.name: step.rest for step in asked if step.rest and step not in due}
         total, stopped = sum(step.seconds_for(step.rest) for step in due), lambda: False
         if due:
             names = "; ".join(f"{step.kind.name} {ranges(step.rest)}" for step in due)
-            self._tell(f"nodes have replied, so the other addresses are tried too ({names}): up to {total:.0f} s")
+            self._report(f"nodes have replied, so the other addresses are tried too ({names}): up to {total:.0f} s")
         if total > SLOW:
             stopped = self._stop_offered()
         with self._progress("trying the others", sum(len(step.rest) for step in due)) as bar:
@@ -166,7 +166,7 @@ class Search:
         except LineDown as error:
             if self._wire.closed.is_set():
                 raise
-            self._tell(f"left out: {error.what}")
+            self._report(f"left out: {error.what}")
             return False
         await self._wire.hear_all(QUIET)
         return True
@@ -205,7 +205,7 @@ class Search:
                         ):
                             found[name, one] = node
                     if not found and probe.outcome is Outcome.GARBLED:
-                        self._tell(f"{self._place(step, address)}: {probe.text}: {garbage(probe.raw)}")
+                        self._report(f"{self._place(step, address)}: {probe.text}: {garbage(probe.raw)}")
             before = address
             advance()
         return len(some)
@@ -231,7 +231,7 @@ class Search:
         # an echo may look like a reply: that of a Mentor II begins with EOT
         if not self._echo and probe.raw.startswith(request):
             self._echo = True
-            self._tell("the adapter receives its own transmissions")
+            self._report("the adapter receives its own transmissions")
             probe = await self._prober(step).ask(address, patience=profile.timings.read.window)
         return probe
 

@@ -88,17 +88,17 @@ def _name(node: Found, found: Sequence[Found]) -> str:
 
 def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
     """Yield the lines of [port]: the settings that were found, and the user's settings that are not the defaults."""
-    said = _set(port)
-    if isinstance(said.get("rs485"), Rs485):
-        said["rs485"] = _set(said["rs485"])
+    table = _set(port)
+    if isinstance(table.get("rs485"), Rs485):
+        table["rs485"] = _set(table["rs485"])
     if discovery.settings is not None and isinstance(port, SerialPort | Rfc2217Port):
-        said |= dataclasses.asdict(discovery.settings)
+        table |= dataclasses.asdict(discovery.settings)
     if discovery.echo:
-        said["echo"] = True
+        table["echo"] = True
     if isinstance(port, Rfc2217Port):
-        said = {"rfc2217": True} | said
+        table = {"rfc2217": True} | table
     yield "[port]"
-    yield from (f"{key} = {toml_text(value)}" for key, value in said.items())
+    yield from (f"{key} = {toml_text(value)}" for key, value in table.items())
 
 
 def _set(settings: SerialPort | TcpPort | Rs485) -> dict[str, Any]:

@@ -57,7 +57,7 @@ class Audience:
     def __init__(self, line: Following) -> None:
         self._line = line
         self._seats: set[Seat] = set()
-        self._said: dict[Key, str] = {}
+        self._sent: dict[Key, str] = {}
         """The first messages for a new page."""
         self._set = 0
         self._exchanges: RemoteExchanges | None = None
@@ -70,7 +70,7 @@ class Audience:
         seat = Seat()
         self._seats.add(seat)
         seat.put(("state", 0), self._state())
-        for key, text in self._said.items():
+        for key, text in self._sent.items():
             seat.put(key, text)
         seat.put(("past", 0), self._past())
         return seat
@@ -98,17 +98,17 @@ class Audience:
             self._asking = None
         self.look_at_exchanges()  # the pages may have gone meanwhile
 
-    def _hear(self, method: str, said: Mapping[str, Any]) -> None:
-        if said.get("set", 0) > self._set:
-            self._set = said["set"]
-            self._said = {key: text for key, text in self._said.items() if key[0] not in ("rows", "values")}
-        key = method, said.get("first", 0)
-        self._said[key] = text = encoded({"method": method, "body": said})
+    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
+        if params.get("set", 0) > self._set:
+            self._set = params["set"]
+            self._sent = {key: text for key, text in self._sent.items() if key[0] not in ("rows", "values")}
+        key = method, params.get("first", 0)
+        self._sent[key] = text = encoded({"method": method, "body": params})
         for seat in self._seats:
             seat.put(key, text)
 
-    def _hear_exchanges(self, said: Mapping[str, Any]) -> None:
-        text = encoded({"method": "exchanges", "body": said})
+    def _hear_exchanges(self, params: Mapping[str, Any]) -> None:
+        text = encoded({"method": "exchanges", "body": params})
         for seat in self._seats:
             if seat.wants_exchanges:
                 seat.put_exchanges(text)

@@ -36,9 +36,9 @@ def most_connections() -> int:
 class Crowd:
     """All connections of one server. Beyond the bound, the one that has waited longest without a request is closed."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
+    def __init__(self, report: Callable[[str], None]) -> None:
         self.most = max(FEWEST, most_connections())
-        self._report = LimitedReport(tell, self._closed_text)
+        self._report = LimitedReport(report, self._closed_text)
         self._waiting: dict[HttpConnection, None] = {}
         """Connections without a whole request; the one that has waited longest first."""
 

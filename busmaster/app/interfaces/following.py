@@ -197,15 +197,15 @@ class Following:
         finally:
             self._remote = self._overview = None
 
-    def _hear(self, method: str, said: Mapping[str, Any]) -> None:
-        self.picture.hear(method, said)
+    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
+        self.picture.hear(method, params)
         for hear in list(self._listeners):
-            hear(method, said)
+            hear(method, params)
 
-    def _hear_touched(self, said: Mapping[str, Any]) -> None:
-        self.picture.hear("touched", said)
+    def _hear_touched(self, params: Mapping[str, Any]) -> None:
+        self.picture.hear("touched", params)
         for hear in list(self._touch_listeners):
-            hear(said)
+            hear(params)
 
     def _change(self, state: Connected | Lost) -> None:
         if isinstance(state, Lost):

@@ -342,15 +342,15 @@ KEYS: dict[str, tuple[type, ...]] = {
 def read_map(path: str) -> RegisterMap:
     """Return the map of a file. Raises OSError, and InvalidCommand that names the file and the entry."""
     try:
-        said = tomllib.loads(read_file(path).decode())
+        table = tomllib.loads(read_file(path).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InvalidCommand(f"{path}: {error}") from None
     try:
-        _check_keys(said, ("stale", "registers"))
-        stale = said.get("stale", "exception")
+        _check_keys(table, ("stale", "registers"))
+        stale = table.get("stale", "exception")
         if stale not in ("exception", "last"):
             raise InvalidCommand(f'stale is "exception" or "last", not {stale!r}')
-        entries = said.get("registers")
+        entries = table.get("registers")
         if not isinstance(entries, list) or not entries or not all(isinstance(one, dict) for one in entries):
             raise InvalidCommand("there is no [[registers]]: each has one point and its address")
         return RegisterMap.of([_entry(one, number) for number, one in enumerate(entries, 1)], stale == "last")
@@ -358,23 +358,23 @@ def read_map(path: str) -> RegisterMap:
         raise InvalidCommand(f"{path}: {error}") from None
 
 
-def _check_keys(said: Mapping[str, Any], known: Collection[str]) -> None:
-    for key in said:
+def _check_keys(table: Mapping[str, Any], known: Collection[str]) -> None:
+    for key in table:
         if key not in known:
             raise InvalidCommand(f"there is no key {key!r}; {meant(key, list(known))}")
 
 
-def _entry(said: Mapping[str, Any], number: int) -> Entry:
+def _entry(table: Mapping[str, Any], number: int) -> Entry:
     try:
-        _check_keys(said, KEYS)
+        _check_keys(table, KEYS)
         for key in ("point", "address"):
-            if key not in said:
+            if key not in table:
                 raise InvalidCommand(f"{key} is missing")
-        for key, value in said.items():
+        for key, value in table.items():
             if isinstance(value, bool) or not isinstance(value, KEYS[key]):
                 raise InvalidCommand(f"{key} is not {'a text' if KEYS[key] == (str,) else 'a number'}: {value!r}")
-        is_bit = said.get("table") in BIT_TABLES
-        entry = Entry(**{"type": "bit" if is_bit else "float32", **said})
+        is_bit = table.get("table") in BIT_TABLES
+        entry = Entry(**{"type": "bit" if is_bit else "float32", **table})
         for key, value, known in (
             ("table", entry.table, TABLES),
             ("type", entry.type, ("bit",) if is_bit else tuple(FORMATS)),
@@ -494,13 +494,13 @@ class Values:
                 end()
             await self._leave_groups(set())
 
-    def _hear(self, method: str, _said: Mapping[str, Any]) -> None:
+    def _hear(self, method: str, _params: Mapping[str, Any]) -> None:
         if method in ("rows", "frame"):
             self._new_rows |= method == "rows"
             self._changed.set()
 
-    def _hear_touched(self, said: Mapping[str, Any]) -> None:
-        self._touches.note(said)
+    def _hear_touched(self, params: Mapping[str, Any]) -> None:
+        self._touches.note(params)
 
     async def _look(self) -> None:
         remote = None
@@ -638,14 +638,14 @@ def _ignore(_kind: str, _peer: str) -> None:
 
 
 class Answers:
-    """Replies to requests. `tell` is called with a line for each write: its client, and its outcome."""
+    """Replies to requests. `report` is called with a line for each write: its client, and its outcome."""
 
-    def __init__(self, values: Values, rules: Rules, tell: Callable[[str], None], refused: Refuse = _ignore) -> None:
+    def __init__(self, values: Values, rules: Rules, report: Callable[[str], None], refused: Refuse = _ignore) -> None:
         self._values = values
         self._rules = rules
-        self._tell = tell
+        self._report = report
         self._refused = refused
-        self._denied = LimitedReport(tell, _denied_text)
+        self._denied = LimitedReport(report, _denied_text)
         self._turns: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
         """The pass-through requests of each address, while it has any."""
 
@@ -712,9 +712,9 @@ class Answers:
                 await self._values.line.write(row.group, row.key, value)
             except (BusError, InvalidCommand) as error:
                 before = f"; of this request {count} of {len(wanted)} points were written" if len(wanted) > 1 else ""
-                self._tell(f"client {peer}: {row.key} = {value}: {cut(str(error))}{before}")
+                self._report(f"client {peer}: {row.key} = {value}: {cut(str(error))}{before}")
                 raise ExceptionReply(code_of(error), str(error)) from None
-            self._tell(f"client {peer}: {row.key} = {value}: written")
+            self._report(f"client {peer}: {row.key} = {value}: written")
 
     # units of the line
 
@@ -735,9 +735,9 @@ class Answers:
             changed = _modbus_commands()[read](request.first, len(request.values), request.table)
             await self._run(peer, unit, Priority.COMMAND, write, request.first, request.values, touches=changed)
         except ExceptionReply as refused:
-            self._tell(f"{what}: {cut(str(refused))}")
+            self._report(f"{what}: {cut(str(refused))}")
             raise
-        self._tell(f"{what}: written")
+        self._report(f"{what}: written")
 
     async def _run(
         self, peer: str, unit: int, priority: Priority, kind: str, *arguments: Any, touches: Any = None
@@ -807,7 +807,7 @@ class ModbusTcpServer:
     """Accepts clients, and replies to the requests of each one by one, in their order."""
 
     def __init__(
-        self, answers: Answers, tell: Callable[[str], None], refused: Refuse = _ignore, *, idle: float = IDLE
+        self, answers: Answers, report: Callable[[str], None], refused: Refuse = _ignore, *, idle: float = IDLE
     ) -> None:
         self._answers = answers
         self._idle = idle
@@ -818,7 +818,7 @@ class ModbusTcpServer:
         """Those whose request has no reply yet."""
         self._replaced: dict[asyncio.StreamWriter, str] = {}
         """Closed connections whose request has no reply yet, and their peers."""
-        self._closed = LimitedReport(tell, self._closed_text)
+        self._closed = LimitedReport(report, self._closed_text)
 
     async def accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
@@ -906,7 +906,7 @@ async def serve(
     rules: Rules,
     listen: tuple[str, int],
     opened: Callable[[str], None],
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     idle: float = IDLE,
 ) -> None:
     """Follow a line and serve it by Modbus TCP until cancelled. `opened` is called with the server's address.
@@ -914,7 +914,7 @@ async def serve(
     Raises InvalidCommand if it cannot listen there.
     """
     refused = ReportedRefusals("modbus-tcp", values.line, "connections", "requests").note
-    server = ModbusTcpServer(Answers(values, rules, tell, refused), tell, refused, idle=idle)
+    server = ModbusTcpServer(Answers(values, rules, report, refused), report, refused, idle=idle)
     socket = await asyncio.to_thread(listening, listen)
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(values.run())

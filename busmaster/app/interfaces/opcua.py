@@ -85,13 +85,13 @@ class Shown:
 class LineServer:
     """Shows a line that another program owns to OPC UA clients, and passes their writes on.
 
-    `tell` is called with a line for each write: the client and the result.
+    `report` is called with a line for each write: the client and the result.
     """
 
-    def __init__(self, server: Server, line: Following, rules: Rules, tell: Callable[[str], None]) -> None:
+    def __init__(self, server: Server, line: Following, rules: Rules, report: Callable[[str], None]) -> None:
         self._line = line
         self._rules = rules
-        self._tell = tell
+        self._report = report
         self._space = Space(server)
         self._health = Health(self._space, line)
         self._points: dict[Identity, Shown] = {}
@@ -129,14 +129,14 @@ class LineServer:
             end_touched()
             await self._leave_groups(set())
 
-    def _hear(self, method: str, said: Mapping[str, Any]) -> None:
+    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
         if method == "rows":
             self._new_rows = True
         if method == "frame":
             self._changed.set()
 
-    def _hear_touched(self, said: Mapping[str, Any]) -> None:
-        self._touches.note(said)
+    def _hear_touched(self, params: Mapping[str, Any]) -> None:
+        self._touches.note(params)
         self._is_touched = True
         self._changed.set()
 
@@ -295,30 +295,30 @@ class LineServer:
         shown = self._by_id.get(wanted.NodeId)
         if shown is None or wanted.AttributeId != ua.AttributeIds.Value:
             return NOT_WRITABLE
-        told, row = wanted.Value, shown.row
-        is_stamped = told.SourceTimestamp is not None or told.ServerTimestamp is not None
-        if wanted.IndexRange or is_stamped or (told.StatusCode is not None and told.StatusCode.value != GOOD):
+        data, row = wanted.Value, shown.row
+        is_stamped = data.SourceTimestamp is not None or data.ServerTimestamp is not None
+        if wanted.IndexRange or is_stamped or (data.StatusCode is not None and data.StatusCode.value != GOOD):
             return NO_SUCH_WRITE  # the time of a value is that of its reply
         if not shown.writable or self._line.read_only:
             return NOT_WRITABLE
         who = f"user {user.name}" if user.name else "an anonymous user"
         if refusal := self._rules.refusal(user):
-            self._tell(f"{who}: {row.key} was not written: {refusal}")
+            self._report(f"{who}: {row.key} was not written: {refusal}")
             return ACCESS_DENIED
-        value = _converted(told.Value, shown.variable.kind, shown.labelled)
+        value = _converted(data.Value, shown.variable.kind, shown.labelled)
         if value is None:
             return TYPE_MISMATCH
-        said = cut(str(value))
+        text = cut(str(value))
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
-            self._tell(f"{who}: {row.key} = {said}: {cut(str(error))}")
+            self._report(f"{who}: {row.key} = {text}: {cut(str(error))}")
             await self._doubt_touched()
             if isinstance(error, InvalidCommand) and await self._is_beyond_limits(row, value):
                 return OUT_OF_RANGE
             return status_of_write(error)
         await self._doubt_touched()  # before the reply to the client, so that it never reads the old value as good
-        self._tell(f"{who}: {row.key} = {said}: written")
+        self._report(f"{who}: {row.key} = {text}: written")
         return status_of_write(None)
 
     async def _is_beyond_limits(self, row: Row, value: Any) -> bool:
@@ -386,7 +386,7 @@ async def serving(
     line: Following,
     rules: Rules,
     listen: tuple[str, int],
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     *,
     certificate: tuple[str, str] | None = None,
 ) -> AsyncIterator[str]:
@@ -404,8 +404,8 @@ async def serving(
     await server.set_application_uri(URI)
     if certificate is not None:
         await load_certificate(server, *certificate)
-    shown = LineServer(server, line, rules, tell)
-    guard(server, rules, shown.write, FailedLogins("opcua", line, tell).note)
+    shown = LineServer(server, line, rules, report)
+    guard(server, rules, shown.write, FailedLogins("opcua", line, report).note)
     host, port = listen
     server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{port}/")
     server.socket_address = listen
@@ -431,11 +431,11 @@ async def serve(
     rules: Rules,
     listen: tuple[str, int],
     opened: Callable[[str], None],
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     certificate: tuple[str, str] | None,
 ) -> None:
     """Serve a line by OPC UA until cancelled. `opened` is called with the server's address; see `serving`."""
-    async with serving(line, rules, listen, tell, certificate=certificate) as url:
+    async with serving(line, rules, listen, report, certificate=certificate) as url:
         opened(url)
         await asyncio.Event().wait()
 

@@ -68,9 +68,9 @@ class Session(InternalSession):  # type: ignore[misc]  # it is untyped
             if code := refusal_of_read(wanted):
                 results[number] = ua.DataValue(StatusCode=ua.StatusCode(code))
             elif wanted.AttributeId == ua.AttributeIds.UserAccessLevel and not may_write:
-                told = results[number].Value
-                if told is not None and told.Value is not None:
-                    results[number] = ua.DataValue(ua.Variant(told.Value & ~WRITE_BIT, ua.VariantType.Byte))
+                access = results[number].Value
+                if access is not None and access.Value is not None:
+                    results[number] = ua.DataValue(ua.Variant(access.Value & ~WRITE_BIT, ua.VariantType.Byte))
         return results
 
     async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:

@@ -125,13 +125,13 @@ class Space:
 
     async def put(self, place: ua.NodeId, value: ua.Variant | None, status: int, when: float) -> None:
         """Give a variable a value of the type that it has; None for no value, with a Bad status."""
-        told = ua.DataValue(
+        data = ua.DataValue(
             value or ua.Variant(None, ua.VariantType.Null),
             StatusCode=ua.StatusCode(status),
             SourceTimestamp=time_of(when),
             ServerTimestamp=datetime.now(UTC),
         )
-        await self._server.write_attribute_value(place, told)
+        await self._server.write_attribute_value(place, data)
 
     def set_type(self, place: ua.NodeId, type_: int) -> None:
         """Change the variable type of a variable. Clients cannot do this, so asyncua has no service for it."""
@@ -179,9 +179,9 @@ class Space:
     async def give_access(self, place: ua.NodeId, writable: bool) -> None:
         """Set whether a variable may be written."""
         access = ua.AccessLevel.CurrentRead.mask | (ua.AccessLevel.CurrentWrite.mask if writable else 0)
-        told = ua.DataValue(ua.Variant(access, ua.VariantType.Byte))
+        data = ua.DataValue(ua.Variant(access, ua.VariantType.Byte))
         for attribute in (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel):
-            await self._server.write_attribute_value(place, told, attribute)
+            await self._server.write_attribute_value(place, data, attribute)
 
     async def _add(
         self, place: ua.NodeId, name: str, parent: ua.NodeId, kind: ua.NodeClass, attributes: Any, type_: int

@@ -12,7 +12,7 @@ from busmaster.app.service.refusals import OTHERS, LimitedReport, failed_text
 from busmaster.bounds import MOST_REPORTED
 from busmaster.errors import LineDown
 
-TELL_EVERY = 1.0
+REPORT_EVERY = 1.0
 """Seconds from one message to the line's owner to the next: a guesser fails a thousand times a second."""
 
 
@@ -26,45 +26,45 @@ class ReportedRefusals:
     def __init__(self, interface: str, line: Following, *kinds: str) -> None:
         self._interface = interface
         self._line = line
-        self._untold: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
+        self._unreported: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
         self._timer: asyncio.TimerHandle | None = None
         line.on_state(self._announce)
 
     def note(self, kind: str, peer: str) -> None:
         """Count a refusal of a peer."""
-        untold = self._untold[kind]
-        untold[peer if peer in untold or len(untold) < MOST_REPORTED else OTHERS] += 1
+        unreported = self._unreported[kind]
+        unreported[peer if peer in unreported or len(unreported) < MOST_REPORTED else OTHERS] += 1
         if self._timer is None:
-            self._tell_later()
+            self._report_later()
 
     def _announce(self) -> None:
         if self._line.is_connected:
-            self._tell_owner(self._untold)
+            self._report_to_owner(self._unreported)
 
-    def _tell_later(self) -> None:
-        self._timer = asyncio.get_running_loop().call_later(TELL_EVERY, self._tell_what_is_new)
+    def _report_later(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(REPORT_EVERY, self._report_what_is_new)
 
-    def _tell_what_is_new(self) -> None:
+    def _report_what_is_new(self) -> None:
         self._timer = None
-        if not self._tell_owner([kind for kind, counts in self._untold.items() if counts]):
-            self._tell_later()
+        if not self._report_to_owner([kind for kind, counts in self._unreported.items() if counts]):
+            self._report_later()
 
-    def _tell_owner(self, kinds: Iterable[str]) -> bool:
+    def _report_to_owner(self, kinds: Iterable[str]) -> bool:
         """Report these kinds. Return whether the owner was there."""
         try:
             for kind in kinds:
-                self._line.remote.report_refusals(self._interface, kind, self._untold[kind])
-                self._untold[kind].clear()
+                self._line.remote.report_refusals(self._interface, kind, self._unreported[kind])
+                self._unreported[kind].clear()
         except LineDown:
             return False
         return True
 
 
 class FailedLogins:
-    """Takes note of failed logins at `interface`: `tell` is called at most once a minute, and the owner counts them."""
+    """Counts failed logins at `interface`. `report` is called at most once a minute; the owner counts them too."""
 
-    def __init__(self, interface: str, line: Following, tell: Callable[[str], None]) -> None:
-        self._report = LimitedReport(tell, partial(failed_text, interface))
+    def __init__(self, interface: str, line: Following, report: Callable[[str], None]) -> None:
+        self._report = LimitedReport(report, partial(failed_text, interface))
         self._refusals = ReportedRefusals(interface, line, "logins")
 
     def note(self, peer: str) -> None:

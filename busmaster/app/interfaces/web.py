@@ -75,7 +75,7 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
 )
 """HTTP statuses by error: the first that matches. The reply contains the error's class and text."""
 
-Told = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 class PastValues(Protocol):
@@ -87,13 +87,13 @@ class PastValues(Protocol):
 
 
 class Api:
-    """The replies of the REST API. `tell` is called with a sentence for each requested write."""
+    """The replies of the REST API. `report` is called with a sentence for each requested write."""
 
-    def __init__(self, line: Following, guard: Guard, tell: Told, history: PastValues | None = None) -> None:
+    def __init__(self, line: Following, guard: Guard, report: Report, history: PastValues | None = None) -> None:
         self._line = line
         self._guard = guard
-        self._tell = tell
-        self._logins = Logins(FailedLogins("web", line, tell).note, time.monotonic)
+        self._report = report
+        self._logins = Logins(FailedLogins("web", line, report).note, time.monotonic)
         self._audience = Audience(line)
         self._pages = 0
         self._history = history
@@ -110,7 +110,7 @@ class Api:
             why, since = state.why, state.since
         elif frame is not None and frame.since is not None:
             why, since = frame.why, self._wall(frame.since)
-        said: dict[str, Any] = {
+        data: dict[str, Any] = {
             "connected": not lost,
             "why": why,
             "since": since,
@@ -121,8 +121,8 @@ class Api:
         }
         if frame is not None:
             left_out = ("events", "why", "since")
-            said["frame"] = {name: value for name, value in asdict(frame).items() if name not in left_out}
-        return _json(said)
+            data["frame"] = {name: value for name, value in asdict(frame).items() if name not in left_out}
+        return _json(data)
 
     async def nodes(self, _: Request) -> Response:
         """Answer health and counts of all nodes."""
@@ -196,9 +196,9 @@ class Api:
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
-            self._tell(f"{asked}: {cut(str(error))}")
+            self._report(f"{asked}: {cut(str(error))}")
             raise
-        self._tell(f"{asked}: written")
+        self._report(f"{asked}: written")
         return _json({"written": value})
 
     async def stream(self, socket: WebSocket) -> None:
@@ -209,7 +209,7 @@ class Api:
         await socket.accept()
         seat = self._audience.join()
         self._pages += 1
-        telling = asyncio.ensure_future(_tell(socket, seat))
+        sending = asyncio.ensure_future(_send_updates(socket, seat))
         try:
             await self._listen(socket, seat)
         except (WebSocketDisconnect, RuntimeError):  # RuntimeError: it disconnected during a message
@@ -217,17 +217,17 @@ class Api:
         finally:
             self._pages -= 1
             self._audience.leave(seat)
-            telling.cancel()
-            await asyncio.wait([telling])
+            sending.cancel()
+            await asyncio.wait([sending])
 
     async def _listen(self, socket: WebSocket, seat: Seat) -> None:
         """Receive whether the page wants the exchanges: {"exchanges": true}."""
         while True:
             text = await socket.receive_text()
-            if text not in WISHES:
+            if text not in EXCHANGES_WANTED:
                 await socket.close(1008, "invalid message; a page only sends whether it wants exchanges")
                 return
-            seat.wants_exchanges = WISHES[text]
+            seat.wants_exchanges = EXCHANGES_WANTED[text]
             self._audience.look_at_exchanges()
 
     # inside
@@ -272,14 +272,14 @@ class Api:
             "writable",
             "value",
         )
-        said = {name: getattr(row, name) for name in (*named, "quality", "error", "alarm")}
-        return _as_in_the_file(said) | {"time": None if row.asked is None else self._wall(row.asked)}
+        data = {name: getattr(row, name) for name in (*named, "quality", "error", "alarm")}
+        return _as_in_the_file(data) | {"time": None if row.asked is None else self._wall(row.asked)}
 
 
-def _as_in_the_file(said: dict[str, Any]) -> dict[str, Any]:
+def _as_in_the_file(data: dict[str, Any]) -> dict[str, Any]:
     """Return a description of a node or a point with its protocol as in LINE.toml: `microflex`, not `hcp2`."""
-    kind = said.pop("kind")
-    return said | {"protocol": kind or said["protocol"]}
+    kind = data.pop("kind")
+    return data | {"protocol": kind or data["protocol"]}
 
 
 def _range(request: Request) -> tuple[float, float, int]:
@@ -306,10 +306,10 @@ def _number(query: QueryParams, name: str, default: float) -> float:
     return number
 
 
-WISHES = {'{"exchanges":true}': True, '{"exchanges":false}': False}
+EXCHANGES_WANTED = {'{"exchanges":true}': True, '{"exchanges":false}': False}
 
 
-async def _tell(socket: WebSocket, seat: Seat) -> None:
+async def _send_updates(socket: WebSocket, seat: Seat) -> None:
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         while True:
             for text in await seat.take():
@@ -329,20 +329,20 @@ async def _value(request: Request) -> float | str:
     except ClientDisconnect:
         raise HTTPException(400, "the connection ended before the body did") from None
     try:
-        said = json.loads(body)
+        data = json.loads(body)
     except (ValueError, RecursionError):
-        said = None
-    match said:
+        data = None
+    match data:
         case {"value": bool() | int() | float() | str() as value, **rest} if not rest:
             return value
     raise HTTPException(400, 'the body is {"value": NUMBER}, {"value": true}, {"value": false} or {"value": "TEXT"}')
 
 
 def application(
-    line: Following, guard: Guard, tell: Told = lambda _: None, history: PastValues | None = None
+    line: Following, guard: Guard, report: Report = lambda _: None, history: PastValues | None = None
 ) -> Guarded:
-    """Return the ASGI application that shows a line. `tell` is called for each requested write."""
-    api = Api(line, guard, tell, history)
+    """Return the ASGI application that shows a line. `report` is called for each requested write."""
+    api = Api(line, guard, report, history)
     one = "/api/points/{group}/{key:path}"
     routes = [
         Route("/", _page, methods=["GET"]),
@@ -363,8 +363,8 @@ def application(
 
 
 @contextlib.asynccontextmanager
-async def serving(application: Any, listen: HostPort, tell: Told = lambda _: None) -> AsyncIterator[str]:
-    """Serve an application at an address, and yield its URL. `tell` is called for connections that are closed.
+async def serving(application: Any, listen: HostPort, report: Report = lambda _: None) -> AsyncIterator[str]:
+    """Serve an application at an address, and yield its URL. `report` is called for connections that are closed.
 
     Raises InvalidCommand if it cannot listen there.
     """
@@ -378,7 +378,7 @@ async def serving(application: Any, listen: HostPort, tell: Told = lambda _: Non
             proxy_headers=False,
             server_header=False,
             timeout_graceful_shutdown=CLOSE_WITHIN,
-            **Crowd(tell).protocols(),
+            **Crowd(report).protocols(),
             ws_max_size=LONGEST_PAGE_MESSAGE,
             ws_per_message_deflate=False,  # it takes as long as everything else for a page
         )
@@ -405,8 +405,8 @@ async def serve(
     listen: HostPort,
     secrets: Mapping[str, bytes],
     hosts: Sequence[str],
-    opened: Told,
-    tell: Told = lambda _: None,
+    opened: Report,
+    report: Report = lambda _: None,
     history: PastValues | None = None,
 ) -> None:
     """Follow a line and serve its page until cancelled. `opened` is called with the page's URL, `hosts` are further
@@ -414,7 +414,7 @@ async def serve(
 
     Raises InvalidCommand if it cannot listen there.
     """
-    async with serving(application(line, Guard(listen, secrets, hosts), tell, history), listen, tell) as url:
+    async with serving(application(line, Guard(listen, secrets, hosts), report, history), listen, report) as url:
         opened(url)
         await line.follow()
 
@@ -443,5 +443,5 @@ async def _explain_http(_: Request, error: Exception) -> Response:
     return _json({"error": "NotServed", "what": error.detail}, error.status_code, error.headers)
 
 
-def _json(said: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    return Response(encoded(said), status, headers, media_type="application/json")
+def _json(data: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    return Response(encoded(data), status, headers, media_type="application/json")

@@ -47,7 +47,7 @@ def check(path: str | os.PathLike[str]) -> Report:
     with warnings.catch_warnings(record=True) as noticed:
         warnings.simplefilter("always")
         file, line = _made(source)
-    problems = list(_told(source, line))
+    problems = list(_problems_of(source, line))
     known = [str(one.message) for one in noticed if issubclass(one.category, UserWarning)]
     if file is not None and line is not None and not problems:
         known += _doubts(file, line)
@@ -78,7 +78,7 @@ def _part_at(table: Table, key: str) -> Iterator[None]:
         yield
 
 
-def _told(source: Source, line: ConfiguredLine | None) -> Iterator[FileError]:
+def _problems_of(source: Source, line: ConfiguredLine | None) -> Iterator[FileError]:
     """Yield the problems that do not only follow from others, by their place in the file."""
     assert source.problems is not None
     unknown = _unread_nodes(source, line)

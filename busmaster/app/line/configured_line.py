@@ -44,10 +44,10 @@ class ConfiguredLine:
 
     `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError with
     line and key for settings that the protocols or the outputs do not support. `port` is used instead of the file's.
-    `tap` receives every byte. Without `outputs`, nothing is recorded or published. `tell` is called, on the loop, with
-    the events of the outputs. `read_only` rejects all writes from outside; `authorisation` checks each of them. With
-    `wait_for_port`, a port that cannot be opened yet is not an error. A line that never `asks` only listens and is not
-    entered: its outputs do not report the state of line and nodes.
+    `tap` receives every byte. Without `outputs`, nothing is recorded or published. `report` is called, on the loop,
+    with the events of the outputs. `read_only` rejects all writes from outside; `authorisation` checks each of them.
+    With `wait_for_port`, a port that cannot be opened yet is not an error. A line that never `asks` only listens and is
+    not entered: its outputs do not report the state of line and nodes.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class ConfiguredLine:
         port: Endpoint | None = None,
         outputs: bool = True,
         tap: Tap | None = None,
-        tell: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
         read_only: bool = False,
         wait_for_port: bool = False,
         asks: bool = True,
@@ -77,8 +77,8 @@ class ConfiguredLine:
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.authorisation = Authorisation(self.bus, read_only=read_only, access=access_of(file.service, self))
         self.authorisation.safe_state = self.safe_state
-        self.outputs = Distributor(self.bus, tell, authorisation=self.authorisation, asks=asks)
-        self._kept_times = KeptTimes(self.bus, self._tell)
+        self.outputs = Distributor(self.bus, report, authorisation=self.authorisation, asks=asks)
+        self._kept_times = KeptTimes(self.bus, self._report)
         self.authorisation.record = self.outputs.record
         if outputs:
             self._add_outputs()
@@ -179,13 +179,13 @@ class ConfiguredLine:
         [send] = ext.prepare_write(handle, point.source.item, list(map(point.unscaled, values)), **options)
         return send
 
-    def audit(self, tell: Callable[[str], None] = lambda _: None) -> Distributor:
+    def audit(self, report: Callable[[str], None] = lambda _: None) -> Distributor:
         """Return the outputs of the file that keep an audit log, for a process that does not poll.
 
         They are not started, do not report the line's state, and accept no commands. Raises InvalidCommand if an extra
         is missing.
         """
-        audit = Distributor(self.bus, tell, in_charge=False)
+        audit = Distributor(self.bus, report, in_charge=False)
         for kind, settings in self.file.outputs.items():
             if find(kind).keeps_audit:
                 with self.file.table.table("outputs").table(kind).at():
@@ -213,8 +213,8 @@ class ConfiguredLine:
 
     # inside
 
-    def _tell(self, text: str) -> None:
-        self.outputs.tell(text)
+    def _report(self, text: str) -> None:
+        self.outputs.report(text)
 
     def _own_nodes(self) -> dict[str, Node]:
         return {name: Node.of(handle) for name, handle in self.nodes.items()}

@@ -34,17 +34,17 @@ SLICE = 16
 
 
 class KeptTimes:
-    """The file of one line. `tell` is called, on the loop, with an error of the file, once until it changes."""
+    """The file of one line. `report` is called, on the loop, with an error of the file, once until it changes."""
 
-    def __init__(self, bus: Bus, tell: Callable[[str], None]) -> None:
+    def __init__(self, bus: Bus, report: Callable[[str], None]) -> None:
         self._bus = bus
-        self._tell = tell
+        self._report = report
         self._path: str | None = None
         self._nodes: Mapping[str, Node] = {}
         self._known: Mapping[str, Any] = {}
         """Contents of the file when the line was opened."""
         self._kept = ""
-        self._trouble = self._told = ""
+        self._trouble = self._reported = ""
         self._keeping: asyncio.Task[None] | None = None
         self._thread: threading.Thread | None = None
         self._one_at_a_time = threading.Lock()
@@ -64,7 +64,7 @@ class KeptTimes:
                 ext.begin_with(node, _times(self._known[name]))
         if path is not None and self._keeping is None:
             self._keeping = asyncio.ensure_future(self._keep_often())
-        self._say()
+        self._report_trouble()
 
     async def close(self) -> None:
         """Store the present times, and stop."""
@@ -91,12 +91,12 @@ class KeptTimes:
             if times := ext.times_to_keep(node):
                 kept[name] = {"settings": self._settings(node), "times": [asdict(each) for each in times]}
         await asyncio.to_thread(self._do, NOT_KEPT, self._write, path, kept)
-        self._say()
+        self._report_trouble()
 
-    def _say(self) -> None:
-        if self._trouble and self._trouble != self._told:
-            self._tell(self._trouble)
-        self._told = self._trouble
+    def _report_trouble(self) -> None:
+        if self._trouble and self._trouble != self._reported:
+            self._report(self._trouble)
+        self._reported = self._trouble
 
     def _settings(self, node: Node) -> str:
         """Return a mark of all that its reply times depend on: with another one they are learned anew."""
@@ -120,13 +120,13 @@ class KeptTimes:
 
     def _read(self, path: str) -> None:
         try:
-            said = json.loads(read_file(path))
-            if said["version"] != VERSION:
+            data = json.loads(read_file(path))
+            if data["version"] != VERSION:
                 raise ValueError("of another version")
-            for node in said["nodes"].values():
+            for node in data["nodes"].values():
                 str(node["settings"])
                 _times(node)
-            self._known = said["nodes"]
+            self._known = data["nodes"]
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -158,7 +158,7 @@ def _why(error: Exception) -> str:
 
 def _times(node: Any) -> list[LearnedTimes]:
     """Return the times of one node in a file. Raises ValueError, TypeError or KeyError for invalid contents."""
-    found = [LearnedTimes(**said) for said in node["times"]]
+    found = [LearnedTimes(**data) for data in node["times"]]
     for times in found:
         seconds = (times.slowest, times.received, times.pause, times.window)
         if not (type(times.kind) is str and type(times.packet) is type(times.trusted) is bool):

@@ -176,21 +176,21 @@ def set_text(one: ParameterSet, kind: NodeKind) -> str:
 
 def _header(one: ParameterSet) -> str:
     drive = {"protocol": one.protocol, "address": one.address, "label": one.label, "line": one.line}
-    said = "".join(f"{key} = {toml_text(value)}\n" for key, value in drive.items())
+    lines = "".join(f"{key} = {toml_text(value)}\n" for key, value in drive.items())
     return (
-        f"{HEAD}format = {FORMAT}\n\n[drive]\n{said}identity = {toml_text(dict(one.identity))}\n\n"
+        f"{HEAD}format = {FORMAT}\n\n[drive]\n{lines}identity = {toml_text(dict(one.identity))}\n\n"
         f"[saved]\ntime = {one.saved.isoformat().replace('+00:00', 'Z')}\nby = {toml_text(one.by)}\n\n[parameters]\n"
     )
 
 
 def _line(entry: Entry, kind: NodeKind) -> str:
     parameter = entry.parameter
-    said: dict[str, Any] = {"value": in_unit(parameter, entry.value, kind)}
+    entries: dict[str, Any] = {"value": in_unit(parameter, entry.value, kind)}
     for key in ENTRY_KEYS[1:]:
         value = getattr(parameter, key)
         if value != getattr(_NOTHING, key) and (key != "access" or value == "read"):
-            said[key] = value
-    return f"{toml_text(parameter.item)} = {toml_text(said)}\n"
+            entries[key] = value
+    return f"{toml_text(parameter.item)} = {toml_text(entries)}\n"
 
 
 _NOTHING = Parameter(item="")
@@ -292,7 +292,7 @@ class PartFile:
             raise InvalidCommand(f"{self._part} was started with other parameters; {other}")
         source = Source(self._part, text)
         parameters = source.data["parameters"]
-        gaps = {item: said for item, said in parameters.items() if isinstance(said, dict) and "why" in said}
+        gaps = {item: entry for item, entry in parameters.items() if isinstance(entry, dict) and "why" in entry}
         for item in gaps:
             del parameters[item]
         _, begun = _read(Table(source))
@@ -300,8 +300,8 @@ class PartFile:
             raise InvalidCommand(f"{self._part} was started with another node ({begun.label}); {other}")
         own = {one.item: one for one in self._wanted}
         self._found = {item: Entry(own[item], entry.value) for item, entry in begun.entries.items()}
-        for item, said in gaps.items():
-            self.gaps[item] = Found(own[item], why=str(said["why"]), gap=said.get("gap") is True)
+        for item, entry in gaps.items():
+            self.gaps[item] = Found(own[item], why=str(entry["why"]), gap=entry.get("gap") is True)
         os.truncate(self._part, len(whole))
         return replace(begun, entries={})
 

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 
 from busmaster import Point
 from busmaster.app.config.point_section import POINT_KEYS, PointSection
-from busmaster.app.config.rewriting import Said, toml_text
+from busmaster.app.config.rewriting import Entries, toml_text
 from busmaster.app.config.sections import LineFile, NodeSection
 from busmaster.app.line.configured_line import ConfiguredLine
 from busmaster.app.outputs.cells import csv_lines, text_cell
@@ -36,7 +36,7 @@ class Row:
 
     node: str
     point: str
-    said: Said
+    entries: Entries
     origin: str
     limited_by: tuple[str, ...] = ()
 
@@ -81,9 +81,9 @@ def sections(file: LineFile) -> dict[str, NodeSection]:
     return found
 
 
-def said_text(said: Said, key: str) -> str:
+def entry_text(entries: Entries, key: str) -> str:
     """Return the value of a key as text; "" if it is not set."""
-    return "" if key not in said else str(said[key]) if key in TEXTS else toml_text(said[key])
+    return "" if key not in entries else str(entries[key]) if key in TEXTS else toml_text(entries[key])
 
 
 def points_csv(file: LineFile) -> bytes:
@@ -96,7 +96,7 @@ def _cells(row: Row) -> Iterator[str]:
     yield text_cell(row.node)
     yield text_cell(row.point)
     for key in POINT_KEYS:
-        text = said_text(row.said, key)
-        yield text_cell(text) if key in TEXTS and key in row.said else text
+        text = entry_text(row.entries, key)
+        yield text_cell(text) if key in TEXTS and key in row.entries else text
     yield text_cell(", ".join(row.limited_by))
     yield row.origin and text_cell(row.origin)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from busmaster.app.config.point_section import POINT_KEYS, PointSection, check_suits, read_point
-from busmaster.app.config.rewriting import Said, rewritten, toml_text
+from busmaster.app.config.rewriting import Entries, rewritten, toml_text
 from busmaster.app.config.sections import LineFile, NodeSection, read
 from busmaster.app.config.source import FileError, Key, Source
 from busmaster.app.config.table import Table
@@ -45,23 +45,23 @@ class Change:
 
     node: str
     point: str
-    before: Said | None
-    after: Said
+    before: Entries | None
+    after: Entries
 
     def __str__(self) -> str:
         name, before = f"{self.node}/{self.point}", self.before
         if before is None:
             return f"{name} is new: {toml_text(self.after)}"
         keys = (key for key in POINT_KEYS if not _same(before, self.after, key))
-        told = (f"{key} {_told(before, key)} -> {_told(self.after, key)}" for key in keys)
-        return f"{name}: {', '.join(told)}"
+        changes = (f"{key} {_entry_text(before, key)} -> {_entry_text(self.after, key)}" for key in keys)
+        return f"{name}: {', '.join(changes)}"
 
 
-def _told(said: Said, key: str) -> str:
-    return toml_text(said[key]) if key in said else "none"
+def _entry_text(entries: Entries, key: str) -> str:
+    return toml_text(entries[key]) if key in entries else "none"
 
 
-def _same(one: Said, other: Said, key: str) -> bool:
+def _same(one: Entries, other: Entries, key: str) -> bool:
     """Return whether two points have the same value of a key. True differs from 1."""
     if key not in one or key not in other:
         return key not in one and key not in other
@@ -138,7 +138,7 @@ class _Incoming:
         self.changes: list[Change] = []
         self.numbers: dict[tuple[str, str], int] = {}
         """The row of each point that the CSV has."""
-        self.own: dict[tuple[str, str], Said] = {}
+        self.own: dict[tuple[str, str], Entries] = {}
         """The new keys of each changed point in the node's own section."""
         self._file = file
         self._name = name
@@ -200,7 +200,7 @@ class _Incoming:
         if first != number:
             raise place.error((name,), f"{where}/{name} is also in row {first}; remove one of the rows")
         held = self._held.get((where, name))
-        before = held.said if held else {}
+        before = held.entries if held else {}
         after = {key: value for key in POINT_KEYS for value in _values(place, name, key, given, before)}
         if held and all(_same(before, after, key) for key in POINT_KEYS):
             return
@@ -215,7 +215,7 @@ class _Incoming:
         what = f"the node belongs to {node.table.name}; use that name" if node else meant(where, self._sections)
         raise place.error(("", NODE), f"no section of nodes has the name {where!r}; {what}")
 
-    def _own(self, place: _RowPlace, where: str, name: str, after: Said) -> Said:
+    def _own(self, place: _RowPlace, where: str, name: str, after: Entries) -> Entries:
         """Return the keys for the node's own section that, together with the template, give this point."""
         template = self._templates[where].points.get(name)
         given = {} if template is None else template.data
@@ -235,7 +235,7 @@ class _Incoming:
         return section
 
 
-def _values(place: _RowPlace, name: str, key: str, given: dict[str, str], before: Said) -> Iterator[Any]:
+def _values(place: _RowPlace, name: str, key: str, given: dict[str, str], before: Entries) -> Iterator[Any]:
     """Yield the value of a key: that of the cell, or the present one if there is no such column."""
     cell = given.get(key)
     if cell is None:
@@ -252,7 +252,7 @@ def _value(place: _RowPlace, key: Key, cell: str) -> Any:
     if DECIMAL_COMMA.fullmatch(cell):
         raise place.error(key, f"{cell} has a decimal comma; write {cell.replace(',', '.')}")
     try:
-        said = tomllib.loads(f"cell = {cell}")
+        table = tomllib.loads(f"cell = {cell}")
     except tomllib.TOMLDecodeError:
         return cell
-    return said["cell"] if len(said) == 1 else cell
+    return table["cell"] if len(table) == 1 else cell

@@ -101,7 +101,7 @@ def check_extra(package: str, extra: str) -> None:
 
 
 class Output(ABC):
-    """One output. `say` is called from any thread with what happens to the output."""
+    """One output. `report` is called from any thread with what happens to the output."""
 
     what: ClassVar[str] = "written"
     finds_outdated: ClassVar[bool] = False
@@ -111,7 +111,7 @@ class Output(ABC):
         self,
         kind: str,
         settings: Settings,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.kind = kind
         self.groups = settings.groups
@@ -128,7 +128,7 @@ class Output(ABC):
         """Whether a write is acknowledged only after this output has made its audit entry durable."""
         self._promised: dict[int, tuple[WriteRecord, Kept]] = {}
         """Audit entries whose durability is awaited, by their identity: loop and thread share it without a lock."""
-        self._say = say
+        self._report = report
         self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: its operations are atomic
         self._stop = threading.Event()
         self._reopen = threading.Event()
@@ -258,7 +258,7 @@ class Output(ABC):
         self._retry = FIRST_RETRY
         if self.error:
             self.error = ""
-            self._say(f"{self.kind} is up again")
+            self._report(f"{self.kind} is up again")
 
     def down(self, error: BaseException) -> None:
         """Note why the output does not work, and report the reason if it is a new one."""
@@ -267,7 +267,7 @@ class Output(ABC):
             text = f"{self._destination}: {text}"
         if text != self.error:
             self.error = text
-            self._say(f"{self.kind} is down: {text}")
+            self._report(f"{self.kind} is down: {text}")
 
     def rest(self, seconds: float) -> None:
         """Wait for the next try, or until it is stopped."""
@@ -292,15 +292,15 @@ class Output(ABC):
 class OutputLine:
     """The line that an output belongs to. An output uses as much of it as it needs.
 
-    `say` reports an event of the output, from any thread. `commands` are the points, by their keys, that the output may
-    write for others, through `authorisation`. `statistics` returns the counts of all outputs of the line. An output
-    whose process is not `in_charge` of the line must not report the line's state. Where the process only listens,
-    `polls` is False.
+    `report` is called with an event of the output, from any thread. `commands` are the points, by their keys, that
+    the output may write for others, through `authorisation`. `statistics` returns the counts of all outputs of the
+    line. An output whose process is not `in_charge` of the line must not report the line's state. Where the process
+    only listens, `polls` is False.
     """
 
     bus: Bus
     authorisation: Authorisation
-    say: Callable[[str], None] = lambda _: None
+    report: Callable[[str], None] = lambda _: None
     commands: Mapping[str, Point[Any]]
     statistics: Callable[[], Sequence[OutputStatistics]] = tuple
     in_charge: bool = True

@@ -29,9 +29,9 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
         self,
         kind: str,
         settings: SpillingSettings,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, say)
+        super().__init__(kind, settings, report)
         self._batch: list[Formatted] = []
         self._sizes: list[int] = []
         """How many values each of the batch holds."""

@@ -56,7 +56,7 @@ class Wanted(NamedTuple):
 
 
 class Distributor:
-    """The outputs of one bus. `tell` is called, on the loop, with their events.
+    """The outputs of one bus. `report` is called, on the loop, with their events.
 
     `authorisation` checks the commands that they receive. Without `in_charge`, the state of the line is not reported,
     because another process may own it. With `asks` False, the line only listens, and only that and its samples are
@@ -66,13 +66,13 @@ class Distributor:
     def __init__(
         self,
         bus: Bus,
-        tell: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
         *,
         authorisation: Authorisation | None = None,
         in_charge: bool = True,
         asks: bool = True,
     ) -> None:
-        self.tell = tell
+        self.report = report
         self.authorisation = authorisation or Authorisation(bus)
         self._in_charge = in_charge
         self._asks = asks
@@ -125,7 +125,7 @@ class Distributor:
         for kind, output in leaving.items():
             counts = output.statistics()
             on_disk = f", {counts.spilled} kept on disk" if counts.spilled else ""
-            self.tell(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
+            self.report(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
 
     def record(self, write: WriteRecord) -> asyncio.Future[str] | None:
         """Offer an audit entry to all outputs.
@@ -206,14 +206,14 @@ class Distributor:
         lost = 0
         news = self._news[group] = News(ext.line_of(self._bus).is_outdated)
         async for snapshot in cycles:
-            told = news.of(snapshot)
+            selected = news.of(snapshot)
             for output in self._outputs:
                 if isinstance(snapshot, Outdated) and output.finds_outdated:
                     continue
                 if not output.groups or group.name in output.groups:
-                    output.suppress(len(snapshot) - len(told))
-                    if told:
-                        output.offer(told)
+                    output.suppress(len(snapshot) - len(selected))
+                    if selected:
+                        output.offer(selected)
                     # cycles for which the loop was too busy count as well
                     output.miss((cycles.dropped - lost) * len(group.points))
             lost = cycles.dropped
@@ -225,11 +225,11 @@ class Distributor:
                 for output in self._outputs:
                     output.offer(Happening(micros(self._bus.wall_time()), label_of(event), text))
 
-    def _say(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         """Pass a text from any thread to the loop; if the loop has ended, the text is discarded."""
         if self._loop is not None:
             try:
-                self._loop.call_soon_threadsafe(self.tell, text)
+                self._loop.call_soon_threadsafe(self.report, text)
             except RuntimeError:
                 pass
 
@@ -237,7 +237,7 @@ class Distributor:
         line = OutputLine(
             bus=self._bus,
             authorisation=self.authorisation,
-            say=self._say,
+            report=self._report,
             commands=commands,
             statistics=self.statistics,
             in_charge=self._in_charge,

@@ -13,7 +13,7 @@ ROUNDING = 1e-6
 """Seconds by which two moments of a grid may seem nearer to each other than they are."""
 
 
-class Told(NamedTuple):
+class Sent(NamedTuple):
     """The last reported value of a point, its due time, and the time of its request."""
 
     value: Any
@@ -34,7 +34,7 @@ class News:
 
     def __init__(self, outdated: Callable[[Point[Any], float], bool] = lambda *_: False) -> None:
         self._outdated = outdated
-        self._told: dict[Point[Any], Told] = {}
+        self._sent: dict[Point[Any], Sent] = {}
 
     def of(self, snapshot: Snapshot) -> Snapshot:
         """Return the cycle with only the values to report."""
@@ -50,21 +50,21 @@ class News:
 
     def forget(self) -> None:
         """Let everything be news once more."""
-        self._told.clear()
+        self._sent.clear()
 
     def _is_news(self, point: Point[Any], sample: Sample[Any], due: float) -> bool:
-        told, error = self._told.get(point), None if sample.error is None else type(sample.error)
+        sent, error = self._sent.get(point), None if sample.error is None else type(sample.error)
         heartbeat = point.meaning.heartbeat
         if (
-            told is not None
-            and (told.quality, told.error) == (sample.quality, error)
-            and (heartbeat is None or due - told.due < heartbeat - ROUNDING)
-            and not differs(told.value, sample.value, point.meaning.deadband or 0)
-            and not self._outdated(point, told.asked)
+            sent is not None
+            and (sent.quality, sent.error) == (sample.quality, error)
+            and (heartbeat is None or due - sent.due < heartbeat - ROUNDING)
+            and not differs(sent.value, sample.value, point.meaning.deadband or 0)
+            and not self._outdated(point, sent.asked)
         ):
             return False
         asked = sample.finished if sample.started is None else sample.started
-        self._told[point] = Told(sample.value, sample.quality, error, due, asked)
+        self._sent[point] = Sent(sample.value, sample.quality, error, due, asked)
         return True
 
 

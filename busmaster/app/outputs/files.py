@@ -27,16 +27,16 @@ class FileOutput(BatchOutput[bytes]):
         self,
         kind: str,
         settings: FileSettings,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, say)
+        super().__init__(kind, settings, report)
         check_folder(settings.path)
         self._file = GrowingFile(
             settings.path,
             mode=settings.mode,
             sync_every=settings.sync_every,
             head=self.head,
-            tell=lambda text: say(f"{kind}: {text}"),
+            report=lambda text: report(f"{kind}: {text}"),
         )
 
     def commit(self, batch: list[bytes]) -> None:
@@ -105,14 +105,14 @@ def value_cell(sample: Sample[Any]) -> str:
 CSV = OutputKind(
     name="csv",
     settings=FileSettings,
-    make=lambda settings, line: CsvOutput("csv", settings, line.say),
+    make=lambda settings, line: CsvOutput("csv", settings, line.report),
     about="Values as lines of a CSV file.",
     without=("audit",),
 )
 JSONL = OutputKind(
     name="jsonl",
     settings=FileSettings,
-    make=lambda settings, line: JsonlOutput("jsonl", settings, line.say),
+    make=lambda settings, line: JsonlOutput("jsonl", settings, line.report),
     about="Values and events as lines of JSON.",
     keeps_audit=True,
 )

@@ -18,7 +18,7 @@ from busmaster.ext import FOLDER_MODE, MODE, open_file
 class GrowingFile:
     """`pattern` may contain fields of a date, also in its folders, which are created. The umask narrows `mode`.
 
-    An empty file begins with `head`. `tell` is called with a sentence about changes by other programs.
+    An empty file begins with `head`. `report` is called with a sentence about changes by other programs.
     """
 
     def __init__(
@@ -28,13 +28,13 @@ class GrowingFile:
         mode: int = MODE,
         sync_every: float = 10.0,
         head: bytes = b"",
-        tell: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._pattern = pattern
         self._mode = mode
         self._sync_every = sync_every
         self._head = head
-        self._tell = tell
+        self._report = report
         self._path = ""
         self._descriptor: int | None = None
         self._synced = time.monotonic()
@@ -76,7 +76,7 @@ class GrowingFile:
             self.close()
             self._path = path
         if self._descriptor is not None and not is_at(path, self._descriptor):
-            self._tell(f"{path} was moved or removed; a new file was started")
+            self._report(f"{path} was moved or removed; a new file was started")
             self.close()
         if self._descriptor is None:
             self._descriptor = self._opened(path)
@@ -91,7 +91,7 @@ class GrowingFile:
         self._is_named = False
         if ends_in_a_half_line(path):
             os.write(descriptor, b"\n")  # else the first new line would continue the half one
-            self._tell(f"{path} ended with an incomplete line, which was closed")
+            self._report(f"{path} ended with an incomplete line, which was closed")
         return descriptor
 
     def _write(self, descriptor: int, lines: bytes) -> None:

@@ -134,14 +134,14 @@ class HomeAssistant:
         return self._config("binary_sensor", f"alarms/{topic_part(point.key)}", topic, fields)
 
     def _config(self, component: str, name: str, unique: str, fields: Mapping[str, Any]) -> Config:
-        told = {
+        payload = {
             **fields,
             "unique_id": f"busmaster/{unique}",
             "availability_mode": "all",
             "origin": {"name": "busmaster", "sw_version": version("busmaster")},
         }
         topic = f"{self._discovery}/{component}/{_name(self._prefix)}/{_name(name)}/config"
-        return Config(topic, json.dumps(told, ensure_ascii=False))
+        return Config(topic, json.dumps(payload, ensure_ascii=False))
 
     def _device(self, node: str) -> dict[str, Any]:
         line = self._line["identifiers"][0]

@@ -81,12 +81,12 @@ class MetricsOutput(Output):
         kind: str,
         settings: MetricsSettings,
         bus: Bus,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
         outputs: Callable[[], Sequence[OutputStatistics]] = tuple,
         refusals: Refusals | None = None,
     ) -> None:
         check_extra("prometheus_client", "metrics")
-        super().__init__(kind, settings, say)
+        super().__init__(kind, settings, report)
         self.port = settings.port
         """The port in use, if the configured one is 0."""
         self._host = settings.host
@@ -357,7 +357,7 @@ def add_histogram(family: HistogramMetricFamily, node: str, buckets: Sequence[tu
 
 def make(settings: MetricsSettings, line: OutputLine) -> MetricsOutput:
     """Make the output of a line."""
-    return MetricsOutput("metrics", settings, line.bus, line.say, line.statistics, line.authorisation.refusals)
+    return MetricsOutput("metrics", settings, line.bus, line.report, line.statistics, line.authorisation.refusals)
 
 
 def unsuitable(settings: MetricsSettings, group: str, points: Mapping[str, str]) -> Unsuitable | None:

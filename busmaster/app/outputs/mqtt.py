@@ -103,7 +103,7 @@ class MqttOutput(SpillingOutput):
         kind: str,
         settings: MqttSettings,
         bus: Bus,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
         *,
         commands: Mapping[str, Point[Any]] | None = None,
         authorisation: Authorisation | None = None,
@@ -111,7 +111,7 @@ class MqttOutput(SpillingOutput):
         asks: bool = True,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
-        super().__init__(kind, settings, say)
+        super().__init__(kind, settings, report)
         self._settings = settings
         self._secrets = secrets(settings)
         self._bus = bus
@@ -224,7 +224,7 @@ class MqttOutput(SpillingOutput):
         broker = f"{self._settings.host}:{self._settings.port}"
         async with AsyncExitStack() as stack:
             unconnected = self._client()
-            stack.callback(self._arriving.tell_unanswered)  # at the very end
+            stack.callback(self._arriving.report_unanswered)  # at the very end
             try:
                 client = await stack.enter_async_context(unconnected)
             except aiomqtt.MqttCodeError as error:
@@ -247,7 +247,7 @@ class MqttOutput(SpillingOutput):
             self._authorisation,
             self._commands,
             self._bus.now,
-            lambda text: self._say(f"{self.kind}: {text}"),
+            lambda text: self._report(f"{self.kind}: {text}"),
         )
         client = aiomqtt.Client(
             settings.host,
@@ -487,7 +487,7 @@ def make(settings: MqttSettings, line: OutputLine) -> MqttOutput:
         "mqtt",
         settings,
         line.bus,
-        line.say,
+        line.report,
         commands=line.commands,
         authorisation=line.authorisation,
         in_charge=line.in_charge,

@@ -29,7 +29,7 @@ LEAST = 5
 """Bytes of a message beside its topic and its payload, at least."""
 BREATH = 0.005
 """Seconds between two replies to refused commands: a flood of them costs the line nothing."""
-TOLD_EVERY = 10.0
+REPORT_EVERY = 10.0
 """Minimum number of seconds between two messages about refusals that were only counted."""
 EXPIRY = "MessageExpiryInterval"
 PROPERTIES = "UserProperty"
@@ -54,13 +54,13 @@ class Answer(NamedTuple):
 
 
 Write: TypeAlias = Callable[[WriteRequest], Awaitable[WriteRecord]]
-Say: TypeAlias = Callable[[Answer], Awaitable[None]]
+Reply: TypeAlias = Callable[[Answer], Awaitable[None]]
 
 
 class Commands:
     """The permitted points, by topic, and the queue of commands. All of it is on the thread of the output.
 
-    `tell` is called with the number of commands that were refused without a reply.
+    `report` is called with the number of commands that were refused without a reply.
     """
 
     def __init__(
@@ -69,13 +69,13 @@ class Commands:
         authorisation: Authorisation,
         points: Mapping[str, Point[Any]],
         now: Callable[[], float],
-        tell: Callable[[str], object] = lambda _: None,
+        report: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.refused = 0
         """Refused commands, including those without a reply."""
         self.unanswered = 0
         self.queued: deque[WriteRequest] = deque()
-        self._tell = tell
+        self._report = report
         self._asked = f"{prefix}/set/"
         self._authorisation = authorisation
         self._points = points
@@ -89,7 +89,7 @@ class Commands:
         self._answers: deque[tuple[WriteRequest, Answer]] = deque()
         self._answering = 0
         """Commands that are neither waiting nor answered yet."""
-        self._told = 0
+        self._reported = 0
         self._closed = False
         self._something = asyncio.Event()
 
@@ -135,12 +135,12 @@ class Commands:
         self._something.set()
 
     def _read(self, request: WriteRequest, message: Message | MQTTMessage) -> WriteRequest:
-        said = read_payload(message.payload)
-        ends = [] if said.expires is None else [said.expires]
+        payload = read_payload(message.payload)
+        ends = [] if payload.expires is None else [payload.expires]
         interval = getattr(message.properties, EXPIRY, None)
         if interval is not None:
             ends.append(time.time() - (self._now() - self._looked) + interval)
-        return replace(request, value=said.value, expires=min(ends, default=None), id=said.id)
+        return replace(request, value=payload.value, expires=min(ends, default=None), id=payload.id)
 
     def _refuse(self, request: WriteRequest, name: str, error: str) -> None:
         if len(self._answers) < MOST_COMMANDS:
@@ -154,7 +154,7 @@ class Commands:
         self.unanswered += 1
 
     async def serve(
-        self, write: Write, keep: Callable[[WriteRequest, str], object], say: Say, unread: Callable[[], int]
+        self, write: Write, keep: Callable[[WriteRequest, str], object], reply: Reply, unread: Callable[[], int]
     ) -> None:
         """Write the permitted commands and reply to all, until cancelled.
 
@@ -162,10 +162,10 @@ class Commands:
         """
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._keep_looking, unread)
-            tasks.start_soon(self._answer_refusals, keep, say)
-            tasks.start_soon(self._keep_telling)
+            tasks.start_soon(self._answer_refusals, keep, reply)
+            tasks.start_soon(self._report_regularly)
             for _ in range(MOST_AT_ONCE):
-                tasks.start_soon(self._obey, write, say)
+                tasks.start_soon(self._obey, write, reply)
 
     def look(self, unread: int) -> None:
         """Store the present time for the unread bytes: messages after them arrive later.
@@ -183,23 +183,23 @@ class Commands:
             self.look(unread())
             await anyio.sleep(LOOK)
 
-    async def _obey(self, write: Write, say: Say) -> None:
+    async def _obey(self, write: Write, reply: Reply) -> None:
         while True:
             if self.queued:
                 request = self.queued.popleft()
                 with self._one_more():
                     record = await write(request)
-                    await say(Answer(request.name, record.ok, record.error, request.id))
+                    await reply(Answer(request.name, record.ok, record.error, request.id))
             else:
                 await self._wait()
 
-    async def _answer_refusals(self, keep: Callable[[WriteRequest, str], object], say: Say) -> None:
+    async def _answer_refusals(self, keep: Callable[[WriteRequest, str], object], reply: Reply) -> None:
         while True:
             if self._answers:
                 request, answer = self._answers.popleft()
                 with self._one_more():
                     keep(request, answer.error)
-                    await say(answer)
+                    await reply(answer)
                 await anyio.sleep(BREATH)
             else:
                 await self._wait()
@@ -227,16 +227,16 @@ class Commands:
         self.queued.clear()
         self._answers.clear()
 
-    async def _keep_telling(self) -> None:
+    async def _report_regularly(self) -> None:
         while True:
-            await anyio.sleep(TOLD_EVERY)
-            self.tell_unanswered()
+            await anyio.sleep(REPORT_EVERY)
+            self.report_unanswered()
 
-    def tell_unanswered(self) -> None:
+    def report_unanswered(self) -> None:
         """Report the number of refusals that were only counted, if there are new ones."""
-        if self.unanswered > self._told:
-            self._tell(f"{self.unanswered - self._told} refused commands got neither a reply nor an audit entry")
-            self._told = self.unanswered
+        if self.unanswered > self._reported:
+            self._report(f"{self.unanswered - self._reported} refused commands got neither a reply nor an audit entry")
+            self._reported = self.unanswered
 
     async def _wait(self) -> None:
         self._something.clear()
@@ -252,8 +252,8 @@ def _as_it_came(payload: bytes | bytearray) -> str:
 
 def _sender(topic: str, message: Message | MQTTMessage) -> str:
     """Return the source of a command: its topic, and the name in its user property, which is not verified."""
-    said = dict(getattr(message.properties, PROPERTIES, ())).get(SENDER, "")[:LONGEST_SENDER]
-    return f"{topic}, sender {said!r} (not verified)" if said else topic
+    sender = dict(getattr(message.properties, PROPERTIES, ())).get(SENDER, "")[:LONGEST_SENDER]
+    return f"{topic}, sender {sender!r} (not verified)" if sender else topic
 
 
 class Inbox(asyncio.Queue["Message"]):

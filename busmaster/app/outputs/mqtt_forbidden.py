@@ -65,9 +65,9 @@ class Forbidden:
             self._client.tls_set_context(tls)
         self._client.on_connect = self._ask
         self._client.on_message = self._hear
-        self._client.on_subscribe = lambda *_: self._tell(partial(_done, self._subscribed))
-        self._client.on_unsubscribe = lambda *_: self._tell(partial(_done, self._unsubscribed))
-        self._client.on_disconnect = lambda *_: self._tell(partial(_done, self.lost))
+        self._client.on_subscribe = lambda *_: self._run_on_loop(partial(_done, self._subscribed))
+        self._client.on_unsubscribe = lambda *_: self._run_on_loop(partial(_done, self._unsubscribed))
+        self._client.on_disconnect = lambda *_: self._run_on_loop(partial(_done, self.lost))
 
     async def begin(self, keep_alive: int, within: float) -> None:
         """Return when the subscription is active. Raises OSError, including ConnectionError, if that fails."""
@@ -96,10 +96,10 @@ class Forbidden:
 
     def _hear(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
         if message.topic not in self._allowed:
-            self._tell(partial(self._take, message))
+            self._run_on_loop(partial(self._take, message))
         self._over.wait(REST)  # it is acknowledged when this returns
 
-    def _tell(self, call: Callable[[], object]) -> None:
+    def _run_on_loop(self, call: Callable[[], object]) -> None:
         with suppress(RuntimeError):  # that loop has ended
             self._loop.call_soon_threadsafe(call)
 

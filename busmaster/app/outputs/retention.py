@@ -26,11 +26,11 @@ class Retention:
     """
 
     def __init__(
-        self, days: float | None, megabytes: float | None, tell: Callable[[str], None] = lambda _: None
+        self, days: float | None, megabytes: float | None, report: Callable[[str], None] = lambda _: None
     ) -> None:
         self._days = days
         self._bytes = None if megabytes is None else megabytes * MEGABYTE
-        self._tell = tell
+        self._report = report
         self._next = 0.0
         self._offset: float | None = None
         self._believed_from = 0.0
@@ -67,7 +67,7 @@ class Retention:
 
     def _doubt(self, why: str, now: float) -> None:
         self._believed_from = now + STEADY
-        self._tell(f"{why}; nothing is deleted for a day")
+        self._report(f"{why}; nothing is deleted for a day")
 
 
 def delete_older(database: sqlite3.Connection, table: str, moment: float) -> int:

@@ -98,20 +98,20 @@ class _Server:
 
     async def _reply(self, head: str) -> bytes:
         first, *lines = head.split("\r\n")
-        said = {name.strip().lower(): text.strip() for name, _, text in (line.partition(":") for line in lines)}
+        fields = {name.strip().lower(): text.strip() for name, _, text in (line.partition(":") for line in lines)}
         words = first.split()
         if len(words) != 3 or not words[2].startswith("HTTP/"):
             return response("400 Bad Request", "text/plain", b"this is not HTTP\n")
         if words[0] not in ("GET", "HEAD"):
             return response("405 Method Not Allowed", "text/plain", b"only GET is answered\n", Allow="GET, HEAD")
         try:
-            content_type, text = await self._page(said.get("accept", ""))
+            content_type, text = await self._page(fields.get("accept", ""))
         except TimeoutError:
             return response(BUSY, "text/plain", b"the line's loop is busy\n")
         except Exception as error:
             return response("500 Internal Server Error", "text/plain", f"{error!r}\n".encode())
         encoding: dict[str, str] = {}
-        if "gzip" in said.get("accept-encoding", ""):
+        if "gzip" in fields.get("accept-encoding", ""):
             text, encoding = gzip.compress(text, 1), {"Content-Encoding": "gzip"}
         answer = response("200 OK", content_type, text, **encoding)
         return answer if words[0] == "GET" else answer[: answer.index(b"\r\n\r\n") + 4]
@@ -128,6 +128,6 @@ class _Server:
 
 def response(status: str, content_type: str, body: bytes, **headers: str) -> bytes:
     """Return an HTTP message after which the connection ends."""
-    said = {"Content-Type": content_type, "Content-Length": str(len(body)), "Connection": "close", **headers}
-    lines = [f"HTTP/1.1 {status}", *(f"{name}: {text}" for name, text in said.items())]
+    fields = {"Content-Type": content_type, "Content-Length": str(len(body)), "Connection": "close", **headers}
+    lines = [f"HTTP/1.1 {status}", *(f"{name}: {text}" for name, text in fields.items())]
     return "\r\n".join([*lines, "", ""]).encode() + body

@@ -25,8 +25,8 @@ SPILL_EVERY = 0.2
 class SpillingOutput(Output):
     """An output with a spool, if its settings name one. All of it is on the output's thread."""
 
-    def __init__(self, kind: str, settings: SpillingSettings, say: Callable[[str], None] = lambda _: None) -> None:
-        super().__init__(kind, settings, say)
+    def __init__(self, kind: str, settings: SpillingSettings, report: Callable[[str], None] = lambda _: None) -> None:
+        super().__init__(kind, settings, report)
         self._mode = settings.mode
         self._spill = settings.spill
         self._most_spilled = settings.spill_values
@@ -53,7 +53,7 @@ class SpillingOutput(Output):
     def succeed(self, before: Output) -> None:
         super().succeed(before)
         if isinstance(before, SpillingOutput) and before.spilled and before._spill != self._spill:
-            self._say(f"{self.kind}: {before.spilled} values stay in {before._spill}, which is not used any more")
+            self._report(f"{self.kind}: {before.spilled} values stay in {before._spill}, which is not used any more")
 
     def open_spool(self) -> None:
         """Open the spool, and count its items. An output begins its work with this.
@@ -68,14 +68,14 @@ class SpillingOutput(Output):
                 self._spill,
                 self._most_spilled,
                 self.kind,
-                lambda text: self._say(f"{self.kind}: {text}"),
+                lambda text: self._report(f"{self.kind}: {text}"),
                 mode=self._mode,
                 strict=self.is_strict,
             )
         except InvalidCommand as error:
             if os.path.isfile(self._spill) and os.path.getsize(self._spill):
                 raise
-            self._tell_once(str(error))
+            self._report_once(str(error))
         else:
             self.spilled = self._spool.values  # first: the line's loop must never take it for more in memory
             self.found += self._spool.values
@@ -92,7 +92,7 @@ class SpillingOutput(Output):
             try:
                 lost = self._spool.put(self.records())
             except sqlite3.Error as error:
-                self._tell_once(f"{self._spill}: {error}")
+                self._report_once(f"{self._spill}: {error}")
                 return
             self.lost += lost  # first, for the same reason
             self.spilled += self.let_go() - lost
@@ -124,7 +124,7 @@ class SpillingOutput(Output):
             if self._spool is not None:
                 self._spool.close()
 
-    def _tell_once(self, error: str) -> None:
+    def _report_once(self, error: str) -> None:
         if error != self._spool_error:
             self._spool_error = error
-            self._say(f"{self.kind}: {error}")
+            self._report(f"{self.kind}: {error}")

@@ -29,9 +29,9 @@ class Record(NamedTuple):
 class Spool:
     """Holds at most `most` values for one kind of output.
 
-    Raises InvalidCommand if it cannot be created, if another process has it, and for a file with other contents. `say`
-    is called if an existing file is damaged, which is moved aside and not deleted. With `strict`, items survive a loss
-    of power at once.
+    Raises InvalidCommand if it cannot be created, if another process has it, and for a file with other contents.
+    `report` is called if an existing file is damaged, which is moved aside and not deleted. With `strict`, items
+    survive a loss of power at once.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Spool:
         path: str,
         most: int,
         kind: str,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
         *,
         mode: int = MODE,
         strict: bool = False,
@@ -53,7 +53,7 @@ class Spool:
                 if not is_damaged(error):  # for example held by another process
                     raise
                 aside = move_aside(path)
-                say(f"{path}: {error}: it is kept as {aside}, and begun anew")
+                report(f"{path}: {error}: it is kept as {aside}, and begun anew")
                 self._database = _opened(path, kind, mode, strict)
             self.values: int = self._database.execute("select coalesce(sum(count), 0) from waiting").fetchone()[0]
         except sqlite3.OperationalError as error:

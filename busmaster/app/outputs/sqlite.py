@@ -101,13 +101,13 @@ class SqliteOutput(BatchOutput[Rows]):
         self,
         kind: str,
         settings: SqliteSettings,
-        say: Callable[[str], None] = lambda _: None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, say)
+        super().__init__(kind, settings, report)
         check_folder(settings.path)
         self._path = settings.path
-        self._tell: Callable[[str], None] = lambda text: say(f"{kind}: {text}")
-        self._retention = Retention(settings.keep_days, settings.keep_mb, self._tell)
+        self._report_event: Callable[[str], None] = lambda text: report(f"{kind}: {text}")
+        self._retention = Retention(settings.keep_days, settings.keep_mb, self._report_event)
         self._database: sqlite3.Connection | None = None
         self._file: int | None = None
         """The database's file, to see whether it is still where it was. Closed after it: closing gives up all locks."""
@@ -143,12 +143,14 @@ class SqliteOutput(BatchOutput[Rows]):
                 raise
             self.shut()
             aside = move_aside(self._path)
-            self._tell(f"{self._path} is damaged ({error}); it was moved to {aside}, and a new file was started")
+            self._report_event(
+                f"{self._path} is damaged ({error}); it was moved to {aside}, and a new file was started"
+            )
             self._write(batch)
 
     def _write(self, batch: list[Rows]) -> None:
         if self._file is not None and not is_at(self._path, self._file):
-            self._tell(f"{self._path} was moved or removed; a new file was started")
+            self._report_event(f"{self._path} was moved or removed; a new file was started")
             self._leave()
         database = self._open()
         # With "full" the log is on the disk when a transaction ends; with "normal", some time after that.
@@ -256,7 +258,7 @@ def column(value: Any) -> Any:
 SQLITE = OutputKind(
     name="sqlite",
     settings=SqliteSettings,
-    make=lambda settings, line: SqliteOutput("sqlite", settings, line.say),
+    make=lambda settings, line: SqliteOutput("sqlite", settings, line.report),
     about="Values and events in a database: the tables points, samples and events, and the view history.",
     keeps_audit=True,
 )

@@ -109,7 +109,7 @@ class RemoteGroup(Cycles):
             if not self._own:
                 self._points = tuple(owners_point_of(said, self._find) for said in body["points"])
         elif method == "snapshot" and body["set"] == self._set:
-            self._tell(snapshot_of(body, self.name, self._points))
+            self._publish(snapshot_of(body, self.name, self._points))
         elif method == "ended":
             self.close()
 

@@ -99,13 +99,13 @@ async def test_on_hovering_an_exchange_says_what_was_said_and_the_arrow_keys_go_
         await asyncio.to_thread(browser.run, "document.getElementById('wire-canvas').focus()")
         await asyncio.to_thread(exchanges_are_drawn, browser)
         await asyncio.to_thread(browser.press, LEFT)
-        await says(browser, "#wire-said", "read ")
-        text = await asyncio.to_thread(browser.text, "#wire-said")
+        await says(browser, "#wire-text", "read ")
+        text = await asyncio.to_thread(browser.text, "#wire-text")
         assert "→" in text
         assert "first byte after" in text
         assert await asyncio.to_thread(browser.text, "#hold") == "Go on"  # it holds still while it is read
         await asyncio.to_thread(browser.press, LEFT)
-        await asyncio.to_thread(browser.until, "document.getElementById('wire-said').textContent !== given[0]", text)
+        await asyncio.to_thread(browser.until, "document.getElementById('wire-text').textContent !== given[0]", text)
         found = await asyncio.to_thread(
             browser.run,
             """

@@ -36,7 +36,7 @@ class Owner:
 
 @pytest.mark.asyncio
 async def test_each_refusal_is_reported_once_and_kept_while_the_owner_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reported_refusals, "TELL_EVERY", 0.0)
+    monkeypatch.setattr(reported_refusals, "REPORT_EVERY", 0.0)
     owner = Owner()
     refusals = ReportedRefusals("modbus-tcp", cast("Following", cast("Any", owner)), "connections", "requests")
     refusals.note("requests", "10.0.0.1")

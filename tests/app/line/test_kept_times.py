@@ -58,7 +58,7 @@ def kept(tmp_path: Path) -> Path:
 
 def opened(text: str, told: Callable[[str], None] = lambda _: None) -> ConfiguredLine:
     file = read(Source("line.toml", text))
-    return ConfiguredLine(file, port=MemoryPort(emulated_line(file)), tell=told)
+    return ConfiguredLine(file, port=MemoryPort(emulated_line(file)), report=told)
 
 
 def trusted(line: ConfiguredLine) -> set[str]:

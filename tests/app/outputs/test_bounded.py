@@ -16,8 +16,8 @@ from tests.patience import PATIENCE
 class Shelf(BatchOutput[Item]):
     """Puts everything into a list, when it is let."""
 
-    def __init__(self, buffer: int = 100, say: Callable[[str], None] = lambda _: None) -> None:
-        super().__init__("shelf", SpillingSettings(buffer=buffer), say=say)
+    def __init__(self, buffer: int = 100, report: Callable[[str], None] = lambda _: None) -> None:
+        super().__init__("shelf", SpillingSettings(buffer=buffer), report=report)
         self.shelf: list[Item] = []
         self.let = threading.Event()
         self.let.set()
@@ -89,7 +89,7 @@ def test_offering_never_waits_for_the_thread() -> None:
 
 def test_what_failed_is_written_when_it_works_again_and_both_are_told() -> None:
     said: list[str] = []
-    output = Shelf(say=said.append)
+    output = Shelf(report=said.append)
     output._retry = 0.01
     output.broken = OSError(28, "No space left on device", "/disk/x")
     output.start()

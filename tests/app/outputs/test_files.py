@@ -128,7 +128,7 @@ def test_a_folder_that_is_not_there_is_said_before_anything_starts(tmp_path: Pat
 def test_a_file_that_was_moved_away_or_removed_is_begun_anew_and_that_is_told(tmp_path: Path) -> None:
     path = tmp_path / "x.jsonl"
     told: list[str] = []
-    output = JsonlOutput("jsonl", FileSettings(path=str(path)), say=told.append)
+    output = JsonlOutput("jsonl", FileSettings(path=str(path)), report=told.append)
     output.commit([b"first\n"])
     path.rename(tmp_path / "x.jsonl.1")
     output.commit([b"second\n"])
@@ -174,7 +174,7 @@ def test_a_half_line_that_a_crash_left_is_closed_off_and_that_is_told(tmp_path: 
     path = tmp_path / "x.jsonl"
     path.write_bytes(b'{"whole": 1}\n{"half')
     told: list[str] = []
-    output = JsonlOutput("jsonl", FileSettings(path=str(path)), say=told.append)
+    output = JsonlOutput("jsonl", FileSettings(path=str(path)), report=told.append)
     output.commit([b"{}\n"])
     output.shut()
     assert written(path) == ['{"whole": 1}', '{"half', "{}"]

@@ -58,11 +58,11 @@ def emulated(handle: type[Hcp2Controller], address: int) -> Bus:
 
 @asynccontextmanager
 async def publishing(
-    broker: Broker, bus: Bus = BUS, say: Callable[[str], None] = lambda _: None, **options: Any
+    broker: Broker, bus: Bus = BUS, report: Callable[[str], None] = lambda _: None, **options: Any
 ) -> AsyncIterator[Seen]:
     commands = options.pop("commands", {})
     settings = MqttSettings(port=broker.port, prefix="line", **options)
-    output = Seen("mqtt", settings, bus, say, commands=commands)
+    output = Seen("mqtt", settings, bus, report, commands=commands)
     output._retry = 0.02
     output.start()
     try:
@@ -162,7 +162,7 @@ async def test_a_broker_that_is_down_for_a_while_costs_nothing(broker: Broker) -
     said: list[str] = []
     async with listening(broker, "line/values/#", **session):
         pass
-    async with publishing(broker, say=said.append) as output:
+    async with publishing(broker, report=said.append) as output:
         for number in range(1, 31):
             output.offer(cycle(number, float(number)))
             if number == 10:

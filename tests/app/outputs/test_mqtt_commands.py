@@ -462,7 +462,7 @@ def test_a_flood_does_not_make_what_comes_behind_it_look_old() -> None:
 
 @pytest.mark.asyncio
 async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mqtt_commands, "TOLD_EVERY", 0.01)
+    monkeypatch.setattr(mqtt_commands, "REPORT_EVERY", 0.01)
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
     authorisation = Authorisation(bus)
     said: asyncio.Queue[str] = asyncio.Queue()

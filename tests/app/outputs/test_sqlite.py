@@ -362,7 +362,7 @@ def test_a_database_that_was_moved_keeps_what_it_has_and_another_is_begun(
     path, aside = tmp_path / "x.db", tmp_path / "old.db"
     said: list[str] = []
     with recording(path) as output:
-        output._tell = said.append
+        output._report_event = said.append
         output.offer(cycle(1, 1.0))
         until(lambda: settled(output))
         for ending in endings:

@@ -125,20 +125,20 @@ class EdgeLine(WatchedLine):
         again = self._received_again[0][0] if self._received_again else inf
         return min(super().next_event(), again)
 
-    def _say(self, talker: Device | None, start: float, data: bytes) -> None:
+    def _transmit(self, talker: Device | None, start: float, data: bytes) -> None:
         if talker is None:
-            super()._say(talker, start, data)
+            super()._transmit(talker, start, data)
         elif self.second and self._own.random() < self.second:
-            super()._say(talker, start, data)
+            super()._transmit(talker, start, data)
             end = start + len(data) * self.tau
-            super()._say(talker, end + self._own.uniform(0.0, self.kind.max_reply_delay), data)
+            super()._transmit(talker, end + self._own.uniform(0.0, self.kind.max_reply_delay), data)
         elif self._double:
             self._double = False
-            super()._say(talker, start, data)
-            super()._say(talker, start + len(data) * self.tau + self._own.uniform(*AFTERWARDS), data)
+            super()._transmit(talker, start, data)
+            super()._transmit(talker, start + len(data) * self.tau + self._own.uniform(*AFTERWARDS), data)
             self.on_doubled()
         elif self.edges is None:
-            super()._say(talker, start, data)
+            super()._transmit(talker, start, data)
         else:
             self._strike(self.edges, talker, start, data)
 
@@ -146,7 +146,7 @@ class EdgeLine(WatchedLine):
         own = self._own
         if len(data) == 1:
             if data != ACK or own.random() >= edges.acks_lost:
-                super()._say(talker, start, data)
+                super()._transmit(talker, start, data)
             return
         pushed = own.random() < edges.pushed
         cut = len(data) - 1 if pushed else own.randrange(1, len(data))

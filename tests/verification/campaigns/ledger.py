@@ -285,7 +285,7 @@ class WatchedLine(Line):
             if spoken.asked_at < end:
                 yield spoken
 
-    def _say(self, talker: Device | None, start: float, data: bytes) -> None:
+    def _transmit(self, talker: Device | None, start: float, data: bytes) -> None:
         if talker is not None:
             self.tell(talker, start, start + len(data) * self.tau, data)
         self.put(talker, start, data)
@@ -308,7 +308,7 @@ class WatchedLine(Line):
     def put(self, talker: Device | None, start: float, data: bytes) -> None:
         """Put it on the wire, with the faults that strike there."""
         self._said = data
-        super()._say(talker, start, data)
+        super()._transmit(talker, start, data)
 
     def _join(self, talk: Talk) -> None:
         if not talk.clean and self._said not in talk.data:

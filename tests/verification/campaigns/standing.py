@@ -161,10 +161,10 @@ class StandingWorld(World):
             self._unread += self.line.receive(self.now)
         self.now = end
 
-    def _say(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         """The driver takes it, late perhaps, and says when it has."""
         if self._own.random() < self._stands.process:
             self._stand_still()
-        super()._say(data)
+        super()._send(data)
         if self.plugged:
             self.arbiter.transmitted(self.now)

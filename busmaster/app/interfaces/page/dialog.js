@@ -54,16 +54,16 @@ export class PointDialog {
   }
 
   async load(row) {
-    let said;
+    let answer;
     try {
-      said = await (await fetch(path_of(row))).json();
+      answer = await (await fetch(path_of(row))).json();
     } catch {
       return;
     }
-    if (this.row !== row || !said.details) return;
-    this.details = said.details;
-    by("write-limits").textContent = limits_text(said.details, row.unit);
-    field.inputMode = Object.keys(said.details.labels ?? {}).length ? "text" : "decimal";
+    if (this.row !== row || !answer.details) return;
+    this.details = answer.details;
+    by("write-limits").textContent = limits_text(answer.details, row.unit);
+    field.inputMode = Object.keys(answer.details.labels ?? {}).length ? "text" : "decimal";
     this.draw();
   }
 
@@ -83,9 +83,9 @@ export class PointDialog {
     if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", alarms_text(this.details, row)]);
     if (row.error) facts.push(["last cycle", row.error + (this.details?.hint ? `; ${this.details.hint}` : "")]);
     const text = JSON.stringify(facts);
-    if (text === this.told) return;
-    this.told = text;
-    by("point-facts").replaceChildren(...facts.flatMap(([name, said]) => [element("dt", name), element("dd", said)]));
+    if (text === this.shown) return;
+    this.shown = text;
+    by("point-facts").replaceChildren(...facts.flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   }
 
   ask(value) {
@@ -121,8 +121,8 @@ export class PointDialog {
     if (by("token").value) headers.Authorization = `Bearer ${by("token").value}`;
     try {
       const answer = await fetch(path_of(row), { method: "PUT", headers, body: JSON.stringify({ value }) });
-      const said = await answer.json();
-      this.outcome(answer.ok ? `${value} ${row.unit} was written.` : said.what, answer.ok ? "good" : "bad");
+      const result = await answer.json();
+      this.outcome(answer.ok ? `${value} ${row.unit} was written.` : result.what, answer.ok ? "good" : "bad");
     } catch {
       this.outcome("The program of this page did not reply: the write may have been sent. Read the value before you write again.", "bad");
     } finally {
@@ -143,9 +143,9 @@ function path_of(row, what = "points") {
 }
 
 function typed(text) {
-  const said = text.trim();
-  if (!said) return null;
-  return /^[-+]?(\d+[.,]?\d*|[.,]\d+)(e[-+]?\d+)?$/i.test(said) ? Number(said.replace(",", ".")) : said;
+  const entry = text.trim();
+  if (!entry) return null;
+  return /^[-+]?(\d+[.,]?\d*|[.,]\d+)(e[-+]?\d+)?$/i.test(entry) ? Number(entry.replace(",", ".")) : entry;
 }
 
 // Numbers have limits. What is shown as a text and has a limit all the same is a bit.
@@ -171,7 +171,7 @@ function limits_text(details, unit) {
   }).filter(Boolean).map((text) => `Limits: ${text}.`).join(" ");
 }
 
-// The line refuses it all the same; here it is said before anything is sent.
+// The line refuses it all the same; here the user is told before anything is sent.
 function beyond(value, details) {
   for (const limit of details?.limits ?? []) {
     if (!limit.writable) return "The line's file does not permit writes to this point.";

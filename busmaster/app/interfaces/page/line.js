@@ -1,4 +1,4 @@
-// What is known of the line: put together of what its owner says, in whatever order that comes.
+// What is known of the line: put together from the messages of its owner, in any order.
 
 const KEPT = 240; // values of a point, for its trend
 
@@ -15,7 +15,7 @@ export class Line {
     this.drawn = performance.now();
   }
 
-  hear({ method, body }) {
+  take({ method, body }) {
     switch (method) {
       case "state":
         if (body.connected && !this.state.connected) this.set = 0; // another owner, perhaps: it counts anew
@@ -24,7 +24,7 @@ export class Line {
       case "frame":
         this.begin(body.set);
         this.frame = body;
-        this.heard = performance.now();
+        this.received = performance.now();
         break;
       case "rows":
         this.begin(body.set);
@@ -66,8 +66,8 @@ export class Line {
     }
   }
 
-  takeRows(first, said) {
-    this.parts.set(first, said.map((row, number) => {
+  takeRows(first, rows) {
+    this.parts.set(first, rows.map((row, number) => {
       const name = JSON.stringify([row.group, row.protocol, row.address, row.key, row.unit]);
       const before = this.known.get(name);
       this.known.delete(name); // two points may be called alike
@@ -95,8 +95,8 @@ export class Line {
   get all_groups() { return in_order(this.groups).slice(0, this.frame?.groups ?? 0); }
   get all_nodes() { return in_order(this.nodes).slice(0, this.frame?.nodes ?? 0); }
 
-  // The line's time now: of its owner's clock, as it was last told.
-  get now() { return this.frame ? this.frame.now + (this.state.connected ? (performance.now() - this.heard) / 1000 : 0) : 0; }
+  // The line's time now: its owner's clock, as last received.
+  get now() { return this.frame ? this.frame.now + (this.state.connected ? (performance.now() - this.received) / 1000 : 0) : 0; }
 }
 
 function in_order(parts) {
@@ -107,7 +107,7 @@ function kept({ past, value, quality, asked, error, alarm }) {
   return { past, value, quality, asked, error, alarm };
 }
 
-// A number that JSON does not have is said as {"float": "nan"}.
+// A number that JSON does not have is sent as {"float": "nan"}.
 function plain(value) {
   return value !== null && typeof value === "object" && "float" in value ? value.float : value;
 }

@@ -1,4 +1,4 @@
-// The page: it is told what changes by a WebSocket, and draws that at most once a frame.
+// The page: it receives changes by a WebSocket, and draws at most once per frame.
 
 import { Line, milliseconds, shown } from "./line.js";
 import { PointDialog } from "./dialog.js";
@@ -15,12 +15,12 @@ const OUT_OF_SIGHT_EVERY = 1000; // milliseconds: rows that are scrolled away ar
 const LONG_TEXT = 14; // characters of a text that fit beside unit and trend
 const by = (id) => document.getElementById(id);
 const line = new Line();
-const wire = new Wire(by("wire-canvas"), by("tip"), by("wire-said"));
+const wire = new Wire(by("wire-canvas"), by("tip"), by("wire-text"));
 const shown_rows = new Map();
 let may = { read_only: true, wants_token: false, history: false };
 let asked_what_may_be = false; // until then it is not known whether the page is read-only
 let connected = false;
-let stale = true; // something was heard since it was drawn
+let stale = true; // something was received since it was drawn
 let known = false; // the first picture of the line was complete
 let wire_in_sight = true;
 let wire_drawn = -WIRE_EVERY, values_drawn = -VALUES_EVERY, all_drawn = 0; // when, in milliseconds
@@ -34,7 +34,7 @@ function colours() {
 
 const dialog = new PointDialog(colours);
 
-// what is heard
+// received messages
 
 function connect() {
   const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/stream`);
@@ -42,10 +42,10 @@ function connect() {
   socket.onopen = () => { connected = true; stale = true; look(); };
   document.addEventListener("visibilitychange", look);
   socket.onmessage = ({ data }) => {
-    const said = JSON.parse(data);
-    if (said.method === "exchanges") wire.hear(said.body);
-    else line.hear(said);
-    if (said.method === "state") { ask_what_may_be(); wire.clear(); }
+    const message = JSON.parse(data);
+    if (message.method === "exchanges") wire.take(message.body);
+    else line.take(message);
+    if (message.method === "state") { ask_what_may_be(); wire.clear(); }
     stale = true;
   };
   socket.onclose = () => {
@@ -365,7 +365,7 @@ by("span").addEventListener("change", ({ target }) => { wire.span = Number(targe
 by("find").addEventListener("input", () => { stale = true; });
 addEventListener("resize", () => { for (const cells of shown_rows.values()) cells.drawn = null; stale = true; });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stale = true; });
-setInterval(() => { stale = true; }, 1000); // ages go on while nothing is heard
+setInterval(() => { stale = true; }, 1000); // ages increase while nothing is received
 
 ask_what_may_be();
 connect();

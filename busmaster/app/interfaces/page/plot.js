@@ -105,18 +105,18 @@ export class Plot {
     this.asked = this.now();
     this.loading = number;
     const limit = Math.min(Math.max(Math.round(this.canvas.clientWidth), 100), MOST_PARTS);
-    let said, ok = false;
+    let answer, ok = false;
     try {
       const reply = await fetch(`${path}?from=${this.begin}&to=${this.end}&limit=${limit}`);
-      said = await reply.json();
+      answer = await reply.json();
       ok = reply.ok;
     } catch {
-      said = { what: "The program of this page did not reply." };
+      answer = { what: "The program of this page did not reply." };
     }
     if (number === this.loading) this.loading = 0;
     if (number !== this.requested) return; // the plot has moved, or shows another point
-    this.failed = ok ? "" : said.what;
-    if (ok) this.loaded = said;
+    this.failed = ok ? "" : answer.what;
+    if (ok) this.loaded = answer;
     this.draw();
   }
 
@@ -183,7 +183,7 @@ export class Plot {
       for (const value of new Set([found[2], found[3]])) if (value !== null) { pen.beginPath(); pen.arc(x((found[0] + found[1]) / 2), y(value), 4, 0, 7); pen.fill(); }
     }
     pen.restore();
-    this.tell(inside, found);
+    this.describe(inside, found);
   }
 
   draw_values(pen, parts, x, y) {
@@ -226,7 +226,7 @@ export class Plot {
     }
   }
 
-  tell(inside, found) {
+  describe(inside, found) {
     const { row, loaded } = this, unit = row.unit ? ` ${row.unit}` : "";
     const named = (value) => loaded?.labels[value] ?? shown(value, row.precision) + unit;
     let text;

@@ -6,7 +6,7 @@ import { milliseconds } from "./line.js";
 
 const KEPT_SECONDS = 31;
 const MOST_KEPT = 20000;
-const LATER = 0.4; // seconds: what is on the wire now is told when it is over
+const LATER = 0.4; // seconds: an exchange is shown when it has ended
 const PLACES = [
   "said", "bytes", "ended", "protocol", "address", "command", "writes", "purpose", "request", "attempt", "verdict", "result", "late",
   "quiet_time",
@@ -14,15 +14,15 @@ const PLACES = [
 const LANE = 14, LINE_LANE = 26, SCALE = 16, LEFT = 64;
 
 export class Wire {
-  constructor(canvas, tip, said) {
-    Object.assign(this, { canvas, tip, said, exchanges: [], lanes: [], held: null, span: 2, chosen: null, left_out: 0 });
+  constructor(canvas, tip, text) {
+    Object.assign(this, { canvas, tip, text, exchanges: [], lanes: [], held: null, span: 2, chosen: null, left_out: 0 });
     canvas.addEventListener("pointermove", (event) => this.point(event));
     canvas.addEventListener("pointerdown", (event) => this.point(event));
     canvas.addEventListener("pointerleave", () => { tip.hidden = true; });
     canvas.addEventListener("keydown", (event) => this.key(event));
   }
 
-  hear({ exchanges, left_out, now }) {
+  take({ exchanges, left_out, now }) {
     let before = this.exchanges.findLast((one) => one.verdict);
     for (const one of exchanges.map(exchange_of)) {
       if (one.verdict) {
@@ -155,7 +155,7 @@ export class Wire {
     pen.restore();
   }
 
-  // What is since the last exchange, while the line is not ready: nothing is told of it before it is over.
+  // What is since the last exchange, while the line is not ready: it is shown when it has ended.
   still(pen, width, state, colour) {
     const from = Math.max(this.end - this.span, this.exchanges.at(-1)?.ended ?? 0);
     if (state === "resynchronising") this.resynchronising(pen, from, this.end - from, colour("resynchronising"));
@@ -178,7 +178,7 @@ export class Wire {
       if (away < least && here(one)) { best = one; least = away; }
     }
     this.tip.hidden = false;
-    if (best) this.tell(best);
+    if (best) this.describe(best);
     else this.tip.textContent = this.between(this.end - this.span + ((x - LEFT) / (box.width - LEFT - 4)) * this.span);
     this.tip.style.left = `${Math.max(4, Math.min(event.clientX + 14, innerWidth - this.tip.offsetWidth - 8))}px`;
     const below = event.clientY + 18;
@@ -201,18 +201,18 @@ export class Wire {
     const now = this.exchanges.indexOf(this.chosen);
     const last = this.exchanges.findLastIndex((one) => one.begun <= this.end);
     const next = now < 0 ? last : Math.max(0, Math.min(last, now + step));
-    this.tell(this.exchanges[next]);
+    this.describe(this.exchanges[next]);
   }
 
-  tell(one) {
+  describe(one) {
     this.chosen = one;
-    const text = told(one, this.lanes);
+    const text = description(one, this.lanes);
     this.tip.textContent = text;
-    this.said.textContent = text.replaceAll("\n", " · ");
+    this.text.textContent = text.replaceAll("\n", " · ");
   }
 }
 
-// An exchange as it is told, by names and in seconds; without a verdict, bytes that nobody had asked for.
+// An exchange with named fields, in seconds; without a verdict: unexpected bytes.
 function exchange_of(values) {
   const one = Object.fromEntries(values.map((value, place) => [PLACES[place], value]));
   one.said = one.said.map(([when, ...rest]) => [when / 1e6, ...rest]);
@@ -229,9 +229,9 @@ function kind_of(one) {
   return one.writes ? "write" : "ok";
 }
 
-function told(one, nodes) {
-  const said = one.said.map(([when, who, hex]) => `${who === "master" ? "→" : "←"} +${milliseconds(when - one.begun)}  ${spelled(hex)}`);
-  if (!one.verdict) return [`unexpected: ${one.bytes} bytes without a request`, ...said].join("\n");
+function description(one, nodes) {
+  const lines = one.said.map(([when, who, hex]) => `${who === "master" ? "→" : "←"} +${milliseconds(when - one.begun)}  ${spelled(hex)}`);
+  if (!one.verdict) return [`unexpected: ${one.bytes} bytes without a request`, ...lines].join("\n");
   const answer = one.verdict === "ok" ? one.result || "done" : `${one.verdict}: ${one.result}`;
   const why = one.purpose ? `for ${one.purpose}` : "requested by a program";
   const first = one.said.find(([, who]) => who === "node");
@@ -239,7 +239,7 @@ function told(one, nodes) {
     `${label_of(one, nodes)}: ${one.command} = ${answer}`,
     `${why}, request ${one.request}${one.attempt > 1 ? `, RETRY: attempt ${one.attempt}` : ""}${one.late ? ", LATE" : ""}`,
     `${milliseconds(one.ended - one.begun, 2)} in all${first ? `, first byte after ${milliseconds(first[0] - one.begun, 2)}` : ", nothing came"}`,
-    ...said,
+    ...lines,
   ].join("\n");
 }
 

@@ -31,7 +31,7 @@ class InfluxOutput(Output):
     """Sends each cycle as one packet."""
 
     def __init__(self, settings: InfluxSettings, line: OutputLine) -> None:
-        super().__init__("influx", settings, line.say)
+        super().__init__("influx", settings, line.report)
         self._address = settings.host, settings.port
 
     def work(self) -> None:
