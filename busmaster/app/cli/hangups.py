@@ -23,7 +23,7 @@ class Hangups:
 
     def __enter__(self) -> Hangups:
         if threading.current_thread() is threading.main_thread():  # Python handles signals only there
-            self._before = signal.signal(signal.SIGHUP, self._hear)
+            self._before = signal.signal(signal.SIGHUP, self._receive)
         return self
 
     def __exit__(
@@ -32,7 +32,7 @@ class Hangups:
         if self._before is not None:
             signal.signal(signal.SIGHUP, self._before)
 
-    def _hear(self, _number: int, _frame: object) -> None:
+    def _receive(self, _number: int, _frame: object) -> None:
         self._heard = True
         if self._wake is not None:
             self._wake()

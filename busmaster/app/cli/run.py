@@ -111,7 +111,7 @@ class Running:
         self.line.outputs.report = self._print_output_event
         service = service_of(self.line)  # now: it keeps what happens as the line is opened
         if service is not None:
-            service.tell = self._print_refusals
+            service.report = self._print_refusals
         try:
             async with self.line:
                 entered = True

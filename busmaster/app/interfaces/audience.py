@@ -62,7 +62,7 @@ class Audience:
         self._set = 0
         self._exchanges: RemoteExchanges | None = None
         self._asking: asyncio.Task[None] | None = None
-        line.on_picture(self._hear)
+        line.on_picture(self._receive)
         line.on_state(self._changed)
 
     def join(self) -> Seat:
@@ -91,14 +91,14 @@ class Audience:
 
     async def _ask(self) -> None:
         try:
-            self._exchanges = await self._line.remote.exchanges(self._hear_exchanges)
+            self._exchanges = await self._line.remote.exchanges(self._receive_exchanges)
         except BusError:
             pass  # the owner has gone: the request is repeated when it is back
         finally:
             self._asking = None
         self.look_at_exchanges()  # the pages may have gone meanwhile
 
-    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
+    def _receive(self, method: str, params: Mapping[str, Any]) -> None:
         if params.get("set", 0) > self._set:
             self._set = params["set"]
             self._sent = {key: text for key, text in self._sent.items() if key[0] not in ("rows", "values")}
@@ -107,7 +107,7 @@ class Audience:
         for seat in self._seats:
             seat.put(key, text)
 
-    def _hear_exchanges(self, params: Mapping[str, Any]) -> None:
+    def _receive_exchanges(self, params: Mapping[str, Any]) -> None:
         text = encoded({"method": "exchanges", "body": params})
         for seat in self._seats:
             if seat.wants_exchanges:

@@ -22,7 +22,7 @@ FIRST_PAUSE = 0.25
 """Seconds before it is tried again to connect; each time twice as long, up to `LONGEST_PAUSE`."""
 LONGEST_PAUSE = 2.0
 
-Hear = Callable[[str, Mapping[str, Any]], None]
+Receive = Callable[[str, Mapping[str, Any]], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Following:
         self._address = address
         self._token = token
         self._read_only = read_only
-        self._listeners: list[Hear] = []
+        self._listeners: list[Receive] = []
         self._watchers: list[Callable[[], None]] = []
         self._touch_listeners: list[Callable[[Mapping[str, Any]], None]] = []
         self._remote: RemoteBus | None = None
@@ -74,28 +74,29 @@ class Following:
 
     # notifications for an interface
 
-    def on_picture(self, hear: Hear) -> Callable[[], None]:
-        """Call `hear` with the messages of the owner, after `picture` has taken them; return the function to stop that.
+    def on_picture(self, receive: Receive) -> Callable[[], None]:
+        """Call `receive` with the messages of the owner after `picture` has taken them. Returns what stops it.
 
-        These are the messages of an overview: `rows`, `values`, `groups`, `nodes`, and then `frame`. `hear` must not
+        These are the messages of an overview: `rows`, `values`, `groups`, `nodes`, and then `frame`. `receive` must not
         block. If it raises, the connection ends.
         """
-        self._listeners.append(hear)
-        return lambda: self._listeners.remove(hear)
+        self._listeners.append(receive)
+        return lambda: self._listeners.remove(receive)
 
     def on_state(self, watch: Callable[[], None]) -> Callable[[], None]:
         """Call `watch` when `state` has changed; return the function to stop that. It must not block, nor raise."""
         self._watchers.append(watch)
         return lambda: self._watchers.remove(watch)
 
-    def on_touched(self, hear: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
-        """Call `hear` with the values that a write has made stale, after `picture` has taken them; return the function
-        to stop that.
+    def on_touched(self, receive: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
+        """Call `receive` with the values that a write has made stale, after `picture` has taken them.
+
+        Returns the function to stop it.
 
         It is called before the write is confirmed. `Touches` takes the message. It must not block, nor raise.
         """
-        self._touch_listeners.append(hear)
-        return lambda: self._touch_listeners.remove(hear)
+        self._touch_listeners.append(receive)
+        return lambda: self._touch_listeners.remove(receive)
 
     @property
     def is_connected(self) -> bool:
@@ -191,21 +192,21 @@ class Following:
             self._remote = remote
             self._change(Connected(remote.about))
             remote.on_access.append(lambda: self._change(Connected(remote.about)))
-            remote.on_touched.append(self._hear_touched)
-            self._overview = await remote.overview(self._hear)
+            remote.on_touched.append(self._receive_touched)
+            self._overview = await remote.overview(self._receive)
             await self._overview.over()
         finally:
             self._remote = self._overview = None
 
-    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
-        self.picture.hear(method, params)
-        for hear in list(self._listeners):
-            hear(method, params)
+    def _receive(self, method: str, params: Mapping[str, Any]) -> None:
+        self.picture.receive(method, params)
+        for receive in list(self._listeners):
+            receive(method, params)
 
-    def _hear_touched(self, params: Mapping[str, Any]) -> None:
-        self.picture.hear("touched", params)
-        for hear in list(self._touch_listeners):
-            hear(params)
+    def _receive_touched(self, params: Mapping[str, Any]) -> None:
+        self.picture.receive("touched", params)
+        for receive in list(self._touch_listeners):
+            receive(params)
 
     def _change(self, state: Connected | Lost) -> None:
         if isinstance(state, Lost):

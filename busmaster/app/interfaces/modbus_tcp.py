@@ -478,9 +478,9 @@ class Values:
     async def run(self) -> None:
         """Follow the points until cancelled."""
         ends = (
-            self.line.on_picture(self._hear),
+            self.line.on_picture(self._receive),
             self.line.on_state(self._changed.set),
-            self.line.on_touched(self._hear_touched),
+            self.line.on_touched(self._receive_touched),
         )
         try:
             while True:
@@ -494,12 +494,12 @@ class Values:
                 end()
             await self._leave_groups(set())
 
-    def _hear(self, method: str, _params: Mapping[str, Any]) -> None:
+    def _receive(self, method: str, _params: Mapping[str, Any]) -> None:
         if method in ("rows", "frame"):
             self._new_rows |= method == "rows"
             self._changed.set()
 
-    def _hear_touched(self, params: Mapping[str, Any]) -> None:
+    def _receive_touched(self, params: Mapping[str, Any]) -> None:
         self._touches.note(params)
 
     async def _look(self) -> None:

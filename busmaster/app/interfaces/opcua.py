@@ -113,9 +113,9 @@ class LineServer:
     async def run(self) -> None:
         """Show the line until cancelled."""
         await self._space.begin()
-        end_picture = self._line.on_picture(self._hear)
+        end_picture = self._line.on_picture(self._receive)
         end_state = self._line.on_state(self._changed.set)
-        end_touched = self._line.on_touched(self._hear_touched)
+        end_touched = self._line.on_touched(self._receive_touched)
         try:
             while True:
                 await self._show()
@@ -129,13 +129,13 @@ class LineServer:
             end_touched()
             await self._leave_groups(set())
 
-    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
+    def _receive(self, method: str, params: Mapping[str, Any]) -> None:
         if method == "rows":
             self._new_rows = True
         if method == "frame":
             self._changed.set()
 
-    def _hear_touched(self, params: Mapping[str, Any]) -> None:
+    def _receive_touched(self, params: Mapping[str, Any]) -> None:
         self._touches.note(params)
         self._is_touched = True
         self._changed.set()

@@ -428,14 +428,14 @@ class MqttOutput(SpillingOutput):
         self._interface_is_closed.clear()  # before the check: `close_interface` uses the opposite order
         try:
             if self._commands and not self._leaving.is_set():
-                await self._hear(client, task_status)
+                await self._receive(client, task_status)
             else:
                 task_status.started()
         finally:
             self._arriving.close(self._keep)
             self._interface_is_closed.set()
 
-    async def _hear(self, client: Client, task_status: TaskStatus[None]) -> None:
+    async def _receive(self, client: Client, task_status: TaskStatus[None]) -> None:
         topics = [self._topic("set", name) for name in self._commands]
         forbidden = Forbidden(
             self._settings, self._secrets, self._topic(COMMANDS), frozenset(topics), self._arriving.take

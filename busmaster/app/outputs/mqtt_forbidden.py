@@ -64,7 +64,7 @@ class Forbidden:
         if tls is not None:
             self._client.tls_set_context(tls)
         self._client.on_connect = self._ask
-        self._client.on_message = self._hear
+        self._client.on_message = self._receive
         self._client.on_subscribe = lambda *_: self._run_on_loop(partial(_done, self._subscribed))
         self._client.on_unsubscribe = lambda *_: self._run_on_loop(partial(_done, self._unsubscribed))
         self._client.on_disconnect = lambda *_: self._run_on_loop(partial(_done, self.lost))
@@ -94,7 +94,7 @@ class Forbidden:
     def _ask(self, client: Client, *_: Any) -> None:
         client.subscribe(self._topic, qos=1)
 
-    def _hear(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
+    def _receive(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
         if message.topic not in self._allowed:
             self._run_on_loop(partial(self._take, message))
         self._over.wait(REST)  # it is acknowledged when this returns

@@ -168,8 +168,8 @@ class Authorisation:
     @access.setter
     def access(self, access: Access) -> None:
         self._access = access
-        for tell in self.on_access:
-            tell()
+        for report in self.on_access:
+            report()
 
     def take_secrets(self, secrets: Mapping[str, bytes]) -> None:
         """Replace the tokens: digests by name."""

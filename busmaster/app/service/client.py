@@ -10,11 +10,12 @@ from typing import Any
 
 from busmaster import Node, Point, PollGroup, Priority, ext
 from busmaster.app.service.client_requests import ClientRequest, Writing, client_request_of
-from busmaster.app.service.failures import REFUSED, refusal_of, said_error
+from busmaster.app.service.encoding import encode_statistics, listed_groups, point_of, profile_of, protocol_of
+from busmaster.app.service.failures import REFUSED, encode_error, refusal_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import NO_METHOD, Malformed, answered, check_within, timings_of, written
 from busmaster.app.service.outbox import Outbox
-from busmaster.app.service.overview import said_details
+from busmaster.app.service.overview import encode_details
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.plans import groups_of
@@ -22,7 +23,6 @@ from busmaster.app.service.refusals import KINDS, is_interface_name
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Rights, Role
 from busmaster.app.service.streams import Broadcast, GroupBroadcast
-from busmaster.app.service.telling import listed_groups, point_of, profile_of, protocol_of, said_statistics
 from busmaster.bounds import (
     LONGEST_SENDER,
     MOST_CHECKED,
@@ -83,7 +83,7 @@ class Client:
         that follows, if that is permitted."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node could not be used as the client named it. Requests are refused until it is named correctly."""
-        self.requests = Requests(self, line, self._tell_result, self._refuse)
+        self.requests = Requests(self, line, self._report_result, self._refuse)
         """Its requests that have not ended."""
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
@@ -105,7 +105,7 @@ class Client:
 
     @property
     def rights(self) -> Rights:
-        """Return the rights of its role. `tell_access` updates it, so that it is not looked up for every request."""
+        """Return the rights of its role. `notify_access` updates it, so that it is not looked up for every request."""
         return RIGHTS[self._role]
 
     @property
@@ -120,11 +120,11 @@ class Client:
 
     # messages to the client
 
-    def tell(self, stream: int, method: str, body: str) -> None:
+    def notify(self, stream: int, method: str, body: str) -> None:
         """Send a message of a stream; it is dropped if the client does not keep up."""
         self.outbox.put_news(stream, self._news(stream, method, body))
 
-    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+    def notify_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
         """Send a message about a part of a stream, which replaces an earlier unsent one."""
         self.outbox.put_latest((stream, method, part), self._news(stream, method, body))
 
@@ -133,7 +133,7 @@ class Client:
         head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
         return f"{head}{body}}}}}"
 
-    def tell_access(self) -> None:
+    def notify_access(self) -> None:
         """Apply a changed role at once, and send the new permission."""
         role = self.permission.role
         if role is not self._role:
@@ -141,7 +141,7 @@ class Client:
             ext.line_of(self._line.bus).arbiter.change_client(self.turn, self.rights.owner_time)
         self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
 
-    def tell_stops(self, node: NodeRecord) -> None:
+    def notify_stops(self, node: NodeRecord) -> None:
         """Send the number of stops of a node, if this client uses it."""
         key = (node.profile.name, node.address)
         if key in self._nodes:
@@ -153,15 +153,15 @@ class Client:
         """Return whether it follows a stream of the line, and so can hold values that a write makes stale."""
         return bool(self._streams)
 
-    def tell_touched(self, params: Mapping[str, Any], key: Hashable) -> None:
+    def notify_touched(self, params: Mapping[str, Any], key: Hashable) -> None:
         """Send which values a write has made stale; `key` identifies these values."""
         self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
 
     # messages from the client
 
-    def take(self, said: Mapping[str, Any]) -> None:
+    def take(self, decoded: Mapping[str, Any]) -> None:
         """Handle a message. Raises Malformed for one that no client of this version sends."""
-        number, method, params = said.get("id"), said.get("method"), said.get("params", {})
+        number, method, params = decoded.get("id"), decoded.get("method"), decoded.get("params", {})
         if not isinstance(method, str) or not isinstance(params, dict):
             raise Malformed("a message has a method, and its parameters by name")
         if self.in_safe_place and method not in FOR_SAFE_STATE:
@@ -189,7 +189,7 @@ class Client:
         except REFUSED as error:
             self._refuse(number, refusal_of(method, error))
         else:
-            self._tell_result(number, answer)
+            self._report_result(number, answer)
 
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:
@@ -238,7 +238,7 @@ class Client:
             case "now":
                 return self._line.bus.now()
             case "statistics":
-                return said_statistics(ext.line_statistics(self._line.bus))
+                return encode_statistics(ext.line_statistics(self._line.bus))
             case "groups":
                 return listed_groups(self._line.bus)
             case "subscribe":
@@ -254,7 +254,7 @@ class Client:
             case "exchanges":
                 return self._follow(params, self._line.exchanges())
             case "details":
-                return said_details(self._line.bus, *self._line.point(params["group"], params["key"]))
+                return encode_details(self._line.bus, *self._line.point(params["group"], params["key"]))
             case "pause" | "demand" | "suspend":
                 return self._steer(method, params)
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
@@ -276,7 +276,7 @@ class Client:
         except REFUSED as error:
             self._refuse(number, refusal_of("plan", error))
         else:
-            self._tell_result(number, plan)
+            self._report_result(number, plan)
 
     def _steer(self, method: str, params: Mapping[str, Any]) -> None:
         """Change how the line is polled for all clients. The events name the program that did it.
@@ -365,11 +365,11 @@ class Client:
 
     # answers
 
-    def _tell_result(self, number: int, result: Any) -> None:
+    def _report_result(self, number: int, result: Any) -> None:
         self.outbox.put(answered(number, result))
 
     def _refuse(self, number: int, error: Exception) -> None:
-        self.outbox.put(written({"id": number, "error": said_error(error)}))
+        self.outbox.put(written({"id": number, "error": encode_error(error)}))
 
     # sequences
 

@@ -64,7 +64,7 @@ class Host(Protocol):
         """Store the peer; return the HTTP status and text of a refusal, None if it is admitted."""
         ...
 
-    def admit(self, connection: ClientConnection, said: Mapping[str, Any], /) -> Client:
+    def admit(self, connection: ClientConnection, decoded: Mapping[str, Any], /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
         ...
 
@@ -105,7 +105,7 @@ class ClientConnection:
     def opened(self) -> None:
         """Wait for the first message."""
 
-    def heard(self, message: str | bytes) -> None:
+    def received(self, message: str | bytes) -> None:
         """Take a message when it is its turn; until then nothing more is read."""
         if self._ended:
             return
@@ -177,7 +177,7 @@ class ClientConnection:
         if self.client is not None:
             self.client.outbox.put(text)
         else:
-            self.websocket.say(text)
+            self.websocket.send(text)
         self._end(POLICY, str(error)[:100])
 
     def _end(self, code: int, reason: str) -> None:

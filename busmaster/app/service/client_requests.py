@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster import Node, Point, ext
 from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
+from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.peers import Peer
@@ -16,7 +17,6 @@ from busmaster.app.service.permission import Permission
 from busmaster.app.service.reads import PlainRead
 from busmaster.app.service.record import RAW_COMMAND
 from busmaster.app.service.rights import Rights
-from busmaster.app.service.telling import protocol_of
 from busmaster.bounds import LONGEST_WAIT
 from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.ext import (
@@ -76,7 +76,7 @@ class RequestSender(Protocol):
         """Return whether the write that is begun now is a stop of its node, as the client has announced."""
         ...
 
-    def tell_stops(self, node: NodeRecord, /) -> None:
+    def notify_stops(self, node: NodeRecord, /) -> None:
         """Send the number of stops of a node."""
         ...
 
@@ -251,7 +251,7 @@ class Writing:
     def _stop_node(self) -> None:
         """Count this write as a stop if it is permitted. Otherwise send the program the number of stops."""
         if self._line.authorisation.refusal(self._write_request()):
-            self._sender.tell_stops(ext.record_of(self.node))
+            self._sender.notify_stops(ext.record_of(self.node))
         else:
             self.node.note_stop()
 
@@ -320,22 +320,26 @@ class Writing:
 ClientRequest: TypeAlias = Reading | Writing
 
 
-def client_request_of(said: Mapping[str, Any] | PlainRead, sender: RequestSender, line: ServedLine) -> ClientRequest:
+def client_request_of(decoded: Mapping[str, Any] | PlainRead, sender: RequestSender, line: ServedLine) -> ClientRequest:
     """Return the request of a client. Raises InvalidCommand for a command that the protocol does not have."""
-    if isinstance(said, PlainRead):
-        return Reading(sender.node(said.protocol, said.address), said.command, sender.turn, None, sender.reads)
-    task = RequestedCommand.of_point(said, sender, line) if "key" in said else RequestedCommand.of_node(said, sender)
+    if isinstance(decoded, PlainRead):
+        return Reading(sender.node(decoded.protocol, decoded.address), decoded.command, sender.turn, None, sender.reads)
+    task = (
+        RequestedCommand.of_point(decoded, sender, line)
+        if "key" in decoded
+        else RequestedCommand.of_node(decoded, sender)
+    )
     node, command = task.node, task.command
-    given = cast("CommandOptions", said.get("options") or {})
+    given = cast("CommandOptions", decoded.get("options") or {})
     if not set(given) <= OPTIONS:
         raise InvalidCommand(f"unknown options in {', '.join(given)}; use {', '.join(sorted(OPTIONS))}")
     RequestOptions.of(given, node.label)  # checked here, before it may wait
     _check_waits(given, node)
-    now, stops_seen = line.bus.now(), said.get("stops_seen")
+    now, stops_seen = line.bus.now(), decoded.get("stops_seen")
     stops_seen = None if stops_seen is None else stops_seen + sender.stops_before(node)
-    client = sender.client_of(said.get("sequence"), node)
-    stop = said.get("stop") is True and _check_stop(node, command)
-    asked = min(now, seconds(said.get("requested", now), "requested"))
+    client = sender.client_of(decoded.get("sequence"), node)
+    stop = decoded.get("stop") is True and _check_stop(node, command)
+    asked = min(now, seconds(decoded.get("requested", now), "requested"))
     if not command.writes:
         options = RequestOptions.of(_left(given, now - asked), node.label)
         options = replace(options, priority=max(options.priority, sender.rights.reads))

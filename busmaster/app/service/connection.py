@@ -45,7 +45,7 @@ class MessageHandler(Protocol):
         """Handle the opening: from now on messages can be sent, and will arrive."""
         ...
 
-    def heard(self, message: str | bytes) -> None:
+    def received(self, message: str | bytes) -> None:
         """Handle a message. Bytes are not JSON-RPC."""
         ...
 
@@ -113,7 +113,7 @@ class Connection(asyncio.BufferedProtocol):
         assert self._transport is not None
         return self._transport
 
-    def say(self, text: str) -> None:
+    def send(self, text: str) -> None:
         """Send a message, unless the connection is ending."""
         transport = self._transport
         if self._talks and transport is not None and not transport.is_closing():
@@ -180,7 +180,7 @@ class Connection(asyncio.BufferedProtocol):
                 self._feed(self._cut(size))
             else:
                 del self._rest[:size]
-                self._tell(text, True)
+                self._notify(text, True)
 
     def eof_received(self) -> None:
         if self._rest:
@@ -229,11 +229,11 @@ class Connection(asyncio.BufferedProtocol):
         self._write()
         for event in self._core.events_received():
             if self._is_open:
-                self._hear(cast("Frame", event))
+                self._receive(cast("Frame", event))
             else:
                 self._shake_hands(event)
 
-    def _hear(self, frame: Frame) -> None:
+    def _receive(self, frame: Frame) -> None:
         self._check_frame()
         if frame.opcode >= _CONTROL:
             return
@@ -243,16 +243,16 @@ class Connection(asyncio.BufferedProtocol):
         self._part += frame.data
         if frame.fin:
             data, self._part = bytes(self._part), None
-            self._tell(data, self._is_text)
+            self._notify(data, self._is_text)
 
-    def _tell(self, data: bytes, is_text: bool) -> None:
+    def _notify(self, data: bytes, is_text: bool) -> None:
         try:
             message = data.decode() if is_text else data
         except UnicodeDecodeError:
             self._core.fail(NO_TEXT, "a message is text in UTF-8")
             self._write()
         else:
-            self._handler.heard(message)
+            self._handler.received(message)
 
     def _write(self) -> None:
         transport = self.transport
@@ -370,14 +370,14 @@ class OutgoingConnection(Connection):
     @property
     def close_reason(self) -> str:
         """Return the reason with which the other end closed the connection, "" if it has not."""
-        said = self._core.close_rcvd
-        return "" if said is None else said.reason
+        decoded = self._core.close_rcvd
+        return "" if decoded is None else decoded.reason
 
     @property
     def owner_ended(self) -> bool:
         """Return whether the other end closed the connection because it ends in an orderly way."""
-        said = self._core.close_rcvd
-        return said is not None and said.code == GOING_AWAY
+        decoded = self._core.close_rcvd
+        return decoded is not None and decoded.code == GOING_AWAY
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)

@@ -22,26 +22,26 @@ MOST_KEPT = 500
 MOST_BYTES = 256
 """Maximum number of bytes that are reported for one exchange, or for unexpected bytes."""
 LONGEST_RESULT = 200
-HEARD_AT_ONCE = 200
+RECEIVED_AT_ONCE = 200
 """Pieces of what passes that are put into their order at once."""
 
 
 class TracedExchange:
     """One attempt at a command with all of its bytes; or, without an attempt, unexpected bytes."""
 
-    __slots__ = ("attempt", "bytes", "said")
+    __slots__ = ("attempt", "bytes", "transmissions")
 
     def __init__(self, attempt: Attempt | None) -> None:
         self.attempt = attempt
-        self.said: list[list[Any]] = []
+        self.transmissions: list[list[Any]] = []
         """Time, sender and bytes, in the form of the message."""
         self.bytes = 0
 
     def add(self, now: float, by_master: bool, data: bytes) -> None:
         """Add bytes that were sent or received."""
         if self.bytes < MOST_BYTES:
-            told = data[: MOST_BYTES - self.bytes].hex()
-            self.said.append([round(now * 1e6), "master" if by_master else "node", told])
+            text = data[: MOST_BYTES - self.bytes].hex()
+            self.transmissions.append([round(now * 1e6), "master" if by_master else "node", text])
         self.bytes += len(data)
 
     @property
@@ -57,7 +57,7 @@ class Listener:
 
     def __init__(self) -> None:
         self._lost = 0
-        self._heard: list[tuple[float, bool, bytes, Attempt | None]] = []
+        self._received: list[tuple[float, bool, bytes, Attempt | None]] = []
         self._exchanges: deque[TracedExchange] = deque()
         self._last: TracedExchange | None = None
         self._has_begun = False
@@ -65,14 +65,14 @@ class Listener:
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
         """Store bytes of the master: the request of a new attempt, or without one the end of the attempt before."""
-        self._heard.append((now, True, data, attempt))
-        if len(self._heard) == HEARD_AT_ONCE:
+        self._received.append((now, True, data, attempt))
+        if len(self._received) == RECEIVED_AT_ONCE:
             self._put_in_order()
 
     def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
         """Store received bytes."""
-        self._heard.append((now, False, data, attempt))
-        if len(self._heard) == HEARD_AT_ONCE:
+        self._received.append((now, False, data, attempt))
+        if len(self._received) == RECEIVED_AT_ONCE:
             self._put_in_order()
 
     def attempted(self, attempt: Attempt, /) -> None:
@@ -89,8 +89,8 @@ class Listener:
         return over, self._lost
 
     def _put_in_order(self) -> None:
-        heard, self._heard = self._heard, []
-        for now, by_master, data, attempt in heard:
+        received, self._received = self._received, []
+        for now, by_master, data, attempt in received:
             exchange = self._last
             if attempt is not None or (self._has_begun and not by_master):
                 if exchange is None or exchange.attempt is not attempt:
@@ -140,9 +140,9 @@ def exchange_to_json(exchange: TracedExchange) -> list[Any]:
     """
     attempt = exchange.attempt
     if attempt is None or attempt.verdict is None:
-        return [exchange.said, exchange.bytes]
+        return [exchange.transmissions, exchange.bytes]
     return [
-        exchange.said,
+        exchange.transmissions,
         exchange.bytes,
         round(attempt.ended_at * 1e6),
         attempt.protocol,

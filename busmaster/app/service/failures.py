@@ -29,7 +29,7 @@ KNOWN: dict[str, type[BusError]] = {
 }
 
 
-def said_error(error: Exception) -> dict[str, Any]:
+def encode_error(error: Exception) -> dict[str, Any]:
     """Return an error in the form of JSON-RPC; its class is in its `data`."""
     if isinstance(error, Malformed):
         return {"code": error.code, "message": str(error)}
@@ -53,24 +53,24 @@ def refusal_of(method: str, error: Exception) -> Exception:
 def error_data(error: BusError, depth: int = 0) -> dict[str, Any]:
     """Return the class of an error by the nearest name that every client knows, and its fields."""
     name = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN), "BusError")
-    said: dict[str, Any] = {"error": name, **{field: getattr(error, field) for field in FIELDS}}
+    decoded: dict[str, Any] = {"error": name, **{field: getattr(error, field) for field in FIELDS}}
     if isinstance(error, Refused):
-        said |= {"confirm": error.confirm} | ({"temporary": True} if error.temporary else {})
+        decoded |= {"confirm": error.confirm} | ({"temporary": True} if error.temporary else {})
     cause = error.__cause__
     if cause is not None and depth < DEEPEST:
         text = f"{type(cause).__name__}: {cause}"
-        said["cause"] = error_data(cause, depth + 1) if isinstance(cause, BusError) else text
-    return said
+        decoded["cause"] = error_data(cause, depth + 1) if isinstance(cause, BusError) else text
+    return decoded
 
 
-def error_of(said: dict[str, Any]) -> Exception:
+def error_of(decoded: dict[str, Any]) -> Exception:
     """Return a new error with all fields of the received one."""
-    data = said.get("data") or {}
+    data = decoded.get("data") or {}
     if data.get("error") == "InvalidCommand":
         return InvalidCommand(data["what"])
     if data:
         return bus_error_of(data)
-    return BusError(f"the program that owns the line could not do it: {said.get('message')}", hint="see its log")
+    return BusError(f"the program that owns the line could not do it: {decoded.get('message')}", hint="see its log")
 
 
 def bus_error_of(data: dict[str, Any]) -> BusError:

@@ -262,11 +262,11 @@ class ServedSocket:
 
 def _read(path: Path) -> Owner | None:
     try:
-        said = json.loads(read_file(path, LONGEST_LINE_RECORD))
-        owner = Owner(**said)
+        decoded = json.loads(read_file(path, LONGEST_LINE_RECORD))
+        owner = Owner(**decoded)
         # Another program of this user may have made the file. A file with other contents is ignored.
-        texts = [said[name] for name in ("name", "port", "socket")]
-        fits = all(isinstance(text, str) and "\0" not in text for text in texts) and type(said["pid"]) is int
+        texts = [decoded[name] for name in ("name", "port", "socket")]
+        fits = all(isinstance(text, str) and "\0" not in text for text in texts) and type(decoded["pid"]) is int
         return owner if fits else None
     except (OSError, ValueError, TypeError, RecursionError):
         return None

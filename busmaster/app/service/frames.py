@@ -33,8 +33,8 @@ def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
     size = text + length
     if come < size or data[0] != TEXT or is_masked is not masked:
         return size, None
-    said, key = bytes(data[text:size]), data[begin:text]
-    return size, mask(said, key) if masked and key != NO_MASK else said
+    payload, key = bytes(data[text:size]), data[begin:text]
+    return size, mask(payload, key) if masked and key != NO_MASK else payload
 
 
 def text_frame(data: bytes, key: bytes) -> bytes:

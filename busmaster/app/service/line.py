@@ -31,7 +31,7 @@ class ServedLine:
         self.share = share
         self.title = title
         """Title above the views of the line."""
-        self.safe_wishes = SafeStateRequests(authorisation)
+        self.safe_writes = SafeStateRequests(authorisation)
         self.planner = Planner(bus)
         self.journal = EventLog(bus)
         """The events from now on, also before the line is served."""

@@ -120,7 +120,7 @@ class Link:
                     await loop.create_unix_connection(self._connect, where)
                 else:
                     await loop.create_connection(self._connect, *place)
-                said: dict[str, Any] = await hello.future
+                decoded: dict[str, Any] = await hello.future
         except BaseException as error:
             hello.future.cancel()  # its result is not awaited any more
             shut = self._shut(where, error)
@@ -128,7 +128,7 @@ class Link:
             if shut is not None:
                 raise shut from error
             raise
-        return said
+        return decoded
 
     async def close(self) -> None:
         """Close the connection. Requests in progress end with BusClosed."""
@@ -137,7 +137,7 @@ class Link:
             self._connection.close()
             await self._connection.closed()
 
-    def tell(self, method: str, params: Mapping[str, Any]) -> None:
+    def notify(self, method: str, params: Mapping[str, Any]) -> None:
         """Send a notification, which has no reply. Does nothing if the connection is lost."""
         if self._over is None:
             text = written({"method": method, "params": params})
@@ -203,7 +203,7 @@ class Link:
         self._is_open = True
         self.writable()
 
-    def heard(self, message: str | bytes) -> None:
+    def received(self, message: str | bytes) -> None:
         """Pass a reply to its request, and a notification to `on_news`."""
         try:
             self._take(read(message))
@@ -223,7 +223,7 @@ class Link:
                 if asked.future.done():
                     continue  # cancelled before it was sent
                 asked.handed = True
-            connection.say(text)
+            connection.send(text)
 
     def lost(self) -> None:
         """End all requests, because the connection is over."""
@@ -265,13 +265,13 @@ class Link:
         connection = self._connection
         if self._waiting or not self._is_open or connection is None or connection.full:
             return False
-        connection.say(text)
+        connection.send(text)
         return True
 
     def _drop(self, asked: PendingRequest) -> None:
         """Stop waiting for a request, and cancel it at the line."""
         if self._asked.pop(asked.number, None) is not None and asked.handed:
-            self.tell("cancel", {"id": asked.number})
+            self.notify("cancel", {"id": asked.number})
 
     def _overdue(self, asked: PendingRequest) -> None:
         what = "the time of the request is over, and the program that owns the line did not reply"
@@ -287,22 +287,22 @@ class Link:
             self._waiting.clear()
             self._on_lost()
 
-    def _take(self, said: Mapping[str, Any]) -> None:
-        if "method" in said:
-            self._on_news(said["method"], said["params"])
+    def _take(self, decoded: Mapping[str, Any]) -> None:
+        if "method" in decoded:
+            self._on_news(decoded["method"], decoded["params"])
             return
-        asked = self._asked.get(said.get("id"))  # type: ignore[arg-type]  # the other end can send anything
+        asked = self._asked.get(decoded.get("id"))  # type: ignore[arg-type]  # the other end can send anything
         if asked is None:
             return
         # Decoded first: if that fails, the request is still registered, and ends with the connection.
-        error = error_of(said["error"]) if "error" in said else None
+        error = error_of(decoded["error"]) if "error" in decoded else None
         del self._asked[asked.number]
         if asked.future.done():
             return
         if error is not None:
             asked.future.set_exception(error)
         else:
-            asked.future.set_result(said.get("result"))
+            asked.future.set_result(decoded.get("result"))
 
 
 def is_a_name(address: str) -> bool:

@@ -73,16 +73,16 @@ def read(text: str | bytes) -> dict[str, Any]:
         raise Malformed("a message is text")
     text = text.strip()
     try:
-        said, end = _decode(text, 0)
+        decoded, end = _decode(text, 0)
     except StopIteration as error:
         raise Malformed(f"not valid JSON: no value begins at {error.value}", PARSE_ERROR) from None
     except (ValueError, RecursionError) as error:
         raise Malformed(f"not valid JSON: {error}", PARSE_ERROR) from None
     if end < len(text):
         raise Malformed("not valid JSON: there is more text after the value", PARSE_ERROR)
-    if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
+    if not isinstance(decoded, dict) or decoded.get("jsonrpc") != "2.0":
         raise Malformed("not a message of JSON-RPC 2.0")
-    return said
+    return decoded
 
 
 def read_request(text: str | bytes) -> dict[str, Any]:
@@ -92,39 +92,39 @@ def read_request(text: str | bytes) -> dict[str, Any]:
     return read(text)
 
 
-def value_of(said: Any) -> Any:
+def value_of(decoded: Any) -> Any:
     """Return the original of a decoded value: a list was a tuple, {"members": [...]} a frozenset."""
-    if isinstance(said, list):
-        return tuple(said) if PLAIN.issuperset(map(type, said)) else tuple(map(value_of, said))
-    if isinstance(said, dict):
-        if set(said) == {"float"}:
-            return float(said["float"])
-        if set(said) == {"members"} and isinstance(said["members"], list):
-            return frozenset(said["members"])
-        return {name: value_of(part) for name, part in said.items()}
-    return said
+    if isinstance(decoded, list):
+        return tuple(decoded) if PLAIN.issuperset(map(type, decoded)) else tuple(map(value_of, decoded))
+    if isinstance(decoded, dict):
+        if set(decoded) == {"float"}:
+            return float(decoded["float"])
+        if set(decoded) == {"members"} and isinstance(decoded["members"], list):
+            return frozenset(decoded["members"])
+        return {name: value_of(part) for name, part in decoded.items()}
+    return decoded
 
 
-def said_timings(timings: Timings | Learned | None) -> Any:
+def encode_timings(timings: Timings | Learned | None) -> Any:
     """Return the reply times of a node in the form of a message."""
     if isinstance(timings, Learned):
-        return {"learned": said_timings(timings.document)}
+        return {"learned": encode_timings(timings.document)}
     if timings is None:
         return None
-    return {step: _said_timing(getattr(timings, step)) for step in ("read", "write", "packet")}
+    return {step: _encode_timing(getattr(timings, step)) for step in ("read", "write", "packet")}
 
 
-def timings_of(said: Any) -> Timings | Learned | None:
+def timings_of(decoded: Any) -> Timings | Learned | None:
     """Return the reply times in a message. Raises InvalidCommand for invalid ones."""
-    if said is None:
+    if decoded is None:
         return None
     try:
-        if set(said) == {"learned"}:
-            document = timings_of(said["learned"])
+        if set(decoded) == {"learned"}:
+            document = timings_of(decoded["learned"])
             if isinstance(document, Learned):
                 raise TypeError("learned twice")
             return Learned(document)
-        steps = {step: ReplyTiming(**timing) for step, timing in said.items()}
+        steps = {step: ReplyTiming(**timing) for step, timing in decoded.items()}
         times = Timings(**steps)
     except (TypeError, KeyError) as error:
         raise InvalidCommand(f"invalid reply times: {error}") from None
@@ -153,7 +153,7 @@ def check_within(times: Timings | Learned | None, profile: Profile, address: int
                 )
 
 
-def _said_timing(timing: ReplyTiming) -> dict[str, float]:
+def _encode_timing(timing: ReplyTiming) -> dict[str, float]:
     names = ("late_after", "window", "max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence")
     return {name: value for name in names if (value := getattr(timing, name)) is not None}
 
@@ -167,7 +167,7 @@ def _finite(value: Any) -> Any:
     return list(map(_finite, value)) if isinstance(value, list | tuple) else value
 
 
-def _said_set(value: Any) -> dict[str, list[Any]]:
+def _encode_set(value: Any) -> dict[str, list[Any]]:
     """Return a set (flags that are on) in the form of a message. Raises TypeError for any other type."""
     if isinstance(value, AbstractSet):
         return {"members": sorted(value)}
@@ -178,7 +178,7 @@ def _encoder() -> Callable[..., Iterable[str]]:
     """Return what makes the parts of a value's text, which is not indented: 0. It is made once: Python does so anew for
     each value, which takes longer than to use it.
     """
-    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
+    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_encode_set)
     text = json.encoder.encode_basestring_ascii
     try:
         make = json.encoder.c_make_encoder  # type: ignore[attr-defined]  # undocumented

@@ -17,7 +17,7 @@ class MessageSink(Protocol):
         """Return whether earlier messages are still unsent."""
         ...
 
-    def say(self, text: str, /) -> None: ...
+    def send(self, text: str, /) -> None: ...
 
 
 class _Message:
@@ -57,7 +57,7 @@ class Outbox:
         if self._messages or self._sink.full:
             self._messages[_Message(text)] = None
         else:
-            self._sink.say(text)
+            self._sink.send(text)
 
     def put_latest(self, key: Hashable, text: str) -> None:
         """Send a message that replaces an earlier unsent one with the same key."""
@@ -68,12 +68,12 @@ class Outbox:
             self._latest[key] = message = _Message(text, key)
             self._messages[message] = None
         else:
-            self._sink.say(text)
+            self._sink.send(text)
 
     def put_news(self, key: Hashable, text: str) -> None:
         """Send a notification of a stream, unless the client does not keep up."""
         if not self._messages and not self._sink.full:
-            self._sink.say(text)
+            self._sink.send(text)
             return
         while len(self._news) >= MOST_UNREAD:
             oldest = self._news.popleft()
@@ -91,4 +91,4 @@ class Outbox:
                 self._news.popleft()
             elif self._latest.get(message.key) is message:
                 del self._latest[message.key]
-            self._sink.say(message.text)
+            self._sink.send(message.text)

@@ -83,13 +83,13 @@ class Part:
         self.rows = ""
         self.values = ""
 
-    def say_rows(self, number: int) -> None:
+    def send_rows(self, number: int) -> None:
         """Work out what these points are, in the picture's `number`-th set."""
-        rows = [_said_point(self.group, point) for point in self._points]
+        rows = [_encode_point(self.group, point) for point in self._points]
         self.rows = encoded({"set": number, "first": self.first, "rows": rows})
         self.values = encoded({"set": number, "first": self.first, "values": []})
 
-    def say_values(self, number: int, bus: Bus) -> bool:
+    def send_values(self, number: int, bus: Bus) -> bool:
         """Work out what these points hold now, and return whether that is something else than before."""
         snapshot, line = self.group.latest, ext.line_of(bus)
         if snapshot is None:
@@ -101,7 +101,7 @@ class Part:
         self._seen = seen
         self._snapshot = snapshot  # kept: no other can have its id then, as one with a value read after a write could
         alarms = bus.alarms
-        values = [_said_value(bus, point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
+        values = [_encode_value(bus, point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
         before, self.values = self.values, encoded({"set": number, "first": self.first, "values": values})
         return self.values != before
 
@@ -136,31 +136,31 @@ class Overview(Broadcast):
         self._fresh.append((reader, stream))
         super().join(reader, stream)
 
-    async def _tell(self) -> None:
+    async def _notify(self) -> None:
         while True:
             fresh, self._fresh = self._fresh, []
-            await self._tell_points(fresh)
-            await self._tell_counts(fresh)
-            await self._say("frame", 0, encoded(self._frame()), tuple(self.readers))
+            await self._send_points(fresh)
+            await self._send_counts(fresh)
+            await self._send("frame", 0, encoded(self._frame()), tuple(self.readers))
             await asyncio.sleep(INTERVAL)
 
-    async def _say(self, method: str, part: int, body: str, places: Sequence[Place]) -> None:
+    async def _send(self, method: str, part: int, body: str, places: Sequence[Place]) -> None:
         for number, place in enumerate(places):
             if number and number % READERS_IN_A_TURN == 0:
                 await asyncio.sleep(0)
             if place in self.readers:
-                place[0].tell_surely(place[1], method, body, part)
+                place[0].notify_surely(place[1], method, body, part)
 
     # points
 
-    async def _tell_points(self, fresh: Sequence[Place]) -> None:
+    async def _send_points(self, fresh: Sequence[Place]) -> None:
         new = self._regroup()
         for number, part in enumerate(self._parts):
             if new:
-                part.say_rows(self._set)
-            await self._say("rows", number, part.rows, tuple(self.readers) if new else fresh)
-            changed = part.say_values(self._set, self._bus)
-            await self._say("values", number, part.values, tuple(self.readers) if changed else fresh)
+                part.send_rows(self._set)
+            await self._send("rows", number, part.rows, tuple(self.readers) if new else fresh)
+            changed = part.send_values(self._set, self._bus)
+            await self._send("values", number, part.values, tuple(self.readers) if changed else fresh)
             if new or changed:
                 await asyncio.sleep(0)
 
@@ -187,7 +187,7 @@ class Overview(Broadcast):
 
     # counts
 
-    async def _tell_counts(self, fresh: Sequence[Place]) -> None:
+    async def _send_counts(self, fresh: Sequence[Place]) -> None:
         now = self._bus.now()
         due = now >= self._counted_at + COUNTED_EVERY
         if due:
@@ -195,12 +195,12 @@ class Overview(Broadcast):
             self._counts = {key: self._counts.get(key, "") for key in self._count_keys()}
         for (method, first), text in self._counts.items():
             if due:
-                things = _said_groups if method == "groups" else _said_nodes
-                told = things(self._bus, first)
-                text = encoded({"first": first, method: told})
+                things = _encode_groups if method == "groups" else _encode_nodes
+                changes = things(self._bus, first)
+                text = encoded({"first": first, method: changes})
                 self._counts[method, first] = text
                 await asyncio.sleep(0)
-            await self._say(method, first, text, tuple(self.readers) if due else fresh)
+            await self._send(method, first, text, tuple(self.readers) if due else fresh)
 
     def _count_keys(self) -> Iterator[tuple[str, int]]:
         for method, number in (("groups", len(self._bus.groups)), ("nodes", len(self._bus.nodes))):
@@ -250,7 +250,7 @@ def _same(one: tuple[PollGroup, tuple[Point[Any], ...]], other: tuple[PollGroup,
     return one[0] is other[0] and len(one[1]) == len(other[1]) and all(map(is_, one[1], other[1]))
 
 
-def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
+def _encode_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
     return {
         "group": group.name,
         "key": point.key,
@@ -265,7 +265,7 @@ def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
     }
 
 
-def _said_value(
+def _encode_value(
     bus: Bus, point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None
 ) -> list[Any] | None:
     """Return value, quality, time of the request, error, and alarm ("" for none).
@@ -285,7 +285,7 @@ def shown(point: Point[Any], value: Any) -> Any:
     return value if type(value) in (int, float) or value is None else value_text(value, point.meaning.precision)
 
 
-def said_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any]:
+def encode_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any]:
     """Return the details of one point of a group: its last exchange, its limits, and the meaning of its value."""
     sample = None if group.latest is None else group.latest.samples.get(point)
     if sample is not None:
@@ -294,7 +294,7 @@ def said_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any
     node = point.node if isinstance(point.node, Node) else None
     return {
         "command": str(point.command),
-        "sample": _said_value(bus, point, sample),
+        "sample": _encode_value(bus, point, sample),
         "hint": "" if sample is None or sample.error is None else sample.error.hint or "",
         "timeline": None if sample is None else sample.timeline._asdict(),
         "due": None if sample is None else sample.due,
@@ -309,21 +309,21 @@ def said_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any
     }
 
 
-def _said_groups(bus: Bus, first: int) -> list[dict[str, Any]]:
-    said = []
+def _encode_groups(bus: Bus, first: int) -> list[dict[str, Any]]:
+    decoded = []
     for group in islice(bus.groups, first, first + COUNTED_AT_ONCE):
         counts = group.statistics()
-        told = {"name": group.name, "period": group.period, "paused": group.paused}
-        told |= {name: getattr(counts, name) for name in ("cycles", "missed", "achieved")}
-        said.append(told | {"jitter": counts.jitter.p99})
-    return said
+        changes = {"name": group.name, "period": group.period, "paused": group.paused}
+        changes |= {name: getattr(counts, name) for name in ("cycles", "missed", "achieved")}
+        decoded.append(changes | {"jitter": counts.jitter.p99})
+    return decoded
 
 
-def _said_nodes(bus: Bus, first: int) -> list[dict[str, Any]]:
-    return [_said_node(node) for node in islice(bus.nodes, first, first + COUNTED_AT_ONCE)]
+def _encode_nodes(bus: Bus, first: int) -> list[dict[str, Any]]:
+    return [_encode_node(node) for node in islice(bus.nodes, first, first + COUNTED_AT_ONCE)]
 
 
-def _said_node(node: Node) -> dict[str, Any]:
+def _encode_node(node: Node) -> dict[str, Any]:
     counts = node.statistics()
     return {
         "label": node.label,

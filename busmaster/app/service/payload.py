@@ -35,32 +35,32 @@ def read_payload(payload: object) -> Payload:
         raise NoCommand(f"a command must have at most {LONGEST_COMMAND} bytes, not {len(raw)}", "")
     text = bytes(raw).decode(errors="replace")
     try:
-        said = json.loads(text, parse_constant=lambda name: name)
+        decoded = json.loads(text, parse_constant=lambda name: name)
     except (ValueError, RecursionError):
-        said = None
-    mark = said.get("id", "") if isinstance(said, dict) else ""
+        decoded = None
+    mark = decoded.get("id", "") if isinstance(decoded, dict) else ""
     shown = str(mark)
     if not isinstance(mark, str | int) or isinstance(mark, bool) or len(shown) > LONGEST_ID or not shown.isprintable():
         raise NoCommand(f"an id must be a whole number, or a text of one line with at most {LONGEST_ID} characters", "")
     try:
-        value, expires = _read(said, text)
+        value, expires = _read(decoded, text)
     except InvalidCommand as error:
         raise NoCommand(str(error), shown) from None
     return Payload(value, shown, expires)
 
 
-def _read(said: Any, text: str) -> tuple[Any, float | None]:
+def _read(decoded: Any, text: str) -> tuple[Any, float | None]:
     """Return the value and the expiry time."""
-    if not isinstance(said, dict):
-        return _numbers(said, text), None
-    if not set(said) <= {"value", "id", "expires"} or "value" not in said:
+    if not isinstance(decoded, dict):
+        return _numbers(decoded, text), None
+    if not set(decoded) <= {"value", "id", "expires"} or "value" not in decoded:
         raise InvalidCommand(f'{text[:40]!r} is not a command; use {{"value": ..., "id": ..., "expires": ...}}')
-    expires = said.get("expires")
+    expires = decoded.get("expires")
     if expires is not None and not _is_number(expires):
         raise InvalidCommand("expires must be a time in seconds since 1970")
     if expires is not None and expires > LATEST:
         raise InvalidCommand("expires must be a time in seconds since 1970, not in milliseconds")
-    return _numbers(said["value"], text), expires
+    return _numbers(decoded["value"], text), expires
 
 
 def _numbers(value: Any, text: str) -> Any:

@@ -125,10 +125,10 @@ def holder_of(connected: Any, token: str, digest: bytes | None) -> Holder:
 def _more_groups(connected: Any) -> tuple[int, ...]:
     """Return the groups of a process beside its first."""
     try:
-        said: bytes = connected.getsockopt(socket.SOL_SOCKET, PEER_GROUPS, 4 * MOST_GROUPS)
+        groups: bytes = connected.getsockopt(socket.SOL_SOCKET, PEER_GROUPS, 4 * MOST_GROUPS)
     except OSError:  # an older kernel, or more groups than fit
         return ()
-    return struct.unpack(f"{len(said) // 4}I", said)
+    return struct.unpack(f"{len(groups) // 4}I", groups)
 
 
 def find_name(uid: int) -> asyncio.Future[None] | None:

@@ -139,7 +139,7 @@ class Frame:
 
 
 class Picture:
-    """The state of a line, built from the messages of its owner. `hear` takes them.
+    """The state of a line, built from the messages of its owner. `receive` takes them.
 
     `clean` prepares received values for the display: it restores them, and can also remove control characters.
     """
@@ -155,9 +155,9 @@ class Picture:
         self._nodes: dict[int, list[Node]] = {}
         self._touches = Touches()
 
-    def hear(self, method: str, said: Mapping[str, Any]) -> None:
+    def receive(self, method: str, decoded: Mapping[str, Any]) -> None:
         """Handle one message of the line's owner. Additions of later versions are ignored."""
-        body = self._clean(said)
+        body = self._clean(decoded)
         match method:
             case "frame":
                 self._begin(body.pop("set"))
@@ -177,9 +177,9 @@ class Picture:
                 for row in self.rows:
                     row.doubt(self._touches)
             case "groups":
-                self._groups[body["first"]] = [_made(Group, said) for said in body["groups"]]
+                self._groups[body["first"]] = [_made(Group, decoded) for decoded in body["groups"]]
             case "nodes":
-                self._nodes[body["first"]] = [_made(Node, said) for said in body["nodes"]]
+                self._nodes[body["first"]] = [_made(Node, decoded) for decoded in body["nodes"]]
 
     def lose(self, why: str) -> None:
         """Note that the program that owns the line is gone: no node is up, and no value is good."""
@@ -198,8 +198,8 @@ class Picture:
             self._rows.clear()
             self._values.clear()
 
-    def _take_rows(self, first: int, said: Sequence[Mapping[str, Any]]) -> None:
-        self._rows[first] = rows = [_made(Row, row) for row in said]
+    def _take_rows(self, first: int, decoded: Sequence[Mapping[str, Any]]) -> None:
+        self._rows[first] = rows = [_made(Row, row) for row in decoded]
         alike: dict[tuple[str, str], int] = {}
         for row in self.rows:
             row.number = alike.get((row.group, row.key), 0)
@@ -233,9 +233,9 @@ class Picture:
         return {(node.protocol, node.address): node for node in nodes[: self.frame.nodes if self.frame else 0]}
 
 
-def _made(kind: Any, said: Mapping[str, Any]) -> Any:
+def _made(kind: Any, decoded: Mapping[str, Any]) -> Any:
     """Return the object of these fields, without those that it does not have."""
-    return kind(**{name: said[name] for name in kind.__dataclass_fields__ if name in said})
+    return kind(**{name: decoded[name] for name in kind.__dataclass_fields__ if name in decoded})
 
 
 def matching(rows: list[Row], nodes: Mapping[tuple[str, int], Node], words: str) -> Iterator[Row]:

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from typing import Any
 
 from busmaster import Bus, LineSettings, Priority, ext
-from busmaster.app.service.messages import said_timings, timings_of, value_of
-from busmaster.app.service.telling import protocol_of
+from busmaster.app.service.encoding import protocol_of
+from busmaster.app.service.messages import encode_timings, timings_of, value_of
 from busmaster.bounds import MOST_PLANNED_GROUPS, MOST_PLANNED_READS
 from busmaster.errors import InvalidCommand
 from busmaster.ext import (
@@ -45,10 +45,10 @@ class Planner:
         """Return the plan as it is sent. Raises InvalidCommand for a line with too many groups."""
         async with self._turn:
             _check_groups(len(self._bus.groups) + len(more))
-            return said_plan(await ext.plan_with_pauses(self._bus, *more, pause=PAUSE))
+            return encode_plan(await ext.plan_with_pauses(self._bus, *more, pause=PAUSE))
 
 
-def said_groups(groups: Sequence[PlannedGroup]) -> list[dict[str, Any]]:
+def encode_groups(groups: Sequence[PlannedGroup]) -> list[dict[str, Any]]:
     """Return planned groups as they are sent. Raises InvalidCommand for those that cannot be."""
     if any(group.merge for group in groups):
         raise InvalidCommand("merges of planned groups cannot be sent to the program that owns the line")
@@ -67,7 +67,7 @@ def said_groups(groups: Sequence[PlannedGroup]) -> list[dict[str, Any]]:
                     "protocol": node.profile.name,
                     "address": node.address,
                     "command": protocol_of(node.profile.name).write_down(command),
-                    "timings": said_timings(node.timings),
+                    "timings": encode_timings(node.timings),
                     "reply_time": node.reply_time,
                 }
                 for node, command in group.reads
@@ -77,14 +77,14 @@ def said_groups(groups: Sequence[PlannedGroup]) -> list[dict[str, Any]]:
     ]
 
 
-def groups_of(said: Any, bus: Bus) -> list[PlannedGroup]:
+def groups_of(decoded: Any, bus: Bus) -> list[PlannedGroup]:
     """Return the planned groups that a client has sent: nodes of the line are as the line has measured them.
 
     Raises InvalidCommand for what no planned group is.
     """
-    if not isinstance(said, list) or not all(isinstance(group, dict) for group in said):
+    if not isinstance(decoded, list) or not all(isinstance(group, dict) for group in decoded):
         raise InvalidCommand("the groups of a plan are a list of objects")
-    _check_size(sum(len(group["reads"]) for group in said))
+    _check_size(sum(len(group["reads"]) for group in decoded))
     known = {(node.profile.name, node.address): node.planned() for node in bus.nodes}
     return [
         PlannedGroup(
@@ -94,25 +94,25 @@ def groups_of(said: Any, bus: Bus) -> list[PlannedGroup]:
             None if group.get("phase") is None else seconds(group["phase"], "a phase"),
             checked_priority(group.get("priority", Priority.POLL)),
         )
-        for group in said
+        for group in decoded
     ]
 
 
-def _period(said: Any) -> float:
-    if not SHORTEST <= (period := seconds(said, "a period")) <= LONGEST:
+def _period(decoded: Any) -> float:
+    if not SHORTEST <= (period := seconds(decoded, "a period")) <= LONGEST:
         raise InvalidCommand(f"the period of a planned group is {SHORTEST:g} to {LONGEST:g} s, not {period:g}")
     return period
 
 
-def _read(said: Mapping[str, Any], known: Mapping[tuple[str, int], PlannedNode]) -> tuple[PlannedNode, Any]:
-    protocol = protocol_of(said["protocol"])
-    address = whole_number(said["address"], 0, 2**31, "an address")
-    command = protocol.read_back(said["command"])
+def _read(decoded: Mapping[str, Any], known: Mapping[tuple[str, int], PlannedNode]) -> tuple[PlannedNode, Any]:
+    protocol = protocol_of(decoded["protocol"])
+    address = whole_number(decoded["address"], 0, 2**31, "an address")
+    command = protocol.read_back(decoded["command"])
     _check_reads(command)
     if (node := known.get((protocol.name, address))) is not None:
         return node, command
     protocol.profile.check_address(address)
-    times, reply_time = timings_of(said.get("timings")), said.get("reply_time")
+    times, reply_time = timings_of(decoded.get("timings")), decoded.get("reply_time")
     if isinstance(times, Learned):
         times = times.document
     reply_time = None if reply_time is None else seconds(reply_time, "a reply time")
@@ -136,14 +136,14 @@ def _check_size(reads: int) -> None:
         raise InvalidCommand(f"a client has {MOST_PLANNED_READS} reads planned at once, and not {reads}")
 
 
-def said_plan(plan: Plan) -> dict[str, Any]:
+def encode_plan(plan: Plan) -> dict[str, Any]:
     """Return a plan as it is sent."""
     return {**asdict(plan), "worst_waits": [plan.worst_waits[priority] for priority in Priority]}
 
 
-def plan_of(said: Mapping[str, Any]) -> Plan:
+def plan_of(decoded: Mapping[str, Any]) -> Plan:
     """Return the plan that was sent."""
-    plan = value_of(said)
+    plan = value_of(decoded)
     groups = tuple(
         GroupPlan(**{**group, "merged": tuple(MergedReads(**merged) for merged in group["merged"])})
         for group in plan["groups"]

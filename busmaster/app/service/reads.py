@@ -7,9 +7,9 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.failures import REFUSED
 from busmaster.app.service.messages import BEFORE_NUMBER, read, words
-from busmaster.app.service.telling import protocol_of
 from busmaster.ext import Command
 
 KEPT = 1024
@@ -35,28 +35,28 @@ def words_of(protocol: str, address: int, command: Command[Any]) -> str:
 
     Raises InvalidCommand for a command that the protocol does not have.
     """
-    said = protocol_of(protocol).write_down(command)
-    return words("request", {"protocol": protocol, "address": address, "command": said})
+    decoded = protocol_of(protocol).write_down(command)
+    return words("request", {"protocol": protocol, "address": address, "command": decoded})
 
 
 def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     """Return the number of a message that is a plain read, and that; None for any other, and for a bad one."""
     if not isinstance(message, str) or len(message) > SHORT:
         return None
-    said, _, rest = message.rpartition(END)
+    decoded, _, rest = message.rpartition(END)
     digits = rest[:-1]
     if not digits.isdecimal():
         return None
     number = int(digits)
-    asked = _asked_in(said) if rest == f"{number}}}" else None
+    asked = _asked_in(decoded) if rest == f"{number}}}" else None
     return None if asked is None else (number, asked)
 
 
 @lru_cache(KEPT)
-def _asked_in(said: str) -> PlainRead | None:
+def _asked_in(decoded: str) -> PlainRead | None:
     """Return the plain read in this text, up to END, without its number; None if it is not a plain read."""
     try:
-        message = read(f"{said}}}}}}}")
+        message = read(f"{decoded}}}}}}}")
         params = message["params"]
         if message.keys() != {"jsonrpc", "method", "params"} or message["method"] != "request":
             return None

@@ -40,17 +40,17 @@ MOST_INTERFACES = 16
 MOST_GOOD = 16
 """Names of tokens that are remembered for one peer."""
 
-Told = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 class LimitedReport:
     """Reports what happens often: the first time at once, then at most once in REPORT_EVERY, with the counts since.
 
-    `text` makes a sentence of the counts. A report is given to `tell`, on the running loop.
+    `text` makes a sentence of the counts. A report is given to `report`, on the running loop.
     """
 
-    def __init__(self, tell: Told, text: Callable[[Counter[str]], str]) -> None:
-        self._tell = tell
+    def __init__(self, report: Report, text: Callable[[Counter[str]], str]) -> None:
+        self._deliver = report
         self._text = text
         self._counts: Counter[str] = Counter()
         self._timer: asyncio.TimerHandle | None = None
@@ -67,7 +67,7 @@ class LimitedReport:
         self._timer = None
         if self._counts:
             counts, self._counts = self._counts, Counter()
-            self._tell(self._text(counts))
+            self._deliver(self._text(counts))
             self._timer = asyncio.get_running_loop().call_later(REPORT_EVERY, self._report)
 
 
@@ -84,7 +84,7 @@ class Refusals:
         """Failed logins, by the interface."""
         self.at_interfaces: Counter[tuple[str, str]] = Counter()
         """Connections and requests that interfaces have refused, by the interface and the kind."""
-        self.on_report: list[Told] = []
+        self.on_report: list[Report] = []
         self._reports: dict[str, LimitedReport] = {}
 
     def note_connection(self, role: str) -> None:
@@ -131,11 +131,11 @@ class Refusals:
         return interface if interface in known or len(known) < MOST_INTERFACES else OTHERS
 
     def _report(self, kind: str, text: Callable[[Counter[str]], str]) -> LimitedReport:
-        return self._reports.setdefault(kind, LimitedReport(self._tell, text))
+        return self._reports.setdefault(kind, LimitedReport(self._deliver, text))
 
-    def _tell(self, text: str) -> None:
-        for tell in self.on_report:
-            tell(text)
+    def _deliver(self, text: str) -> None:
+        for report in self.on_report:
+            report(text)
 
 
 def _refused_text(counts: Counter[str]) -> str:

@@ -12,22 +12,22 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from busmaster import Point, Priority, Sample, Timings
+from busmaster.app.service.encoding import (
+    encode_points,
+    encode_sync_reads,
+    event_of,
+    protocol_of,
+    statistics_of,
+)
 from busmaster.app.service.link import TCP, Link
-from busmaster.app.service.messages import said_timings, words
-from busmaster.app.service.plans import plan_of, said_groups
+from busmaster.app.service.messages import encode_timings, words
+from busmaster.app.service.plans import encode_groups, plan_of
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.app.service.remote_node import RemoteNode
 from busmaster.app.service.remote_overview import RemoteOverview
 from busmaster.app.service.safe import outcomes_of
 from busmaster.app.service.sequences import RequestLimit
-from busmaster.app.service.telling import (
-    event_of,
-    protocol_of,
-    said_points,
-    said_sync_reads,
-    statistics_of,
-)
 from busmaster.bounds import LONGEST_REQUEST, MOST_CHECKED
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.events import BusEvent, Stream
@@ -38,7 +38,7 @@ from busmaster.statistics import LineStatistics
 T = TypeVar("T")
 EVENT_BUFFER = 256
 POINTS_IN_A_MESSAGE = 50
-CLOCK_IS_HEARD = 3
+CLOCK_IS_RECEIVED = 3
 """Number of clock readings. If this program is busy during one, the offset is wrong, and its writes seem old."""
 
 
@@ -84,7 +84,7 @@ class RemoteBus:
         """Seconds by which the clock of the owner's machine is ahead, less the time of the message."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
-        self._told: set[RemoteNode] = set()
+        self._reported: set[RemoteNode] = set()
         """Nodes that the owner knows."""
         self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
         self._listed: dict[str, float] = {}
@@ -109,12 +109,12 @@ class RemoteBus:
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
             raise InvalidCommand(f"the bus of {self.address} was already entered; enter it once, and share it")
-        link = Link(self.address, self._token, self._hear, self._lost, safe_only=self._safe_only)
+        link = Link(self.address, self._token, self._receive, self._lost, safe_only=self._safe_only)
         self._link = link
-        said = await link.open(sys.argv[0])
-        self.about, self.line = said, said["line"]
-        self._listed = {group["name"]: group["period"] for group in said["groups"]}
-        for known in said["nodes"]:
+        decoded = await link.open(sys.argv[0])
+        self.about, self.line = decoded, decoded["line"]
+        self._listed = {group["name"]: group["period"] for group in decoded["groups"]}
+        for known in decoded["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
                 node.label = known["label"]
@@ -123,10 +123,10 @@ class RemoteBus:
         try:
             if self.address.startswith(TCP) and not self._safe_only:
                 # another machine, perhaps: its clock began at another moment
-                self._ahead = max([await self._hear_clock() for _ in range(CLOCK_IS_HEARD)])
+                self._ahead = max([await self._receive_clock() for _ in range(CLOCK_IS_RECEIVED)])
             for node, commands, stop in self._prepared:
                 for first in range(0, len(commands), MOST_CHECKED):
-                    await self._ask("check", node.said_sync_read(commands[first : first + MOST_CHECKED], stop))
+                    await self._ask("check", node.encode_sync_read(commands[first : first + MOST_CHECKED], stop))
         except BaseException:
             await link.close()
             raise
@@ -177,8 +177,8 @@ class RemoteBus:
         """
         profile.check_address(address)
         node = self._find(profile, address)
-        said = self._named.setdefault(node, (timings, retries))
-        if timings not in (None, said[0]) or retries not in (None, said[1]):
+        decoded = self._named.setdefault(node, (timings, retries))
+        if timings not in (None, decoded[0]) or retries not in (None, decoded[1]):
             raise InvalidCommand(
                 f"{node.label} is already in use with other timings or retries; "
                 "give all handles of an address the same options, or set them only in the first"
@@ -210,16 +210,16 @@ class RemoteBus:
 
     def _name(self, node: RemoteNode) -> None:
         """Inform the owner once that this program uses a node, with its settings."""
-        if node in self._told:
+        if node in self._reported:
             return
-        self._told.add(node)
+        self._reported.add(node)
         timings, retries = self._named[node]
         params: dict[str, Any] = {"protocol": node.profile.name, "address": node.address}
         if timings is not None:
-            params["timings"] = said_timings(timings)
+            params["timings"] = encode_timings(timings)
         if retries is not None:
             params["retries"] = retries
-        params |= said_sync_reads(node.profile)
+        params |= encode_sync_reads(node.profile)
         asked = self.link.ask("node", params, node=node)
 
         def named(future: asyncio.Future[Any]) -> None:
@@ -240,7 +240,7 @@ class RemoteBus:
         Nodes that the owner has are as it has measured them. Raises InvalidCommand for groups that have more than 200
         reads in all, or merges.
         """
-        question = words("plan", {"groups": said_groups(more)})
+        question = words("plan", {"groups": encode_groups(more)})
         if len(question) > LONGEST_REQUEST // 2:
             raise InvalidCommand("these groups are too long for one message; plan fewer of them at once")
         async with self._planning:  # the owner calculates one at a time for each program
@@ -329,7 +329,7 @@ class RemoteBus:
 
         `kind` is "logins", "connections" or "requests". Without peers, the owner begins to count the kind at 0.
         """
-        self.link.tell("refusals", {"interface": interface, "kind": kind, "peers": dict(peers)})
+        self.link.notify("refusals", {"interface": interface, "kind": kind, "peers": dict(peers)})
 
     def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens to line and nodes from now on; a node in it is this program's."""
@@ -339,17 +339,17 @@ class RemoteBus:
             self.link.ask("events", {"stream": 0})
         return stream
 
-    async def overview(self, hear: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
-        """Call `hear` with the overview of the line, a few times a second, as described in docs/service.md."""
+    async def overview(self, receive: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
+        """Call `receive` with the overview of the line, a few times a second, as described in docs/service.md."""
         self._count += 1
-        overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
+        overview = self._streams[self._count] = RemoteOverview(self.link, self.now, receive)
         await self._ask("overview", {"stream": self._count})
         return overview
 
-    async def exchanges(self, hear: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
-        """Call `hear` with the exchanges on the line, as described in docs/service.md."""
+    async def exchanges(self, receive: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
+        """Call `receive` with the exchanges on the line, as described in docs/service.md."""
         self._count += 1
-        exchanges = self._streams[self._count] = RemoteExchanges(hear, partial(self.end_stream, self._count))
+        exchanges = self._streams[self._count] = RemoteExchanges(receive, partial(self.end_stream, self._count))
         await self._ask("exchanges", {"stream": self._count})
         return exchanges
 
@@ -357,12 +357,12 @@ class RemoteBus:
         """End a stream."""
         stream = self._streams.pop(number, None)
         if stream is not None:
-            self.link.tell("end", {"stream": number})
+            self.link.notify("end", {"stream": number})
             stream.end()
 
     # inside
 
-    async def _hear_clock(self) -> float:
+    async def _receive_clock(self) -> float:
         """Return the offset of the owner's clock, less the time of the message: never more than the real offset."""
         now: float = await self._ask("now", {})
         return now - time.monotonic()
@@ -395,13 +395,13 @@ class RemoteBus:
         params: Mapping[str, Any],
     ) -> None:
         """Have the owner send the cycles of a group. An error ends the group, whose consumers raise it."""
-        said = said_points(points)
+        decoded = encode_points(points)
         try:
-            while len(said) > POINTS_IN_A_MESSAGE:
-                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
-                del said[:POINTS_IN_A_MESSAGE]
-            if said:
-                params = {**params, "points": said}
+            while len(decoded) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": decoded[:POINTS_IN_A_MESSAGE]})
+                del decoded[:POINTS_IN_A_MESSAGE]
+            if decoded:
+                params = {**params, "points": decoded}
             answer = await self._ask(method, {**params, "stream": number})
         except (BusError, InvalidCommand) as error:
             group.end(error)
@@ -412,28 +412,28 @@ class RemoteBus:
                 group.owners_name = answer["name"]
                 self._own_names.add(group.owners_name)
 
-    def _hear(self, method: str, params: Mapping[str, Any]) -> None:
+    def _receive(self, method: str, params: Mapping[str, Any]) -> None:
         if method == "stops":
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
         elif method == "poll_groups":
-            self._listed = {said["name"]: said["period"] for said in params["groups"]}
+            self._listed = {decoded["name"]: decoded["period"] for decoded in params["groups"]}
         elif method == "access":
             self.about = {**self.about, **params}
-            for tell in self.on_access:
-                tell()
+            for notify in self.on_access:
+                notify()
         elif method == "touched":
             self._touched[params["protocol"], params["address"]] = params["when"]
-            for told in self.on_touched:
-                told(params)
+            for take in self.on_touched:
+                take(params)
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:
                 if event is not None:
                     stream.put(event)
         elif (listener := self._streams.get(params.get("stream", -1))) is not None:
-            listener.hear(method, params)
+            listener.receive(method, params)
 
     def _lost(self) -> None:
         for listener in list(self._streams.values()):

@@ -9,14 +9,14 @@ from typing import Any
 class RemoteExchanges:
     """The exchanges of a line, received until `close`, or until the connection ends."""
 
-    def __init__(self, hear: Callable[[Mapping[str, Any]], None], end: Callable[[], None]) -> None:
-        self._hear = hear
+    def __init__(self, receive: Callable[[Mapping[str, Any]], None], end: Callable[[], None]) -> None:
+        self._receive = receive
         self._end = end
 
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
+    def receive(self, method: str, params: Mapping[str, Any]) -> None:
         """Handle a message of the line's owner."""
         if method == "exchanges":
-            self._hear(params["body"])
+            self._receive(params["body"])
 
     def end(self) -> None:
         """Do nothing: the end of the connection is reported elsewhere."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from busmaster import Point, Snapshot
-from busmaster.app.service.telling import FindNode, owners_point_of, snapshot_of
+from busmaster.app.service.encoding import FindNode, owners_point_of, snapshot_of
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import Stream
 from busmaster.ext import Cycles
@@ -97,7 +97,7 @@ class RemoteGroup(Cycles):
             self._end_stream(self._stream)
         self.end()
 
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
+    def receive(self, method: str, params: Mapping[str, Any]) -> None:
         """Take what the line's owner sends of it."""
         body = params["body"]
         for consumer in self._consumers:
@@ -107,7 +107,7 @@ class RemoteGroup(Cycles):
             self._set = body["set"]
             # By its own points, a program gets the values that they decode.
             if not self._own:
-                self._points = tuple(owners_point_of(said, self._find) for said in body["points"])
+                self._points = tuple(owners_point_of(decoded, self._find) for decoded in body["points"])
         elif method == "snapshot" and body["set"] == self._set:
             self._publish(snapshot_of(body, self.name, self._points))
         elif method == "ended":

@@ -8,11 +8,11 @@ from dataclasses import replace
 from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster import Point, Sample
+from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.link import Link
 from busmaster.app.service.messages import value_of, words
 from busmaster.app.service.reads import words_of
 from busmaster.app.service.sequences import HoldsLine, RequestLimit, held_remotely, shortened
-from busmaster.app.service.telling import protocol_of
 from busmaster.errors import InvalidCommand
 from busmaster.ext import (
     ORDINARY,
@@ -88,7 +88,7 @@ class RemoteNode:
     def note_stop(self) -> None:
         """Inform the line that this node is being stopped, before all later requests."""
         self.stops += 1
-        self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
+        self._bus.link.notify("stop", {"protocol": self.profile.name, "address": self.address})
 
     def now(self) -> float:
         """Return the time of the line's clock, in seconds: that of its owner's machine."""
@@ -204,7 +204,7 @@ class RemoteNode:
             params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return words("request", params)
 
-    def said_sync_read(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
+    def encode_sync_read(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
         """Return writes of this node in the form of the message with which the line checks them."""
-        said = [self._protocol.write_down(command) for command in commands]
-        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
+        decoded = [self._protocol.write_down(command) for command in commands]
+        return {"protocol": self.profile.name, "address": self.address, "commands": decoded, "stop": stop}

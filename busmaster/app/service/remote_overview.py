@@ -14,20 +14,20 @@ SOON = 1.0
 
 
 class RemoteOverview:
-    """The pictures of a line: `hear` is called with the owner's messages, until the stream or the connection ends."""
+    """The pictures of a line. `receive` is called with the owner's messages until the stream or the connection ends."""
 
-    def __init__(self, link: Link, now: Callable[[], float], hear: Callable[[str, Mapping[str, Any]], None]) -> None:
+    def __init__(self, link: Link, now: Callable[[], float], receive: Callable[[str, Mapping[str, Any]], None]) -> None:
         self._link = link
         self._now = now
-        self._hear = hear
+        self._receive = receive
         self._ended = asyncio.Event()
 
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
+    def receive(self, method: str, params: Mapping[str, Any]) -> None:
         """Handle a message of the line's owner."""
         if method == "ended":
             self.end()
         else:
-            self._hear(method, params["body"])
+            self._receive(method, params["body"])
 
     def end(self) -> None:
         """Wake the functions that wait for the end."""
@@ -53,8 +53,8 @@ class RemoteOverview:
 
     async def details(self, group: str, key: str) -> Mapping[str, Any]:
         """Return what there is to know of one point of a group. Raises InvalidCommand for one that is gone."""
-        said: Mapping[str, Any] = await self._ask("details", {"group": group, "key": key})
-        return said
+        decoded: Mapping[str, Any] = await self._ask("details", {"group": group, "key": key})
+        return decoded
 
     async def write(self, group: str, key: str, value: Any) -> None:
         """Write a point of a group. Raises BusError or InvalidCommand as `Point.write`; the owner's limits hold."""

@@ -51,15 +51,15 @@ class Requests:
         """Return whether the safe state is being sent for this program."""
         return None in self._under_way.values()
 
-    def begin(self, number: int, said: Mapping[str, Any] | PlainRead) -> None:
+    def begin(self, number: int, decoded: Mapping[str, Any] | PlainRead) -> None:
         """Start a command. Raises Malformed if the number belongs to a request without a reply."""
         under_way = self._under_way
         if number in under_way:  # as check_number does: this is done for every request
             self.check_number(number)
         try:
             if len(under_way) >= MOST_REQUESTS:
-                self._check_room(said)
-            under_way[number] = request = client_request_of(said, self._sender, self._line)
+                self._check_room(decoded)
+            under_way[number] = request = client_request_of(decoded, self._sender, self._line)
             request.begin(partial(self._ended, number))
         except REFUSED as error:
             under_way.pop(number, None)
@@ -70,7 +70,7 @@ class Requests:
         self.check_number(number)
         try:
             self._check_room({})
-            sending = self._line.safe_wishes.begin(params["writes"], self._sender.peer)
+            sending = self._line.safe_writes.begin(params["writes"], self._sender.peer)
         except REFUSED as error:
             self._refuse(number, refusal_of("safe", error))
         else:
@@ -101,9 +101,9 @@ class Requests:
 
     # inside
 
-    def _check_room(self, said: Mapping[str, Any] | PlainRead) -> None:
+    def _check_room(self, decoded: Mapping[str, Any] | PlainRead) -> None:
         waiting = len(self._under_way)
-        if waiting >= MOST_REQUESTS and not (_is_urgent(said) and waiting < MOST_REQUESTS + MOST_URGENT):
+        if waiting >= MOST_REQUESTS and not (_is_urgent(decoded) and waiting < MOST_REQUESTS + MOST_URGENT):
             raise BacklogFull(f"{waiting} requests of this program have no reply yet")
 
     def _ended(self, number: int, request: ClientRequest, value: Any, error: BaseException | None) -> None:
@@ -137,5 +137,5 @@ def _unreported(request: ClientRequest, kind: type[BusError], what: str) -> BusE
     return kind(what, node=request.node, command=str(request.command))
 
 
-def _is_urgent(said: Mapping[str, Any] | PlainRead) -> bool:
-    return isinstance(said, Mapping) and bool(said.get("options", {}).get("priority") == Priority.URGENT)
+def _is_urgent(decoded: Mapping[str, Any] | PlainRead) -> bool:
+    return isinstance(decoded, Mapping) and bool(decoded.get("options", {}).get("priority") == Priority.URGENT)

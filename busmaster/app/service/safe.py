@@ -60,9 +60,9 @@ class SafeStateRequests:
         return {name: None if error is None else error_data(error) for name, error in outcomes.items()}
 
 
-def outcomes_of(said: Mapping[str, Any]) -> dict[str, BusError | None]:
+def outcomes_of(decoded: Mapping[str, Any]) -> dict[str, BusError | None]:
     """Return the result of each point in a message."""
-    return {name: None if error is None else bus_error_of(error) for name, error in said.items()}
+    return {name: None if error is None else bus_error_of(error) for name, error in decoded.items()}
 
 
 def _text(values: Mapping[str, Any]) -> str:

@@ -105,11 +105,11 @@ async def held_remotely(node: AsksInSequence, bus: HoldsLine, longest: float) ->
     """Have the owner of a line hold it for one sequence, `longest` seconds at most, and yield the node for it."""
     sequence, link = bus.new_sequence(), bus.link
     named = {"sequence": sequence, "protocol": node.profile.name, "address": node.address}
-    link.tell("hold", {**named, "max_hold": longest})
+    link.notify("hold", {**named, "max_hold": longest})
     try:
         yield _HeldRemoteNode(node, sequence)
     finally:
-        link.tell("release", {"sequence": sequence})
+        link.notify("release", {"sequence": sequence})
 
 
 class _HeldRemoteNode(HeldNode):

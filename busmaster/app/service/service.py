@@ -22,6 +22,7 @@ from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_connection import ClientConnection, MessageOrder
 from busmaster.app.service.connection import CLOSE_WITHIN, check_installed
+from busmaster.app.service.encoding import listed_groups
 from busmaster.app.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import INVALID_PARAMS, VERSIONS, Malformed, written
@@ -30,7 +31,6 @@ from busmaster.app.service.overview import state_text
 from busmaster.app.service.peers import Holder, Peer, find_name, process_of
 from busmaster.app.service.refusals import SERVICE, Logins, wait_text
 from busmaster.app.service.tcp import HostPort, check_listening, holder, is_our_name, listening
-from busmaster.app.service.telling import listed_groups
 from busmaster.errors import InvalidCommand
 from busmaster.ext import LEAST_SHARE, MOST_SHARE, NodeRecord
 from busmaster.registry import protocols
@@ -99,7 +99,7 @@ class Service:
         self._rate = ConnectionRate(time.monotonic)
         self._logins = Logins(partial(self.authorisation.refusals.note_login, SERVICE), time.monotonic)
         self._log = logging.getLogger("busmaster.app.service")
-        self.tell: Callable[[str], None] = self._log.warning
+        self.report: Callable[[str], None] = self._log.warning
         """Called, at most once a minute, with a text about refused connections and logins."""
         self.message_order = MessageOrder()
         self._groups_sent = -inf
@@ -158,11 +158,11 @@ class Service:
                 server.close()
             served.__exit__(None, None, None)
             raise
-        ext.line_of(self.bus).on_stop.append(self._tell_stop)
+        ext.line_of(self.bus).on_stop.append(self._notify_stop)
         self.line.journal.begin()
-        ext.line_of(self.bus).on_touched.append(self._tell_touched)
+        ext.line_of(self.bus).on_touched.append(self._notify_touched)
         ext.line_of(self.bus).on_groups.append(self._note_groups)
-        self.authorisation.on_access.append(self._tell_access)
+        self.authorisation.on_access.append(self._notify_access)
         self.authorisation.refusals.on_report.append(self._report)
         return self
 
@@ -170,14 +170,14 @@ class Service:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Stop listening, send all clients the results of their requests, and disconnect them."""
-        ext.line_of(self.bus).on_stop.remove(self._tell_stop)
-        ext.line_of(self.bus).on_touched.remove(self._tell_touched)
+        ext.line_of(self.bus).on_stop.remove(self._notify_stop)
+        ext.line_of(self.bus).on_touched.remove(self._notify_touched)
         ext.line_of(self.bus).on_groups.remove(self._note_groups)
         if self._groups_timer is not None:
             self._groups_timer.cancel()
-        self.authorisation.on_access.remove(self._tell_access)
+        self.authorisation.on_access.remove(self._notify_access)
         self.authorisation.refusals.on_report.remove(self._report)
-        await self.line.safe_wishes.close()
+        await self.line.safe_writes.close()
         for server in self._servers:
             server.close()
         connections = [*self._clients.values(), *self._strangers]
@@ -201,13 +201,13 @@ class Service:
     def _report(self, text: str) -> None:
         """Report a refusal, and show it in the events of the line."""
         self.line.journal.note(text)
-        self.tell(text)
+        self.report(text)
 
-    def _tell_stop(self, record: NodeRecord) -> None:
+    def _notify_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
-            client.tell_stops(record)
+            client.notify_stops(record)
 
-    def _tell_touched(self, record: NodeRecord, when: float) -> None:
+    def _notify_touched(self, record: NodeRecord, when: float) -> None:
         clients = [client for client in self._clients if client.has_values]
         if not clients:
             return
@@ -216,7 +216,7 @@ class Service:
         items = params["items"] = None if params["all"] else self.line.stale_items(record, when)
         key = (record.profile.name, record.address, None if items is None else tuple(items))
         for client in clients:
-            client.tell_touched(params, key)
+            client.notify_touched(params, key)
 
     def _note_groups(self) -> None:
         """Send the changed list of poll groups to all clients."""
@@ -298,19 +298,19 @@ class Service:
             return process_of(connected)
         return holder(connected, shown, self.authorisation.access)
 
-    def _tell_access(self) -> None:
+    def _notify_access(self) -> None:
         """Disconnect clients whose token is not valid any more, and send the others their permission."""
         for client, connection in self._clients.items():
             if client.peer.may_stay(self.authorisation.access):
-                client.tell_access()
+                client.notify_access()
             else:
                 connection.websocket.abort()
 
-    def admit(self, connection: ClientConnection, said: Mapping[str, Any], /) -> Client:
+    def admit(self, connection: ClientConnection, decoded: Mapping[str, Any], /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
-        params = said.get("params", {})
+        params = decoded.get("params", {})
         wanted = params.get("versions") if isinstance(params, dict) else None
-        if said.get("method") != "hello" or not isinstance(wanted, list):
+        if decoded.get("method") != "hello" or not isinstance(wanted, list):
             raise Malformed("the first message must be hello, with the supported versions")
         common = [version for version in VERSIONS if version in wanted]
         if not common:
@@ -332,7 +332,7 @@ class Service:
         client = Client(self.line, connection.peer, self._count, outbox, in_safe_place=in_safe_place)
         del self._strangers[connection]
         self._clients[client] = connection
-        client.outbox.put(written({"id": said.get("id"), "result": self._about(client, max(common))}))
+        client.outbox.put(written({"id": decoded.get("id"), "result": self._about(client, max(common))}))
         return client
 
     def count_rejected(self, connection: ClientConnection, /) -> None:

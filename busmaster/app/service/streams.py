@@ -9,8 +9,8 @@ from collections.abc import AsyncGenerator, Callable
 from typing import Any, Protocol
 
 from busmaster import Bus, Point, PollGroup, Snapshot
+from busmaster.app.service.encoding import encode_event, encode_points, encode_sample, encode_snapshot
 from busmaster.app.service.messages import encoded
-from busmaster.app.service.telling import said_event, said_points, said_sample, said_snapshot
 from busmaster.ext import Outdated, ReadAfterWrite
 
 READERS_IN_A_TURN = 4
@@ -21,11 +21,11 @@ SAMPLES_IN_A_TURN = 50
 class Reader(Protocol):
     """A client with a stream."""
 
-    def tell(self, stream: int, method: str, body: str) -> None:
+    def notify(self, stream: int, method: str, body: str) -> None:
         """Send a message of a stream; it is dropped if the client does not keep up."""
         ...
 
-    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+    def notify_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
         """Send a message about a part of a stream, which replaces an earlier unsent one."""
         ...
 
@@ -58,21 +58,21 @@ class Broadcast:
 
     async def _run(self) -> None:
         try:
-            await self._tell()
+            await self._notify()
         except Exception:  # a value that cannot be encoded, an error of an encoder: the readers get "ended"
             logging.getLogger("busmaster.app.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:
-            reader.tell_surely(stream, "ended", "{}")
+            reader.notify_surely(stream, "ended", "{}")
 
-    async def _tell(self) -> None:
+    async def _notify(self) -> None:
         async with contextlib.aclosing(self._bodies()) as bodies:
             async for method, body in bodies:
                 for number, (reader, stream) in enumerate(list(self.readers)):
                     if number and number % READERS_IN_A_TURN == 0:
                         await asyncio.sleep(0)
                     if (reader, stream) in self.readers:
-                        reader.tell(stream, method, body)
+                        reader.notify(stream, method, body)
 
     def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         raise NotImplementedError
@@ -89,13 +89,13 @@ class GroupBroadcast(Broadcast):
 
     def join(self, reader: Reader, stream: int) -> None:
         """Send the list of points to this client, and then each cycle."""
-        self._tell_points((reader, stream))
+        self._send_points((reader, stream))
         super().join(reader, stream)
 
-    def _tell_points(self, *places: Place) -> None:
-        body = encoded({"set": self._set, "points": said_points(self._points)})
+    def _send_points(self, *places: Place) -> None:
+        body = encoded({"set": self._set, "points": encode_points(self._points)})
         for reader, stream in places:
-            reader.tell_surely(stream, "points", body)
+            reader.notify_surely(stream, "points", body)
 
     async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         stream = self.group.subscribe(changes=True)
@@ -109,7 +109,7 @@ class GroupBroadcast(Broadcast):
                 if points != self._points:
                     self._points = points
                     self._set += 1
-                    self._tell_points(*self.readers)
+                    self._send_points(*self.readers)
                 yield "snapshot", await self._encoded(snapshot)
         finally:
             stream.close()
@@ -121,8 +121,8 @@ class GroupBroadcast(Broadcast):
         for begin in range(0, len(samples), SAMPLES_IN_A_TURN):
             if begin:
                 await asyncio.sleep(0)
-            parts.append(encoded(list(map(said_sample, samples[begin : begin + SAMPLES_IN_A_TURN])))[1:-1])
-        head = encoded({"set": self._set, **said_snapshot(snapshot)})
+            parts.append(encoded(list(map(encode_sample, samples[begin : begin + SAMPLES_IN_A_TURN])))[1:-1])
+        head = encoded({"set": self._set, **encode_snapshot(snapshot)})
         return f'{head[:-1]},"samples":[{",".join(parts)}]}}'
 
 
@@ -137,7 +137,7 @@ class EventBroadcast(Broadcast):
         stream = self._bus.events()
         try:
             async for event in stream:
-                if said := said_event(event):
-                    yield "event", encoded(said)
+                if decoded := encode_event(event):
+                    yield "event", encoded(decoded)
         finally:
             stream.close()

@@ -17,15 +17,15 @@ class Touches:
     def __init__(self) -> None:
         self._when: dict[tuple[str | None, int | None, str | None], float] = {}
 
-    def note(self, said: Mapping[str, Any]) -> None:
+    def note(self, decoded: Mapping[str, Any]) -> None:
         """Take one message `touched` (docs/service.md). Without `items` it is of all points of its node, or of all
         nodes."""
-        when, items = said["when"], said.get("items")
-        if said.get("all"):
+        when, items = decoded["when"], decoded.get("items")
+        if decoded.get("all"):
             self._when[None, None, None] = when
             return
         for item in (None,) if items is None else items:
-            self._when[said["protocol"], said["address"], item] = when
+            self._when[decoded["protocol"], decoded["address"], item] = when
 
     def is_stale(self, protocol: str, address: int, item: str, asked: float) -> bool:
         """Return whether a write to the point's place has ended since its value was requested."""

@@ -61,7 +61,7 @@ def test_the_safe_state_is_sent_while_a_file_that_is_read_again_still_waits_for_
         monkeypatch.setattr(line, "take", take)
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(Running(line, str(path), View(silent=True), hangups, None).run)
-            hangups._hear(0, None)
+            hangups._receive(0, None)
             await replacing.wait()
             tasks.cancel_scope.cancel()
             try:

@@ -201,7 +201,7 @@ class Person:
     def takes_stop(self, node: Node, /) -> bool:
         return False
 
-    def tell_stops(self, node: NodeRecord, /) -> None:
+    def notify_stops(self, node: NodeRecord, /) -> None:
         pass
 
 

@@ -113,15 +113,15 @@ async def test_a_lost_line_makes_every_value_bad_and_every_node_offline_before_t
 def test_a_value_that_was_read_before_a_write_and_comes_after_it_is_stale() -> None:
     picture = Picture()
     row = {"group": "g", "key": "5/10", "node": "n", "protocol": "hcp2", "address": 5, "item": "10"}
-    picture.hear("rows", {"set": 1, "first": 0, "rows": [row]})
-    picture.hear("touched", {"protocol": "hcp2", "address": 5, "when": 5.0, "items": ["10"], "all": False})
+    picture.receive("rows", {"set": 1, "first": 0, "rows": [row]})
+    picture.receive("touched", {"protocol": "hcp2", "address": 5, "when": 5.0, "items": ["10"], "all": False})
     for asked, quality in ((4.0, "stale"), (5.0, "good"), (6.0, "good")):
-        picture.hear("values", {"set": 1, "first": 0, "values": [[1.0, "good", asked, "", ""]]})
+        picture.receive("values", {"set": 1, "first": 0, "values": [[1.0, "good", asked, "", ""]]})
         assert picture.rows[0].quality == quality
-    picture.hear("touched", {"protocol": "hcp2", "address": 5, "when": 7.0, "items": ["11"], "all": False})
+    picture.receive("touched", {"protocol": "hcp2", "address": 5, "when": 7.0, "items": ["11"], "all": False})
     assert picture.rows[0].quality == "good"
-    picture.hear("touched", {"protocol": "hcp2", "address": 5, "when": 7.0, "items": None, "all": False})
+    picture.receive("touched", {"protocol": "hcp2", "address": 5, "when": 7.0, "items": None, "all": False})
     assert picture.rows[0].quality == "stale"
-    picture.hear("values", {"set": 1, "first": 0, "values": [[1.0, "good", 8.0, "", ""]]})
-    picture.hear("touched", {"protocol": "hcp2", "address": 0, "when": 9.0, "items": None, "all": True})
+    picture.receive("values", {"set": 1, "first": 0, "values": [[1.0, "good", 8.0, "", ""]]})
+    picture.receive("touched", {"protocol": "hcp2", "address": 0, "when": 9.0, "items": None, "all": True})
     assert picture.rows[0].quality == "stale"

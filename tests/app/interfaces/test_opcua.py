@@ -229,12 +229,12 @@ async def test_a_value_is_written_in_each_type_that_means_it(
 async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
     opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    really = RemoteGroup.hear
+    really = RemoteGroup.receive
 
-    def hear(group: RemoteGroup, method: str, params: Mapping[str, Any]) -> None:
+    def receive(group: RemoteGroup, method: str, params: Mapping[str, Any]) -> None:
         really(group, method, {**params, "dropped": 3})  # as the owner counts them
 
-    monkeypatch.setattr(RemoteGroup, "hear", hear)
+    monkeypatch.setattr(RemoteGroup, "receive", receive)
     async with opened.owned() as line:
         line.poll("10", name="counted")
         await opened.shows("Groups/counted Dropped", lambda told: told.value == 3)

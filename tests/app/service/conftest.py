@@ -45,7 +45,7 @@ def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         note(schema.check_program, schema.heard(text))
         return text
 
-    def hear(self: link.Link, said: Mapping[str, Any]) -> None:
+    def receive(self: link.Link, said: Mapping[str, Any]) -> None:
         note(schema.check_owner, said)
         number = said.get("id")
         if number is not None and "result" in said:
@@ -54,7 +54,7 @@ def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         take(self, said)
 
     monkeypatch.setattr(link.Link, "put", asked_for)
-    monkeypatch.setattr(link.Link, "_take", hear)
+    monkeypatch.setattr(link.Link, "_take", receive)
     monkeypatch.setattr("busmaster.app.service.link.written", lambda message: checked(written(message)))
     monkeypatch.setattr(
         "busmaster.app.service.link.numbered", lambda question, number: checked(numbered(question, number))

@@ -64,7 +64,7 @@ class SlowWay:
         self.full = False
         self.said: list[str] = []
 
-    def say(self, text: str, /) -> None:
+    def send(self, text: str, /) -> None:
         self.said.append(text)
 
 

@@ -71,10 +71,10 @@ def tell(
     """Say a whole picture, in the order in which the owner does."""
     number = frame.get("set", FRAME["set"])
     known = nodes or tuple(node(address) for address in dict.fromkeys(point["address"] for point, _ in rows))
-    picture.hear("rows", {"set": number, "first": 0, "rows": [point for point, _ in rows]})
-    picture.hear("values", {"set": number, "first": 0, "values": [held for _, held in rows]})
-    picture.hear("groups", {"first": 0, "groups": list(groups)})
-    picture.hear("nodes", {"first": 0, "nodes": list(known)})
+    picture.receive("rows", {"set": number, "first": 0, "rows": [point for point, _ in rows]})
+    picture.receive("values", {"set": number, "first": 0, "values": [held for _, held in rows]})
+    picture.receive("groups", {"first": 0, "groups": list(groups)})
+    picture.receive("nodes", {"first": 0, "nodes": list(known)})
     said = {"groups": len(groups), "nodes": len(known), "points": len(rows)}
-    picture.hear("frame", {**FRAME, **said, **frame})
+    picture.receive("frame", {**FRAME, **said, **frame})
     return picture

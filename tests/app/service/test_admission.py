@@ -164,7 +164,7 @@ def test_a_reader_has_no_place_of_those_for_the_safe_state(tmp_path: Path) -> No
 def test_refused_programs_are_counted_and_reported_at_most_once_a_minute(tmp_path: Path) -> None:
     async def story(crowd: Crowd) -> None:
         told: list[str] = []
-        crowd.line.service.tell = told.append
+        crowd.line.service.report = told.append
         for _ in range(3):
             await crowd.fill(Role.READ)
         assert crowd.line.authorisation.refusals.connections == {"read": 3}
@@ -294,7 +294,7 @@ def test_of_a_crowd_that_connects_at_once_some_wait_and_the_rest_is_closed_and_r
     async def story(crowd: Crowd) -> None:
         told: list[str] = []
         service = crowd.line.service
-        service.tell = told.append
+        service.report = told.append
         assert service.tcp_address is not None
         host, _, port = service.tcp_address.removeprefix("tcp://").rpartition(":")
         for _ in range(bounds.FREE_CONNECTIONS):

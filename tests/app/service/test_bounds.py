@@ -141,7 +141,7 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
 
         monkeypatch.setattr(connection.websocket, "buffer_updated", received)
         for _ in range(100):
-            remote.link.tell("end", {"stream": 7})
+            remote.link.notify("end", {"stream": 7})
         await until(lambda: len(taken) >= 100)
         assert len(set(taken)) == len(taken)
         assert max(sizes) <= READ_AT_ONCE
@@ -171,13 +171,13 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lengths: list[int] = []
-    heard = ClientConnection.heard
+    heard = ClientConnection.received
 
     def note(connection: ClientConnection, message: str | bytes) -> None:
         lengths.append(len(message))
         heard(connection, message)
 
-    monkeypatch.setattr(ClientConnection, "heard", note)
+    monkeypatch.setattr(ClientConnection, "received", note)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]

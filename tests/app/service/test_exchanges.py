@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from busmaster import Hcp2Controller, RemoteBus
-from busmaster.app.service.exchanges import HEARD_AT_ONCE, MOST_BYTES, MOST_KEPT, Listener, exchange_to_json
+from busmaster.app.service.exchanges import MOST_BYTES, MOST_KEPT, RECEIVED_AT_ONCE, Listener, exchange_to_json
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -143,10 +143,10 @@ def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
 def test_of_a_flood_no_more_is_kept_than_is_told() -> None:
     listener = Listener()
     listener.transmitted(0.0, b"ask", attempt())
-    for number in range(10 * HEARD_AT_ONCE):
+    for number in range(10 * RECEIVED_AT_ONCE):
         listener.received(float(number), b"x" * 1000, None)
-        assert len(listener._heard) < HEARD_AT_ONCE
-    assert sum(len(passage.said) for passage in listener._exchanges) <= 2
+        assert len(listener._received) < RECEIVED_AT_ONCE
+    assert sum(len(passage.transmissions) for passage in listener._exchanges) <= 2
 
 
 def test_of_too_many_exchanges_the_oldest_are_left_out_and_counted() -> None:
@@ -164,4 +164,4 @@ def test_what_closes_an_exchange_belongs_to_it() -> None:
     listener.received(1.3, b"!", None)
     one.end(Verdict.OK, None, 1.2)
     passages, _ = listener.take()
-    assert [len(passage.said) for passage in passages] == [3, 1]
+    assert [len(passage.transmissions) for passage in passages] == [3, 1]

@@ -125,7 +125,7 @@ def test_two_programs_that_ask_for_the_safe_state_have_it_sent_once(tmp_path: Pa
     async def story(line, service, remote, records):  # type: ignore[no-untyped-def]  # as `Story` says
         async with connect(service.address) as other:
             asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0, "gone/speed": 0}))
-            await until(lambda: service.line.safe_wishes.under_way)
+            await until(lambda: service.line.safe_writes.under_way)
             both = await other.enter_safe_state({"winder/speed": 0, "gone/speed": 0}), await asking
         assert [list(outcomes) for outcomes in both] == [["winder/speed", "gone/speed"]] * 2
         assert sorted(record.point for record in records) == ["gone/speed", "winder/speed"]

@@ -44,7 +44,7 @@ def on_a_watched_line(folder: Path, story: Watched, *, read_only: bool = False) 
     async def with_picture(line: Served, remote: RemoteBus) -> None:
         polled(line.bus)
         picture = Picture()
-        view = await remote.overview(picture.hear)
+        view = await remote.overview(picture.receive)
         await until(lambda: picture.frame is not None and picture.rows and picture.rows[0].value is not None)
         await story(line, picture, view)
 
@@ -137,7 +137,7 @@ def test_a_pause_and_a_suspension_are_for_all_and_say_whose_wish_they_were(tmp_p
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
         other = Picture()
         async with connect(line.address) as second:
-            await second.overview(other.hear)
+            await second.overview(other.receive)
             await view.pause("axes", True)
             await until(lambda: other.groups and other.groups[0].paused and picture.groups[0].paused)
             cycle = line.bus.groups[0].statistics().cycles
@@ -237,7 +237,7 @@ def test_what_happened_before_somebody_looks_is_told(tmp_path: Path) -> None:
             with pytest.raises(BusError):
                 await controller.read(1)
         picture = Picture()
-        await remote.overview(picture.hear)
+        await remote.overview(picture.receive)
         await until(lambda: picture.frame is not None)
         assert picture.frame is not None
         first, *_, last = [text for _, text in picture.frame.events]
@@ -250,7 +250,7 @@ def test_what_happened_before_somebody_looks_is_told(tmp_path: Path) -> None:
 def test_the_end_of_the_owner_and_a_lost_connection_are_told_apart(tmp_path: Path) -> None:
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
         async with connect(line.address) as second:
-            lost = await second.overview(Picture().hear)
+            lost = await second.overview(Picture().receive)
             await until(lambda: len(line.service.clients) == 2)
             connection = list(line.service._clients.values())[1]
             connection.websocket.abort()
@@ -269,7 +269,7 @@ class Full:
 
     full = True
 
-    def say(self, text: str, /) -> None:
+    def send(self, text: str, /) -> None:
         raise AssertionError("it is full")
 
 
@@ -297,8 +297,8 @@ def test_the_line_goes_between_one_part_and_the_next(tmp_path: Path, monkeypatch
             turn += 1
             await asyncio.sleep(0)
 
-    for name in ("say_values", "_said_groups", "_said_nodes"):
-        owner = Part if name == "say_values" else overview
+    for name in ("send_values", "_encode_groups", "_encode_nodes"):
+        owner = Part if name == "send_values" else overview
         plain = getattr(owner, name)
 
         def noted(*arguments: Any, plain: Any = plain) -> Any:
@@ -332,7 +332,7 @@ def test_nothing_is_worked_out_while_nobody_looks(tmp_path: Path) -> None:
             assert line.service.line._overview is not None
         await until(lambda: line.service.line._overview is None)
         picture = Picture()
-        await remote.overview(picture.hear)
+        await remote.overview(picture.receive)
         await until(lambda: picture.rows and picture.rows[0].value == 0)
 
     on_a_served_line(tmp_path, story)

@@ -20,15 +20,15 @@ def test_a_new_set_of_points_may_come_in_any_order(order: tuple[str, ...]) -> No
         "frame": {**FRAME, "set": 2, "groups": 1, "nodes": 1, "points": 1},
     }
     for method in order:
-        picture.hear(method, said[method])
+        picture.receive(method, said[method])
     assert [(one.name, one.value) for one in picture.rows] == [("node 3 outputs", 7)]
 
 
 def test_what_is_said_of_an_earlier_set_is_not_taken_for_this_one() -> None:
     picture = tell(Picture(), row(1, value=5), set=2)
     point, held = row(2, value=6)
-    picture.hear("rows", {"set": 1, "first": 0, "rows": [point]})
-    picture.hear("values", {"set": 1, "first": 0, "values": [held]})
+    picture.receive("rows", {"set": 1, "first": 0, "rows": [point]})
+    picture.receive("values", {"set": 1, "first": 0, "values": [held]})
     assert [(one.name, one.value) for one in picture.rows] == [("node 1 outputs", 5)]
 
 
@@ -58,12 +58,12 @@ def test_two_points_of_one_name_in_a_group_are_two_rows() -> None:
 
 def test_groups_and_nodes_that_are_gone_are_not_shown() -> None:
     picture = tell(Picture(), row(1), row(2), groups=(GROUP, {**GROUP, "name": "slow"}))
-    picture.hear("frame", {**FRAME, "groups": 1, "nodes": 1, "points": 2})
+    picture.receive("frame", {**FRAME, "groups": 1, "nodes": 1, "points": 2})
     assert [group.name for group in picture.groups] == ["axes"]
     assert list(picture.nodes) == [("hcp2", 1)]
 
 
 def test_what_a_later_owner_says_besides_is_passed_over() -> None:
     picture = tell(Picture(), row(1, colour="red"), nodes=(node(1, mood="calm"),), weather="fine")
-    picture.hear("forecast", {"set": 9})
+    picture.receive("forecast", {"set": 9})
     assert [one.name for one in picture.rows] == ["node 1 outputs"]

@@ -103,16 +103,16 @@ def test_a_program_says_a_plain_read_in_the_same_words_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    say = Connection.say
+    send = Connection.send
 
     def noted(self: Connection, text: str) -> None:
         said.append(text)
-        say(self, text)
+        send(self, text)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         node = remote.node(PROFILE, 5)
         await node.request(READ)
-        monkeypatch.setattr(Connection, "say", noted)
+        monkeypatch.setattr(Connection, "send", noted)
         assert [await node.request(READ) for _ in range(2)] == [0, 0]
         asked = [text for text in said if '"method"' in text]
         first = json.loads(asked[0])["id"]

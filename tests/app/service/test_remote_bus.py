@@ -12,7 +12,7 @@ import pytest
 
 from busmaster import Hcp2Controller, MicroFlexDrive, Node, Point, Priority, RemoteBus, connect, errors, ext
 from busmaster.app.service import link
-from busmaster.app.service.failures import error_of, said_error
+from busmaster.app.service.failures import encode_error, error_of
 from busmaster.app.service.link import Link
 from busmaster.errors import (
     BusClosed,
@@ -71,7 +71,7 @@ def test_an_error_comes_back_as_the_same_class_with_the_same_fields(name: str) -
     error = kind("it went wrong", command="read element 1", attempts=3)
     error.line, error.label, error.address = "/dev/ttyUSB0", "winder", 5
     error.__cause__ = NoReply("no reply", hint="look again")
-    again = error_of(json.loads(json.dumps(said_error(error))))
+    again = error_of(json.loads(json.dumps(encode_error(error))))
     assert type(again) is kind
     assert vars(again) == vars(error)
     assert str(again) == str(error)
@@ -80,7 +80,7 @@ def test_an_error_comes_back_as_the_same_class_with_the_same_fields(name: str) -
 
 
 def test_a_final_refusal_stays_one() -> None:
-    again = error_of(said_error(Refused("a prefix may be stored", confirm=False)))
+    again = error_of(encode_error(Refused("a prefix may be stored", confirm=False)))
     assert isinstance(again, Refused)
     assert not again.confirm
 
@@ -451,7 +451,7 @@ def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
     async def story(line: Served, remote: RemoteBus) -> None:
         writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
         await line.sent()
-        remote.link.heard(said.replace('"id": 1', f'"id": {remote.link._count}'))
+        remote.link.received(said.replace('"id": 1', f'"id": {remote.link._count}'))
         with pytest.raises(WriteUnconfirmed, match="sent an invalid message"):
             await writing
 

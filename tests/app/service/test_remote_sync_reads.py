@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.app.service.telling import profile_of, protocol_of, said_sync_reads
+from busmaster.app.service.encoding import encode_sync_reads, profile_of, protocol_of
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import microflex
@@ -16,8 +16,8 @@ READ, WRITE = {"command": "read", "element": 1}, {"command": "write", "element":
 
 
 def test_only_what_is_not_the_protocols_is_sent() -> None:
-    assert said_sync_reads(hcp2.PROFILE) == {}
-    said = said_sync_reads(microflex.PROFILE)
+    assert encode_sync_reads(hcp2.PROFILE) == {}
+    said = encode_sync_reads(microflex.PROFILE)
     assert said["probe"] == {"command": "read", "element": 109}
     found = profile_of(HCP2, said["probe"], said["sync_reads"])
     assert (found.probe, found.sync_reads) == (microflex.PROFILE.probe, microflex.PROFILE.sync_reads)

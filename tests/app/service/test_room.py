@@ -88,7 +88,7 @@ def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[str] = []
-    turn, say = Pump.turn, IncomingConnection.say
+    turn, send = Pump.turn, IncomingConnection.send
 
     def turned(pump: Pump) -> None:
         seen.append("turn")
@@ -97,13 +97,13 @@ def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
 
     def said(connection: Any, text: str) -> None:
         seen.append("answer")
-        say(connection, text)
+        send(connection, text)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
         await controller.read(1)
         monkeypatch.setattr(Pump, "turn", turned)
-        monkeypatch.setattr(IncomingConnection, "say", said)
+        monkeypatch.setattr(IncomingConnection, "send", said)
         assert await controller.read(1) == 0
         assert seen[-3:] == ["turn", "answer", "turn over"]
 

@@ -109,7 +109,7 @@ def test_it_is_sent_to_the_end_when_whoever_asked_for_it_has_gone(tmp_path: Path
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         async with connect(service.address) as other:
             asking = asyncio.ensure_future(other.enter_safe_state({"winder/speed": 0, "gone/speed": 0}))
-            await until(lambda: service.line.safe_wishes.under_way)
+            await until(lambda: service.line.safe_writes.under_way)
         with pytest.raises(WriteUnconfirmed):
             await asking
         await until(lambda: len(records) == 2)
@@ -134,7 +134,7 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
 
         monkeypatch.setattr(SafeStateRequests, "_send", hold)
         asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
-        await until(lambda: service.line.safe_wishes.under_way)
+        await until(lambda: service.line.safe_writes.under_way)
         with pytest.raises(BacklogFull, match="1 requests of this program have no reply yet"):
             await Hcp2Controller(remote, 5).read(10)
         meant.set()

@@ -45,7 +45,7 @@ def protocol_of(name: str) -> BusProtocol:
     raise InvalidCommand(f"no such protocol {name!r}; there are {', '.join(one.name for one in protocols())}")
 
 
-def said_sync_reads(profile: Profile) -> dict[str, Any]:
+def encode_sync_reads(profile: Profile) -> dict[str, Any]:
     """Return the probe and the sync reads of a kind of node, as they are sent, where they are not its protocol's."""
     protocol = protocol_of(profile.name)
     usual = protocol.profile
@@ -66,7 +66,7 @@ def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
         return protocol.profile
     if not isinstance(probe, dict) or not isinstance(sync_reads, list) or not 0 < len(sync_reads) <= MOST_SYNC_READS:
         raise InvalidCommand(f"{protocol.name}: a client sends one probe, and 1 to {MOST_SYNC_READS} sync reads")
-    first, *others = [protocol.read_back(dict(said)) for said in (probe, *sync_reads)]
+    first, *others = [protocol.read_back(dict(decoded)) for decoded in (probe, *sync_reads)]
     for command in (first, *others):
         if command.writes:
             raise InvalidCommand(f"{protocol.name}: a probe or sync read must read, and {command} writes")
@@ -84,7 +84,7 @@ def listed_groups(bus: Bus) -> list[dict[str, Any]]:
 # snapshots
 
 
-def said_points(points: Iterable[Point[Any]]) -> list[dict[str, Any]]:
+def encode_points(points: Iterable[Point[Any]]) -> list[dict[str, Any]]:
     """Return points in the form of messages: their names and their commands."""
     return [
         {
@@ -118,41 +118,41 @@ class OwnersPoint(Point[Any]):
     __hash__ = Point.__hash__
 
 
-def point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
+def point_of(decoded: Mapping[str, Any], find: FindNode) -> Point[Any]:
     """Return the point in a message. It does not change values, because they were decoded by the owner."""
-    protocol = protocol_of(said.get("protocol"))
-    node = find(protocol.name, said["address"])
-    command = protocol.read_back(said["command"])
-    return Point(node, str(said.get("item", "")), command, str(said.get("unit", "")))
+    protocol = protocol_of(decoded.get("protocol"))
+    node = find(protocol.name, decoded["address"])
+    command = protocol.read_back(decoded["command"])
+    return Point(node, str(decoded.get("item", "")), command, str(decoded.get("unit", "")))
 
 
-def owners_point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
+def owners_point_of(decoded: Mapping[str, Any], find: FindNode) -> Point[Any]:
     """Return the owner's point in a message, with the owner's name for it."""
-    point = point_of(said, find)
-    return OwnersPoint(point.node, point.item, point.command, point.unit, owners_key=str(said["key"]))
+    point = point_of(decoded, find)
+    return OwnersPoint(point.node, point.item, point.command, point.unit, owners_key=str(decoded["key"]))
 
 
-def said_snapshot(snapshot: Snapshot) -> dict[str, Any]:
+def encode_snapshot(snapshot: Snapshot) -> dict[str, Any]:
     """Return a cycle in the form of a message, without its samples."""
     return {name: getattr(snapshot, name) for name in ("cycle", "due", "started", "finished", "missed", "wall")}
 
 
-def snapshot_of(said: Mapping[str, Any], group: str, points: Sequence[Point[Any]]) -> Snapshot:
+def snapshot_of(decoded: Mapping[str, Any], group: str, points: Sequence[Point[Any]]) -> Snapshot:
     """Return the cycle in a message; its samples are in the order of its points."""
     names = ("cycle", "due", "started", "finished", "missed", "wall")
-    samples = {point: _sample_of(one, point) for point, one in zip(points, said["samples"], strict=True)}
-    return Snapshot(group=group, samples=samples, **{name: said[name] for name in names})
+    samples = {point: _sample_of(one, point) for point, one in zip(points, decoded["samples"], strict=True)}
+    return Snapshot(group=group, samples=samples, **{name: decoded[name] for name in names})
 
 
-def said_sample(sample: Sample[Any]) -> list[Any]:
+def encode_sample(sample: Sample[Any]) -> list[Any]:
     """Return a sample in the form of a message."""
     error = None if sample.error is None else error_data(sample.error)
     times = (sample.due, sample.started, sample.finished, sample.wall)
     return [sample.value, error, *times, sample.quality.value, sample.timeline]
 
 
-def _sample_of(said: Sequence[Any], point: Point[Any]) -> Sample[Any]:
-    value, error, due, started, finished, wall, quality, timeline = said
+def _sample_of(decoded: Sequence[Any], point: Point[Any]) -> Sample[Any]:
+    value, error, due, started, finished, wall, quality, timeline = decoded
     failed = None if error is None else bus_error_of(error)
     how_good = Quality(quality)
     value = value_of(value)
@@ -167,68 +167,70 @@ def _sample_of(said: Sequence[Any], point: Point[Any]) -> Sample[Any]:
 # events
 
 
-def said_event(event: BusEvent) -> dict[str, Any] | None:
+def encode_event(event: BusEvent) -> dict[str, Any] | None:
     """Return an event in the form of a message; None for one that clients do not get."""
-    said: dict[str, Any] = {"event": type(event).__name__}
+    decoded: dict[str, Any] = {"event": type(event).__name__}
     match event:
         case NodeChanged():
-            said |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
+            decoded |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
         case MaxReplyDelayRaised():
-            said |= {"age": event.age, "max_reply_delay": event.max_reply_delay}
+            decoded |= {"age": event.age, "max_reply_delay": event.max_reply_delay}
         case MaxReplyDelayLowered():
-            said |= {"max_reply_delay": event.max_reply_delay}
+            decoded |= {"max_reply_delay": event.max_reply_delay}
         case RepliesLate():
-            said |= {"age": event.age, "window": event.window}
+            decoded |= {"age": event.age, "window": event.window}
         case LineChanged():
-            return said | {"change": event.change.value, "cause": event.cause}
+            return decoded | {"change": event.change.value, "cause": event.cause}
         case PortFailed():
             bug = None if event.bug is None else f"{type(event.bug).__name__}: {event.bug}"
-            return said | {"cause": event.cause, "hint": event.hint, "bug": bug}
+            return decoded | {"cause": event.cause, "hint": event.hint, "bug": bug}
         case AlarmChanged():
-            [point] = said_points([event.point])
-            told = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
-            return said | {"point": point, **told}
+            [point] = encode_points([event.point])
+            notify = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
+            return decoded | {"point": point, **notify}
         case _:
             return None
     node = event.node
-    return said | {"protocol": node.profile.name, "address": node.address, "label": node.label}
+    return decoded | {"protocol": node.profile.name, "address": node.address, "label": node.label}
 
 
-def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
+def event_of(decoded: Mapping[str, Any], find: FindNode) -> BusEvent | None:
     """Return the event in a message; its `node` is the client's own. None for one of a later version."""
-    name = said["event"]
+    name = decoded["event"]
     if name == "LineChanged":
-        return LineChanged(LineChange(said["change"]), said["cause"])
+        return LineChanged(LineChange(decoded["change"]), decoded["cause"])
     if name == "PortFailed":
-        return PortFailed(said["cause"], said["hint"], None if said["bug"] is None else Exception(said["bug"]))
+        return PortFailed(
+            decoded["cause"], decoded["hint"], None if decoded["bug"] is None else Exception(decoded["bug"])
+        )
     if name == "AlarmChanged":
-        point = owners_point_of(said["point"], find)
-        return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
+        point = owners_point_of(decoded["point"], find)
+        return AlarmChanged(point, decoded["limit"], decoded["bound"], decoded["value"], decoded["active"])
     if name not in ("NodeChanged", "MaxReplyDelayRaised", "MaxReplyDelayLowered", "RepliesLate"):
         return None
     # It has all attributes of a node that events need: label, address, profile, line.
-    node = cast("NodeRecord", find(said["protocol"], said["address"]))
+    node = cast("NodeRecord", find(decoded["protocol"], decoded["address"]))
     if name == "NodeChanged":
-        return NodeChanged(node, Health(said["before"]), Health(said["after"]), said["returning"])
+        return NodeChanged(node, Health(decoded["before"]), Health(decoded["after"]), decoded["returning"])
     if name == "MaxReplyDelayRaised":
-        return MaxReplyDelayRaised(node, said["age"], said["max_reply_delay"])
+        return MaxReplyDelayRaised(node, decoded["age"], decoded["max_reply_delay"])
     if name == "RepliesLate":
-        return RepliesLate(node, said["age"], said["window"])
-    return MaxReplyDelayLowered(node, said["max_reply_delay"])
+        return RepliesLate(node, decoded["age"], decoded["window"])
+    return MaxReplyDelayLowered(node, decoded["max_reply_delay"])
 
 
 # statistics
 
 
-def said_statistics(statistics: LineStatistics) -> dict[str, Any]:
+def encode_statistics(statistics: LineStatistics) -> dict[str, Any]:
     """Return the counters of a line in the form of a message."""
     return {**dataclasses.asdict(statistics), "utilisation": statistics.utilisation}
 
 
-def statistics_of(said: Mapping[str, Any]) -> LineStatistics:
+def statistics_of(decoded: Mapping[str, Any]) -> LineStatistics:
     """Return the counters in a message."""
     known = {part.name for part in dataclasses.fields(LineStatistics)}
-    counts: dict[str, Any] = {name: value for name, value in said.items() if name in known}
-    counts["waits"] = tuple(Quantiles(**wait) for wait in said["waits"])
-    counts["driver"] = None if said["driver"] is None else DriverErrors(**said["driver"])
+    counts: dict[str, Any] = {name: value for name, value in decoded.items() if name in known}
+    counts["waits"] = tuple(Quantiles(**wait) for wait in decoded["waits"])
+    counts["driver"] = None if decoded["driver"] is None else DriverErrors(**decoded["driver"])
     return LineStatistics(**counts)
