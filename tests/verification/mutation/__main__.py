@@ -2,10 +2,10 @@
 
     python -m tests.verification.mutation --count 500 --seed 1 --jobs 2
 
-draws mutants of the arbiter, the contract, the wire, the codecs and the pump, asks the tests about each of them in a
-copy of what is committed, and writes each verdict into the session's file, from which the same command goes on after
-an interruption. `--report` only prints what the file holds. What is measured of the tests first, once for a commit, is
-kept beside it. It wants the extra `mutation`.
+draws mutants of the arbiter, the contract, the wire, the codecs and the pump, or of other `--rooms`. It asks the tests
+about each of them in a copy of what is committed, and writes each verdict into the session's file, from which the same
+command goes on after an interruption. `--report` only prints what the file holds. What is measured of the tests first,
+once for a commit, is kept beside it. It wants the extra `mutation`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from tests.verification.mutation.asked import Measured
-from tests.verification.mutation.places import ROOMS, Mutant, drawn
+from tests.verification.mutation.places import CORE, OUTSIDE, ROOMS, Mutant, drawn
 from tests.verification.mutation.trial import Copy, Verdict
 
 ROOT = Path(__file__).parents[3]
@@ -39,7 +39,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=500, help="how many mutants are drawn (500)")
     parser.add_argument("--seed", type=int, default=1, help="which ones (1)")
     parser.add_argument("--jobs", type=int, default=1, help="how many are tried at once (1)")
-    parser.add_argument("--rooms", default=",".join(ROOMS), help="of which rooms (all)")
+    parser.add_argument(
+        "--rooms", default=",".join(CORE), help=f"of which rooms, of {', '.join(ROOMS)} (those of the core)"
+    )
     parser.add_argument(
         "--session", type=Path, help="the file of verdicts (mutation-SEED.jsonl, not in the repository)"
     )
@@ -50,17 +52,21 @@ def main() -> None:
     options = parser.parse_args()
     session = options.session or ROOT / f"mutation-{options.seed}.jsonl"
     if not options.report:
-        mutants = drawn(ROOT, options.count, options.seed, frozenset(options.rooms.split(",")))
+        rooms = frozenset(options.rooms.split(","))
+        if unknown := rooms - set(ROOMS):
+            parser.error(f"no such room: {', '.join(sorted(unknown))}; use {', '.join(ROOMS)}")
+        mutants = drawn(ROOT, options.count, options.seed, rooms)
         known = {key_of(verdict) for verdict in read(session)}
-        try_all([mutant for mutant in mutants if key_of(mutant.as_fields()) not in known], session, options)
+        left = [mutant for mutant in mutants if key_of(mutant.as_fields()) not in known]
+        try_all(left, session, options, sorted(rooms))
     report(read(session))
 
 
-def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -> None:
+def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace, rooms: Sequence[str]) -> None:
     """Try them, some at once, each process in a copy of its own, and write each verdict as it comes."""
     with tempfile.TemporaryDirectory() as folder:
-        known = measured(Path(folder), options.near)
-        with multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near, known)) as pool:
+        known = measured(Path(folder), options.near, rooms)
+        with multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near, known, rooms)) as pool:
             for number, (mutant, verdict) in enumerate(pool.imap_unordered(judged, mutants), 1):
                 with session.open("a") as file:
                     file.write(json.dumps(mutant.as_fields() | asdict(verdict)) + "\n")
@@ -68,13 +74,14 @@ def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -
                 say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.1f} s  {where}  {verdict.test}")
 
 
-def measured(folder: Path, near: bool) -> Path:
+def measured(folder: Path, near: bool, rooms: Sequence[str]) -> Path:
     """Return the file with what is known of the tests of the commit that is checked out; measure them if it is not."""
     command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-    file = ROOT / f"mutation-{commit}{'-near' if near else ''}.json"
+    outside = "-outside" if OUTSIDE.keys() & rooms else ""
+    file = ROOT / f"mutation-{commit}{'-near' if near else ''}{outside}.json"
     if not file.exists():
-        Copy(ROOT, folder / "measured").measure(near, file)
+        Copy(ROOT, folder / "measured", rooms).measure(near, file)
     return file
 
 
@@ -82,9 +89,10 @@ COPY: list[tuple[Copy, bool, Measured]] = []
 """The copy of this process, whether only the nearest tests are asked in it, and what is known of all tests."""
 
 
-def start_in_a_copy(folder: Path, near: bool, known: Path) -> None:
+def start_in_a_copy(folder: Path, near: bool, known: Path, rooms: Sequence[str]) -> None:
     """Make a process its copy."""
-    COPY.append((Copy(ROOT, folder / multiprocessing.current_process().name), near, Measured.read(known)))
+    copy = Copy(ROOT, folder / multiprocessing.current_process().name, rooms)
+    COPY.append((copy, near, Measured.read(known)))
 
 
 def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import difflib
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.verification.mutation.places import CORE, OUTSIDE
 
 NEAR: dict[str, tuple[str, ...]] = {
     "arbiter": ("tests/arbiter",),
@@ -15,6 +17,9 @@ NEAR: dict[str, tuple[str, ...]] = {
     "wire": ("tests/wire", "tests/protocols"),
     "codecs": ("tests/contract", "tests/protocols", "tests/handles", "tests/test_mistyped_arguments.py"),
     "pump": ("tests/transport", "tests/bus"),
+    "service": ("tests/app/service",),
+    "outputs": ("tests/app/outputs",),
+    "config": ("tests/app/config",),
 }
 """The tests of a room: `--near` asks no others."""
 FURTHER = (
@@ -27,11 +32,14 @@ FURTHER = (
     "tests/verification/proof",
 )
 """Those that may notice what a room's own tests do not: with them it is the suite and the proof that are asked."""
+FURTHER_OUTSIDE = ("tests/app/config", "tests/app/line", "tests/app/outputs", "tests/app/service")
+"""The same for rooms outside the core."""
 
 
-def asked(near: bool) -> list[str]:
-    """Return the files and folders of all tests that are asked about any mutant."""
-    return sorted({path for paths in NEAR.values() for path in paths} | set(() if near else FURTHER))
+def asked(near: bool, rooms: Collection[str] = tuple(CORE)) -> list[str]:
+    """Return the files and folders of all tests that are asked about any mutant of these rooms."""
+    further = {*(FURTHER if CORE.keys() & rooms else ()), *(FURTHER_OUTSIDE if OUTSIDE.keys() & rooms else ())}
+    return sorted({path for room in rooms for path in NEAR[room]} | (set() if near else further))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, TypeAlias
 
-ROOMS: dict[str, tuple[str, ...]] = {
+CORE: dict[str, tuple[str, ...]] = {
     "arbiter": ("busmaster/arbiter/*.py",),
     "contract": ("busmaster/contract/*.py",),
     "wire": ("busmaster/wire/*.py",),
@@ -25,7 +25,14 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "pump": ("busmaster/transport/pump.py", "busmaster/transport/marks.py"),
 }
-"""The rooms whose mutants count, by patterns of their files."""
+"""The rooms of the core, by patterns of their files. Their mutants are drawn by default."""
+OUTSIDE: dict[str, tuple[str, ...]] = {
+    "service": ("busmaster/app/service/*.py",),
+    "outputs": ("busmaster/app/outputs/*.py",),
+    "config": ("busmaster/app/config/*.py",),
+}
+"""The rooms outside the core whose mutants can be drawn. The checks of rights are in the service."""
+ROOMS = {**CORE, **OUTSIDE}
 WITHOUT_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONPYCACHEPREFIX": os.devnull}
 """Environment of tests whose code changes: a change within a second that keeps a file's size would not be compiled. The
 second variable keeps tests/conftest.py from caching bytecode all the same."""

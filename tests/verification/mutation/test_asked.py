@@ -6,8 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.verification.mutation.asked import FURTHER, NEAR, Measured, asked, changed_lines, statements_at
-from tests.verification.mutation.places import ROOMS
+from tests.verification.mutation.asked import (
+    FURTHER,
+    FURTHER_OUTSIDE,
+    NEAR,
+    Measured,
+    asked,
+    changed_lines,
+    statements_at,
+)
+from tests.verification.mutation.places import OUTSIDE, ROOMS
 
 ROOT = Path(__file__).parents[3]
 SOURCE = """\
@@ -74,3 +82,4 @@ def test_every_room_has_its_tests_and_all_that_are_asked_exist() -> None:
     assert set(NEAR) == set(ROOMS)
     assert [path for path in (*asked(near=True), *FURTHER) if not (ROOT / path).exists()] == []
     assert set(asked(near=False)) - set(asked(near=True)) == set(FURTHER)
+    assert set(asked(near=False, rooms=list(OUTSIDE))) == set(FURTHER_OUTSIDE)

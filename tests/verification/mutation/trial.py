@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,14 +38,15 @@ class Verdict:
 class Copy:
     """A copy of what is committed, where files may be changed, and warm processes that run its tests."""
 
-    def __init__(self, root: Path, folder: Path) -> None:
+    def __init__(self, root: Path, folder: Path, rooms: Collection[str]) -> None:
         subprocess.run(["git", "clone", "--quiet", "--shared", str(root), str(folder)], check=True)
         self.folder = folder
+        self._rooms = rooms
         self._warm: dict[str, subprocess.Popen[str]] = {}
 
     def measure(self, near: bool, file: Path) -> None:
         """Write what is known of the tests into a file. Raises RuntimeError if they fail already."""
-        process = self._start("measure", str(file), *asked(near))
+        process = self._start("measure", str(file), *asked(near, self._rooms))
         if process.wait() != 0:
             raise RuntimeError(f"the tests fail without a mutant:\n{self._said('measure').read_text()[-2000:]}")
 
@@ -70,13 +71,13 @@ class Copy:
 
     def _noticed_by(self, mutant: Mutant, lines: set[int], near: bool, measured: Measured) -> str | None:
         """Return the test that notices what is changed now, or None."""
-        paths = list(NEAR[mutant.room]) if near else asked(near)
+        paths = list(NEAR[mutant.room]) if near else asked(near, self._rooms)
         running = measured.running(mutant.module, lines)
         if "" not in running:
             tests = measured.quickest(running, paths)
             if not tests:
                 return None
-            answer = self._answer("answer", asked(near), module=mutant.module, tests=tests)
+            answer = self._answer("answer", asked(near, self._rooms), module=mutant.module, tests=tests)
             if answer["status"] != UNLIKE:
                 return answer["test"] if answer["status"] else None
         answer = self._answer("import", [], paths=paths, tests=measured.quickest(measured.seconds, paths))
