@@ -58,3 +58,8 @@ def test_the_page_lists_every_name() -> None:
 def test_the_old_name_of_the_configuration_names_the_new_ones() -> None:
     with pytest.raises(ImportError, match=r"ConfiguredLine and check are in busmaster\.app\.line"):
         importlib.import_module("busmaster.config")
+
+
+def test_the_old_name_of_the_frames_names_the_new_one() -> None:
+    with pytest.raises(ImportError, match=r"has moved to busmaster\.contract\.frames"):
+        importlib.import_module("busmaster.capture.frames")
