@@ -85,10 +85,8 @@ def test_r15_whatever_stands_still_nothing_is_wrong_or_lost_and_everything_heals
 @pytest.mark.parametrize("learned", [False, True])
 @pytest.mark.parametrize(("protocol", "mix"), in_turn_by_default(KINDS, (mix.name for mix in STANDING_LONG)))
 def test_r15_a_network_that_stands_still_for_6_s_confirms_no_write_and_delivers_no_other_value(
-    protocol: str, mix: str, learned: bool, monkeypatch: pytest.MonkeyPatch
+    protocol: str, mix: str, learned: bool
 ) -> None:
-    for name in ("TRUSTED_AFTER", "TRUSTED_AGAIN_AFTER", "EPOCH"):  # which learned hunts set
-        monkeypatch.setattr(learning, name, getattr(learning, name))
     hunt = Hunt(protocol, mix, 1, learned=learned)
     totals = hunt.run(LONG)
     check(totals, hunt)
