@@ -35,6 +35,8 @@ from busmaster.ext import (
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 """Options of a request that a client can set."""
 INTERFACE = "service"
+BY_PROGRAM, BY_OWNER = "its program cancelled it", "the program that owns the line ended"
+"""Why a request was cancelled."""
 
 
 class RequestSender(Protocol):
@@ -162,7 +164,7 @@ class Reading:
         self._on_end = on_end
         ext.start(self.node, self._request, self)
 
-    def cancel(self) -> None:
+    def cancel(self, cause: str = BY_PROGRAM) -> None:
         """Cancel the command. If it is on the wire, its reply is discarded."""
         if not self._over:
             if self._request.transaction is not None:
@@ -215,6 +217,7 @@ class Writing:
         self._asked = asked
         self._stop = stop
         self._begun = False
+        self._cause = BY_PROGRAM
         self._on_end: OnEnd
 
     @property
@@ -241,8 +244,9 @@ class Writing:
         self.doing = asyncio.ensure_future(self._write())
         self.doing.add_done_callback(self._written)
 
-    def cancel(self) -> None:
-        """Cancel the write. If it is on the wire, its reply is discarded."""
+    def cancel(self, cause: str = BY_PROGRAM) -> None:
+        """Cancel the write. If it is on the wire, its reply is discarded. `cause` is for the audit log."""
+        self._cause = cause
         if self.doing is not None:
             self.doing.cancel()
 
@@ -294,8 +298,8 @@ class Writing:
         if isinstance(error, Exception):
             return error
         if self.sent:
-            return WriteUnconfirmed("its program cancelled it before the reply")
-        return NotStarted("its program cancelled it before it was sent")
+            return WriteUnconfirmed(f"{self._cause} before the reply")
+        return NotStarted(f"{self._cause} before it was sent")
 
     def _write_request(self) -> WriteRequest:
         """Return the request for the audit log, with the name and unit of a point if a poll group has it."""

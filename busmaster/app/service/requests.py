@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from busmaster import Priority
-from busmaster.app.service.client_requests import ClientRequest, RequestSender, Writing, client_request_of
+from busmaster.app.service.client_requests import BY_OWNER, ClientRequest, RequestSender, Writing, client_request_of
 from busmaster.app.service.failures import REFUSED, refusal_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import Malformed
@@ -87,7 +87,7 @@ class Requests:
         """Send the result of all requests, because the service ends, and perhaps the bus too."""
         for number, request in list(self._under_way.items()):
             if request is not None:
-                request.cancel()
+                request.cancel(BY_OWNER)
                 self._refuse(number, _unreported(request, BusClosed, "the program that owns the line ends"))
 
     async def give_up(self) -> None:

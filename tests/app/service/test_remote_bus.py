@@ -346,6 +346,10 @@ def test_an_owner_that_ends_tells_what_became_of_each_request(tmp_path: Path) ->
                 with pytest.raises(BusClosed, match="the program that owns the line ends"):
                     await waiting
                 assert sorted(line.audit())[0][1] == "not started"
+                assert {record.error for record in line.records} == {
+                    "the program that owns the line ended before the reply",
+                    "the program that owns the line ended before it was sent",
+                }
                 await line.service.__aenter__()
 
     asyncio.run(run())
