@@ -361,9 +361,13 @@ async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabl
         target.line.authorisation.record = records.append
     try:
         async with target.bus, late_nodes(target.bus, in_file=target.line is not None):
-            if not dry_run and not await may_be_written(target, enabled):
-                return FAILED
-            plan = await prepare(target, wanted)
+            try:
+                if not dry_run and not await may_be_written(target, enabled):
+                    return FAILED
+                plan = await prepare(target, wanted)
+            except BusError:
+                note("nothing was written")
+                raise
             print_plan(plan, target)
             status = FAILED if any(not left.expected for left in plan.left) else OK
             if dry_run or not plan.changes:

@@ -197,6 +197,7 @@ def test_a_load_that_loses_its_port_while_it_compares_has_written_nothing(bench:
     ran = bench.load("one", "undo", pulled=True)
     assert (ran.status, ran.out) == (1, "")
     assert re.search(LOST, ran.err)
+    assert "nothing was written" in ran.err
     assert bench.drive.values == before
     assert not Path(bench.path("undo")).exists()
 
