@@ -8,7 +8,14 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.counters import DriverErrors, Histogram, LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.counters import (
+    DriverErrors,
+    Histogram,
+    LineStatistics,
+    NodeStatistics,
+    Quantiles,
+    RecentUtilisation,
+)
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench
@@ -177,3 +184,18 @@ def test_attempts_are_those_that_have_ended_whatever_came_of_them() -> None:
     bench.arbiter.line_down("unplugged", bench.now)
     counts = node.counters.snapshot(0.0)
     assert (counts.ok, counts.attempts, counts.fruitless, counts.failed) == (1, 2, 0, 1)
+
+
+def test_errors_of_the_driver_count_from_a_snapshot() -> None:
+    before, now = DriverErrors(1, 2, 3, 4, 5), DriverErrors(11, 22, 33, 44, 55)
+    assert now.since(before) == DriverErrors(10, 20, 30, 40, 50)
+
+
+def test_the_recent_utilisation_begins_anew_when_the_statistics_are_reset() -> None:
+    recent = RecentUtilisation(10.0)
+    idle = line_statistics()
+    recent.note(0.0, replace(idle, busy=2.0, quiet_time=1.0))
+    assert recent.note(4.0, replace(idle, busy=4.0, quiet_time=1.0)) == pytest.approx(0.5)
+    reset = replace(idle, busy=0.5, quiet_time=0.0)
+    assert recent.note(5.0, reset) == reset.utilisation
+    assert recent.note(6.0, replace(idle, busy=0.5, quiet_time=0.5)) == pytest.approx(0.5)

@@ -7,8 +7,9 @@ import pytest
 from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import RepliesLate
 from busmaster.arbiter.health import Health
+from busmaster.arbiter.on_wire import Step
 from busmaster.contract.exchange import Exchange
-from busmaster.contract.timing import Timings
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import (
@@ -249,3 +250,10 @@ def test_a_bug_in_a_protocols_reader_fails_its_transaction_and_not_the_line() ->
     assert bench.sent() == READ_1_OF_NODE_1
     bench.hear(FIVE, after=0.004)
     assert sound.value == 5.0
+
+
+def test_r2_a_reply_window_counts_from_the_last_byte_of_the_echo() -> None:
+    step = Step(ReplyTiming(0.05, 0.1, 0.15, 0.01), 0.004, TAU)
+    step.begin(ReplyTiming(0.05, 0.1, 0.15, 0.01), 8, 10, 3.0)
+    assert step.echoed(5.0) == pytest.approx(5.0 + 0.1 + 0.004)
+    assert step.end == pytest.approx(5.0)

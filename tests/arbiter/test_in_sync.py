@@ -676,3 +676,11 @@ def test_r15_a_port_that_comes_back_begins_with_reads_again() -> None:
     bench.ask(node, write(5))
     bench.until_sent()
     assert bench.sent() == request_of(1)
+
+
+def test_r15_only_an_equal_reply_is_ambiguous_and_only_while_the_overtaken_one_can_come() -> None:
+    in_sync = InSync()
+    in_sync._ambiguous = [(b"\x01", 10.0)]
+    assert in_sync.is_ambiguous((b"\x01", b"\x03"), 5.0)
+    assert not in_sync.is_ambiguous((b"\x02",), 5.0)
+    assert not in_sync.is_ambiguous((b"\x01",), 11.0)

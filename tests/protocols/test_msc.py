@@ -214,6 +214,8 @@ def test_a_block_that_is_written_changes_whatever_lies_within_four_addresses_of_
     """A value has four bytes: its address grows by no more, but by how much is not known."""
     changes = BlockWrite(10, tuple(range(32))).changes(PROFILE)
     assert changes == {("data", address): None for address in range(7, 10 + 32 * 4)} | {("data", 10): 0}
+    stepping = replace(PROFILE, merge=Merging(address_step=1))
+    assert BlockWrite(10, tuple(range(32))).changes(stepping) == {("data", 10 + n): n for n in range(32)}
 
 
 # merged reads
