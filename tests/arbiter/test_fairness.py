@@ -6,6 +6,7 @@ from math import ceil
 from typing import Any
 
 import hypothesis.strategies as st
+import pytest
 from hypothesis import given, settings
 
 from busmaster.arbiter.counters import LineCounters
@@ -77,6 +78,7 @@ CANCEL = st.tuples(st.just("cancel"), st.integers(0, 1000))
 STORY = st.lists(st.one_of(ASKED, DONE, CANCEL), max_size=60)
 
 
+@pytest.mark.slow
 @given(STORY)
 @settings(max_examples=150)
 def test_r7_writes_to_one_node_never_overtake_each_other_in_any_story(story: list[tuple[Any, ...]]) -> None:

@@ -101,6 +101,7 @@ def texts() -> Iterator[tuple[str, int, str]]:
             yield name_of(path), number, line
 
 
+@pytest.mark.slow
 def test_nothing_cites_what_is_not_in_the_repository() -> None:
     """A protocol's own manual may be cited, by its title."""
     found = [

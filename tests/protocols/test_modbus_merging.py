@@ -309,6 +309,7 @@ async def polled(server: CountedServer, limit: int | None = None) -> tuple[list[
         return list(server.requests), [snapshot[point] for point in points]
 
 
+@pytest.mark.slow
 def test_500_registers_of_pymodbus_are_4_requests_in_place_of_500() -> None:
     async def story() -> None:
         async with CountedServer(COUNT) as server:
@@ -324,6 +325,7 @@ def test_500_registers_of_pymodbus_are_4_requests_in_place_of_500() -> None:
     asyncio.run(story())
 
 
+@pytest.mark.slow
 def test_a_register_that_pymodbus_lacks_is_refused_alone() -> None:
     """The group chooses again after replies whose bytes came faster than the baud rate: it must still merge."""
 

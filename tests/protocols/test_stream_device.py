@@ -100,6 +100,7 @@ def test_every_instrument_gets_the_same_requests() -> None:
             assert ours[-1] == reduce(xor, ours[6:-1])
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_each_reads_what_the_other_has_written(line: str) -> None:
     for address in INSTRUMENTS:
@@ -117,6 +118,7 @@ async def test_each_reads_what_the_other_has_written(line: str) -> None:
             assert epics.read(address, "SL") == 300.5 + address
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_each_gets_the_same_code_of_a_refusal(line: str) -> None:
     for name, value, code in (("PV", 3.0, 0x05C8), ("SL", 5000.0, 0x08C8)):

@@ -83,6 +83,7 @@ def served(tally: None) -> Iterator[TcpServer]:
 TALLY = ("--protocol", "tally")
 
 
+@pytest.mark.slow
 def test_the_command_line_reads_writes_and_finds_its_nodes(served: TcpServer, busmaster: Command) -> None:
     assert busmaster("write", served.path, *TALLY, "--node", "3", "a=7", "gate=65535", "--gate", "4").lines == [
         "a ok",

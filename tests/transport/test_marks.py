@@ -268,6 +268,7 @@ async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(pty_
         answering.cancel()
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_binary_data_full_of_ff_comes_through_a_pty() -> None:
     with serve_pty(Line(msc.PROFILE.line, [make_device("msc", 3)], paced=False)) as server:

@@ -270,6 +270,7 @@ async def test_a_reply_with_a_remote_parity_error_fails_the_attempt_and_is_count
             assert (await bus.statistics()).driver == DriverErrors(0, 0, 0, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_binary_data_full_of_ff_comes_through() -> None:
     line = Line(MscController.profile.line, [make_device("msc", 3)], paced=False)

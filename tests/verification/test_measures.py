@@ -75,6 +75,7 @@ def test_circles_are_found_by_way_of_others() -> None:
     assert circles({("a", "b"), ("b", "c"), ("c", "a"), ("c", "d")}) == [{"a", "b", "c"}]
 
 
+@pytest.mark.slow
 def test_the_ways_pass_what_every_request_passes() -> None:
     """A trace that sees nothing, or only one side, would be small, and nobody would wonder."""
     found = ways(HERE)

@@ -21,7 +21,7 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
     Raises FileError with line and key for an error, also in an output that is not enabled.
     """
     if not table.data.keys() <= OWN.keys():
-        table.only(*names())
+        table.only(*names(), advice="; an output of another package must be installed in this environment")
     outputs = dict(_enabled(table, tuple(groups)))
     taken: dict[str, str] = {}
     for kind, settings in outputs.items():

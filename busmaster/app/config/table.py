@@ -30,11 +30,11 @@ class Table:
     def __contains__(self, key: str) -> bool:
         return key in self.data
 
-    def only(self, *known: str) -> None:
-        """Refuse other keys. Raises FileError for a key that is none of these."""
+    def only(self, *known: str, advice: str = "") -> None:
+        """Refuse other keys. Raises FileError for a key that is none of these. `advice` is added to its text."""
         for key in self.data:
             if key not in known:
-                self.source.keep(self.error(f"no such key; {self._meant(key, known)}", key))
+                self.source.keep(self.error(f"no such key; {self._meant(key, known)}{advice}", key))
 
     def _meant(self, key: str, known: tuple[str, ...]) -> str:
         new = now_called(key, known)

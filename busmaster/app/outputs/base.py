@@ -100,6 +100,10 @@ def check_extra(package: str, extra: str) -> None:
         raise InvalidCommand(f"this output needs {package}, which is not installed; pip install 'busmaster[{extra}]'")
 
 
+class Unsendable(Exception):
+    """An item that can never be sent, raised in the `send` of `Output.drain` with the reason. The item is dropped."""
+
+
 class Output(ABC):
     """One output. `report` is called from any thread with what happens to the output."""
 
@@ -133,6 +137,7 @@ class Output(ABC):
         self._stop = threading.Event()
         self._reopen = threading.Event()
         self._retry = FIRST_RETRY
+        self._unsendable = ""
         # A daemon: one that hangs on a disk or a network must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
 
@@ -235,7 +240,8 @@ class Output(ABC):
     def drain(self, send: Callable[[Item], None]) -> None:
         """Send items one by one until the output is stopped and none waits.
 
-        If `send` raises, the item waits again, in front of the others, and the error is raised on.
+        If `send` raises Unsendable, the item is dropped. If it raises another error, the item waits again, in front of
+        the others, and the error is raised on.
         """
         while True:
             stopped = self._stop.is_set()  # before the queue is checked: everything offered until then is sent
@@ -247,11 +253,22 @@ class Output(ABC):
                 continue
             try:
                 send(item)
+            except Unsendable as error:
+                self._drop(item, str(error))
+                continue
             except BaseException:
                 self._waiting.appendleft(item)
                 raise
             self.written += size_of(item)
             self.up()
+
+    def _drop(self, item: Item, why: str) -> None:
+        self.lost += size_of(item)
+        if isinstance(item, WriteRecord):
+            self.settle_entry(item, f"{self.kind} dropped it: {why}")
+        if why != self._unsendable:  # the same reason is reported once
+            self._unsendable = why
+            self._report(f"{self.kind} dropped values that it cannot send: {why}")
 
     def up(self) -> None:
         """Note that the output works, and report it if it was down."""

@@ -79,7 +79,13 @@ def _loaded(entry: EntryPoint) -> OutputKind:
         ) from None
     if not isinstance(kind, OutputKind):
         raise InvalidCommand(
-            f"the output {entry.name!r}{package} is not an OutputKind but a {type(kind).__name__}; "
+            f"the output {entry.name!r}{package} is not an OutputKind but "
+            f"{f'the class {kind.__name__}' if isinstance(kind, type) else f'a {type(kind).__name__}'}; "
             "fix or uninstall that package"
+        )
+    if kind.name != entry.name:
+        raise InvalidCommand(
+            f"the output {entry.name!r}{package} is an OutputKind of the name {kind.name!r}; "
+            "use one name for both, or uninstall that package"
         )
     return kind

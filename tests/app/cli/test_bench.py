@@ -77,6 +77,7 @@ def test_an_emulated_line_in_virtual_time_gives_the_same_json_each_time(busmaste
     assert list(fields["priorities"]) == ["urgent", "command"]
 
 
+@pytest.mark.slow
 def test_a_line_on_a_pseudo_terminal_is_measured_and_printed(busmaster: Command) -> None:
     done = busmaster("bench", *HCP2, "--nodes", "1-2", "--seconds", "0.3", "--priorities", "command=1,urgent=1")
     assert (done.status, done.err) == (
@@ -152,6 +153,7 @@ def test_a_port_that_is_not_there_is_one_clear_line_and_status_1(busmaster: Comm
     assert port.removeprefix("socket://") in done.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_ctrl_c_prints_what_was_measured_so_far(served: TcpServer) -> None:
     with started("bench", served.path, *HCP2, "--nodes", "1-3", "--seconds", "3000", "--json") as process:
         assert watched(served).busy.wait(PATIENCE)
@@ -265,6 +267,7 @@ def test_bad_arguments_are_wrong_usage_and_nothing_is_opened(
     assert "measuring" not in done.err
 
 
+@pytest.mark.slow
 def test_a_plot_is_drawn_after_what_is_printed(busmaster: Command, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "latency.png"

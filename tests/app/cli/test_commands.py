@@ -231,6 +231,7 @@ def test_scan_prints_a_line_for_each_node_that_answers(busmaster: Command, contr
     assert without_time(found.out) == {"node": 7, "value": 0, "answer": "read element 1: 0"}
 
 
+@pytest.mark.slow
 def test_a_scan_of_all_addresses_warns_of_none_of_them(busmaster: Command) -> None:
     with serve("mentor", 3) as server:
         found = busmaster("scan", server.path, "--protocol", "mentor", "--nodes", "2-3", "--timeout", "300")

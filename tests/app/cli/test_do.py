@@ -62,6 +62,7 @@ def audit(path: Path) -> list[tuple[Any, ...]]:
     return rows
 
 
+@pytest.mark.slow
 def test_a_drive_is_enabled_and_disabled_by_its_address(busmaster: Command, drive: TcpServer) -> None:
     node = f"7@{drive.path}"
     ran = busmaster("do", node, "enable", *MICROFLEX)
@@ -73,6 +74,7 @@ def test_a_drive_is_enabled_and_disabled_by_its_address(busmaster: Command, driv
     assert not enabled(drive)
 
 
+@pytest.mark.slow
 def test_a_reset_cancels_the_errors(busmaster: Command, drive: TcpServer) -> None:
     drive.call(lambda line, now: setattr(microflex(line), "axis_error", 4))
     ran = busmaster("do", f"7@{drive.path}", "enable", *MICROFLEX, "--within", "0.05")
@@ -112,6 +114,7 @@ def test_what_is_no_action_is_status_2_and_nothing_is_sent(
     assert complaint in ran.err
 
 
+@pytest.mark.slow
 def test_a_program_carries_out_a_command_with_data_below_0(busmaster: Command, tmp_path: Path) -> None:
     with serve("hcp2", 1) as server:
         mint = server.call(lambda line, now: line.device(1))
@@ -131,6 +134,7 @@ def test_a_program_carries_out_a_command_with_data_below_0(busmaster: Command, t
         assert "the command takes 20 s at least" in ran.err
 
 
+@pytest.mark.slow
 def test_flags_are_set_and_cleared(busmaster: Command) -> None:
     with serve("msc", 3) as server:
         msc = ("--protocol", "msc", "--timeout", "1000")
@@ -151,6 +155,7 @@ def test_help_lists_the_actions_of_each_protocol(busmaster: Command) -> None:
 # by a file
 
 
+@pytest.mark.slow
 def test_each_write_of_an_action_is_on_record_by_its_point(busmaster: Command, file: Path, drive: TcpServer) -> None:
     assert busmaster("do", f"drive@{file}", "enable").status == 0
     assert busmaster("do", f"drive@{file}", "reset").status == 0
@@ -164,12 +169,14 @@ def test_each_write_of_an_action_is_on_record_by_its_point(busmaster: Command, f
     assert not enabled(drive)
 
 
+@pytest.mark.slow
 def test_a_point_of_the_file_names_the_record(busmaster: Command, file: Path) -> None:
     file.write_text(file.read_text() + '[nodes.drive.points]\ncontrol = { item = "108" }\n')
     assert busmaster("do", f"drive@{file}", "enable").status == 0
     assert audit(file) == [("busmaster do enable", "drive/control", 128, "written")]
 
 
+@pytest.mark.slow
 def test_limits_hold_for_an_action_and_not_for_a_stop(busmaster: Command, file: Path, drive: TcpServer) -> None:
     text = file.read_text()
     assert busmaster("do", f"drive@{file}", "enable").status == 0

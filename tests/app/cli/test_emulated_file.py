@@ -126,6 +126,7 @@ def test_emulate_reports_another_baud_rate_of_its_client() -> None:
         assert process.stderr.read() == ""
 
 
+@pytest.mark.slow
 def test_emulate_says_where_the_file_asks_for_what_no_device_has(tmp_path: Path) -> None:
     path, _ = file_of(VALUES[0][0].replace("outputs = 5", "outptus = 5"), ["outputs"], tmp_path)
     with started("emulate", str(path)) as process:

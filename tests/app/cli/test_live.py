@@ -133,6 +133,7 @@ async def test_only_colours_that_light_and_dark_grounds_both_show_are_used() -> 
     assert {colour.name for colour in colours} <= {"default", "red", "magenta", "color(1)", "color(5)"}
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_the_selection_stays_on_its_row_through_every_change() -> None:
     picture = tell(Picture(), *three_drives())
@@ -172,6 +173,7 @@ async def test_a_click_selects_the_row_under_it_wherever_the_table_is_scrolled_t
             assert screen.table.selected.name.split() == second[:3]
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
     nodes = (node(1), node(2), node(9, "down"))

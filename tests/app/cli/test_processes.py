@@ -46,6 +46,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(arguments, process.returncode, out, err)
 
 
+@pytest.mark.slow
 def test_a_value_goes_there_and_back_over_an_emulated_pty_by_its_link(tmp_path: Path) -> None:
     link = str(tmp_path / "line")
     with emulated("--nodes", "1-8", "--pty", link, "--paced") as (process, path):
@@ -100,6 +101,7 @@ def test_a_reader_that_goes_away_ends_a_poll_quietly(controllers: TcpServer) -> 
     assert "internal" not in err
 
 
+@pytest.mark.slow
 def test_the_demo_without_a_terminal_prints_plain_lines() -> None:
     done = ended_once(lambda lines: "8/speed_measured" in lines[-1], "demo")
     assert done.status == 130

@@ -160,6 +160,7 @@ def test_a_rate_that_no_device_has_is_said_once_and_the_command_goes_on(
     ]
 
 
+@pytest.mark.slow
 def test_decimals_of_a_write_are_said_with_it(mentor: Command) -> None:
     assert mentor("write", "1.17=-47.6", "--decimals", "1").out == "1.17 ok\n"
     assert mentor("read", "1.17").out == "1.17 -476\n"

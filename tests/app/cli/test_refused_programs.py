@@ -91,6 +91,7 @@ def failed_logins(busmaster: Command) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_who_guesses_tokens_of_the_service_is_slowed_down_counted_and_reported(
     busmaster: Command, file: Path, metrics: int
 ) -> None:
@@ -109,6 +110,7 @@ def test_who_guesses_tokens_of_the_service_is_slowed_down_counted_and_reported(
         assert count_of(metrics, 'logins_failed_total{interface="service"}') == count
 
 
+@pytest.mark.slow
 def test_who_guesses_tokens_of_the_page_is_slowed_down_counted_and_reported(
     busmaster: Command, file: Path, metrics: int
 ) -> None:
@@ -167,6 +169,7 @@ def test_who_guesses_passwords_of_opcua_is_slowed_down_counted_and_reported(
             interface.communicate(timeout=PATIENCE)
 
 
+@pytest.mark.slow
 def test_what_modbus_tcp_refuses_is_counted_and_reported_by_the_owner(
     busmaster: Command, file: Path, metrics: int
 ) -> None:

@@ -61,6 +61,7 @@ def has_items(*items: str) -> Callable[[list[str]], bool]:
     return lambda lines: {line.split()[1] for line in lines} >= set(items)
 
 
+@pytest.mark.slow
 def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(line: Path, tmp_path: Path) -> None:
     items = ("winder/force", "drive2/1", "drive3/1", "winder/axis0.idle")
     ran = ended_once(has_items(*items), "run", str(line), "--plain")

@@ -33,6 +33,7 @@ def audit(folder: Path) -> list[tuple[Any, ...]]:
         return database.execute("select interface, point, value, outcome from audit order by time").fetchall()
 
 
+@pytest.mark.slow
 def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, address):
         ran = busmaster("write", three_controllers.path, *HCP2, "--node", "2", "1=123.456", "--verify")

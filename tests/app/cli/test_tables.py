@@ -23,6 +23,7 @@ points.cam = { item = "3000:100", unit = "mm", factor = 0.1 }
 """
 
 
+@pytest.mark.slow
 def test_a_cam_table_is_written_verified_and_read_back(busmaster: Command, tmp_path: Path) -> None:
     cam = tmp_path / "cam.csv"
     cam.write_text("# position\n" + "".join(f"{value}\n" for value in CAM))
@@ -34,6 +35,7 @@ def test_a_cam_table_is_written_verified_and_read_back(busmaster: Command, tmp_p
         assert [int(line.split()[1]) for line in read.lines] == CAM
 
 
+@pytest.mark.slow
 def test_a_table_of_a_point_is_in_its_unit(busmaster: Command, tmp_path: Path) -> None:
     (tmp_path / "cam.csv").write_text(" ".join(f"{value / 10:g}" for value in CAM))
     with serve("msc", 3) as server:

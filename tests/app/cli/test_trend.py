@@ -176,6 +176,7 @@ def test_thinned_samples_keep_every_peak() -> None:
 # the command
 
 
+@pytest.mark.slow
 def test_lines_csv_and_summary_agree(three_controllers: TcpServer, tmp_path: Path) -> None:
     path = tmp_path / "trend.csv"
     three_controllers.call(lambda line, now: line.device(1).preset("10", 12.5))
@@ -196,6 +197,7 @@ def test_lines_csv_and_summary_agree(three_controllers: TcpServer, tmp_path: Pat
         assert re.search(pattern, ran.err), ran.err
 
 
+@pytest.mark.slow
 def test_it_ends_by_itself_and_says_so_in_json(busmaster: Command, three_controllers: TcpServer) -> None:
     ran = busmaster("trend", three_controllers.path, *HCP2, "3/1", "--period", "0.5", "--seconds", "2.75", "--json")
     assert ran.status == 0
@@ -214,6 +216,7 @@ def test_a_node_that_does_not_answer_is_no_value_and_status_1(busmaster: Command
     assert "no value was received" in ran.err
 
 
+@pytest.mark.slow
 def test_an_item_that_the_node_does_not_have_ends_it(busmaster: Command) -> None:
     with serve("mentor", 12) as server:
         ran = busmaster("trend", server.path, "--protocol", "mentor", "--timeout", "1000", "12/1.99")

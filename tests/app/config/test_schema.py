@@ -126,6 +126,7 @@ def test_json_schema_is_of_draft_2020_12() -> None:
     Draft202012Validator.check_schema(SCHEMA)
 
 
+@pytest.mark.slow
 def test_json_schema_allows_what_the_program_reads_and_rejects_other_types() -> None:
     wrong = []
     for table, key in KEYS:

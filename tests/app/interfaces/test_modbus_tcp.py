@@ -663,6 +663,7 @@ def eventually(request: Callable[[], Any], wanted: Callable[[Any], bool], allowe
     return reply
 
 
+@pytest.mark.slow
 def test_points_are_read_and_written_as_the_map_says(file: Path) -> None:
     options = ("--map", str(file.parent / "map.toml"), "--allow", "oven/*", "--allow", "kiln/*")
     with owner("serve", str(file)), interface(str(file), *options) as opened, client_of(opened) as client:
@@ -700,6 +701,7 @@ def test_points_are_read_and_written_as_the_map_says(file: Path) -> None:
         assert code(client.readwrite_registers(read_address=0, read_count=1, address=0, values=[1])) == 1
 
 
+@pytest.mark.slow
 def test_without_allow_nothing_is_written_and_only_what_it_names_otherwise(file: Path) -> None:
     with owner("serve", str(file)):
         with interface(str(file)) as opened, client_of(opened) as client:
@@ -719,6 +721,7 @@ def test_without_allow_nothing_is_written_and_only_what_it_names_otherwise(file:
             assert code(client.write_register(0, 8)) == 1
 
 
+@pytest.mark.slow
 def test_a_value_is_not_sent_when_the_owner_stands_still_or_is_gone(file: Path) -> None:
     kept = list(struct.unpack(">2H", struct.pack(">f", 21)))
 
@@ -758,6 +761,7 @@ def test_a_value_is_not_sent_when_the_owner_stands_still_or_is_gone(file: Path) 
                 eventually(lambda: other.read_holding_registers(0, count=4), lambda reply: not code(reply))
 
 
+@pytest.mark.slow
 def test_a_value_of_a_lost_line_is_not_sent(file: Path, units: TcpServer) -> None:
     with owner("serve", str(file)), interface(str(file)) as opened, client_of(opened) as client:
         eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))
@@ -765,6 +769,7 @@ def test_a_value_of_a_lost_line_is_not_sent(file: Path, units: TcpServer) -> Non
         eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: code(reply) == 11, (0,))
 
 
+@pytest.mark.slow
 def test_a_value_of_a_unit_that_has_fallen_silent_is_not_sent(tmp_path: Path) -> None:
     devices = [make_device("modbus", address) for address in (11, 12)]
     line = Line(find("modbus").profile.line, devices, chance=random.Random(1), paced=False)
@@ -854,6 +859,7 @@ def test_an_address_has_few_requests_on_the_line_and_does_not_delay_another(monk
     assert all(0 < left < 3.0 for left in times), "the wait for the turn counts"
 
 
+@pytest.mark.slow
 def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_replies(file: Path) -> None:
     with (
         owner("serve", str(file)),
@@ -898,6 +904,7 @@ def test_requests_are_passed_through_to_units_and_several_clients_get_their_own_
         assert wrong == []
 
 
+@pytest.mark.slow
 def test_a_unit_that_does_not_reply_is_exception_11(file: Path) -> None:
     text = file.read_text().replace("address = 12", "address = 13")
     file.write_text(text)
@@ -906,6 +913,7 @@ def test_a_unit_that_does_not_reply_is_exception_11(file: Path) -> None:
         assert code(client.read_holding_registers(0, device_id=13)) == 11
 
 
+@pytest.mark.slow
 def test_hostile_bytes_do_not_disturb_another_client(file: Path) -> None:
     with owner("serve", str(file)), interface(str(file)) as opened, client_of(opened) as client:
         eventually(lambda: client.read_holding_registers(0, count=4), lambda reply: not code(reply))

@@ -155,6 +155,7 @@ async def test_with_read_after_write_none_of_60_reads_is_the_old_value_as_good(o
         assert group.statistics().cycles == 1
 
 
+@pytest.mark.slow
 async def test_a_point_has_its_unit_range_status_and_time(opened: Opened) -> None:
     async with opened.owned() as line:
         began = time.time()
@@ -285,6 +286,7 @@ async def test_a_client_changes_nothing_but_values(opened: Opened) -> None:
         assert line.audit() == []
 
 
+@pytest.mark.slow
 async def test_a_node_that_does_not_answer_has_no_values_until_it_does_again(opened: Opened) -> None:
     async with opened.owned() as line:
         line.poll("10")
@@ -394,6 +396,7 @@ async def test_nobody_comes_by_the_session_of_another(opened: Opened) -> None:
         assert line.audit() == []
 
 
+@pytest.mark.slow
 async def test_sessions_that_come_and_go_are_nothing_to_the_line(opened: Opened) -> None:
     async with opened.owned() as line:
         line.poll("10")

@@ -72,6 +72,7 @@ async def test_a_read_that_is_not_supported_is_refused(opened: Opened) -> None:
         assert (await asyncio.to_thread(read, opened.client, "5/10", age=1000.0)).StatusCode.name == "Good"
 
 
+@pytest.mark.slow
 async def test_a_deadband_that_is_not_supported_is_refused(opened: Opened) -> None:
     async with opened.owned() as line:
         line.poll("10")

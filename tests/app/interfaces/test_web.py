@@ -118,6 +118,7 @@ async def test_its_schema_has_every_path_and_is_served(tmp_path: Path) -> None:
 METHODS = ("GET", "HEAD", "PUT", "POST", "PATCH", "DELETE", "OPTIONS", "TRACE", "QUERY")
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_a_method_that_a_path_does_not_have_is_refused_with_those_that_it_has(tmp_path: Path) -> None:
     paths = {path: {method.upper() for method in of if method != "parameters"} for path, of in SCHEMA["paths"].items()}

@@ -127,6 +127,7 @@ def test_what_goes_out_gives_the_same_points_to_a_file_without_any() -> None:
     label=st.text(min_size=1).filter(str.isprintable),
     factor=st.floats(1e-12, 1e12) | st.integers(1, 10**9),
 )
+@pytest.mark.slow
 @example(unit="a\rb\x7f\x00", name="\x7f", label="=", factor=1e-05)
 def test_any_text_and_any_number_goes_out_and_comes_in_to_the_letter(
     unit: str, name: str, label: str, factor: float

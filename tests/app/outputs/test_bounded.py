@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from busmaster.app.outputs.base import Happening, Item, Output
+from busmaster.app.outputs.base import Happening, Item, Output, Unsendable
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.settings import SpillingSettings
 from busmaster.bus.polling import Snapshot
@@ -169,3 +169,32 @@ def test_what_was_lost_before_it_could_be_offered_counts_as_dropped() -> None:
     output.close(PATIENCE)
     counts = output.statistics()
     assert (counts.written, counts.dropped, counts.waiting) == (2, 3, 0)
+
+
+class Picky(Output):
+    """Sends each cycle, except the one that can never be sent."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        super().__init__("picky", SpillingSettings(), report)
+        self.sent: list[int] = []
+
+    def work(self) -> None:
+        self.drain(self._send)
+
+    def _send(self, item: Item) -> None:
+        assert isinstance(item, Snapshot)
+        if item.cycle in (2, 3):
+            raise Unsendable("the packet is too large")
+        self.sent.append(item.cycle)
+
+
+def test_an_item_that_can_never_be_sent_is_dropped_counted_and_reported_once() -> None:
+    reported: list[str] = []
+    output = Picky(reported.append)
+    output.start()
+    offer(output, 1, 5)
+    output.close(PATIENCE)
+    assert output.sent == [1, 4, 5]
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.waiting, counts.error) == (6, 4, 0, "")
+    assert reported == ["picky dropped values that it cannot send: the packet is too large"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import socket
 import sys
 from collections.abc import Iterator
@@ -17,7 +18,10 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine, check
 from busmaster.app.outputs import kinds
+from busmaster.bus.meaning import Named
 from busmaster.errors import InvalidCommand
+from tests.app.outputs.cycles import cycle
+from tests.app.service.lines import until
 from tests.docs.pages import ROOT
 
 HERE = Path(__file__).parent
@@ -39,6 +43,7 @@ def _installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: busmaster-broken\nVersion: 1.0\n")
     (broken / "entry_points.txt").write_text(
         "[busmaster.outputs]\nabsent = busmaster_absent:X\nnumber = math:pi\ncsv = math:pi\n"
+        "other = busmaster_influx:INFLUX\nkind = busmaster_influx:InfluxOutput\n"
     )
     monkeypatch.syspath_prepend(str(HERE / "installed"))
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -95,7 +100,12 @@ def test_the_reference_has_its_table() -> None:
 @pytest.mark.parametrize(
     ("name", "error"),
     [
-        ("influxx", "did you mean 'influx'"),
+        ("influxx", "did you mean 'influx'\\?; an output of another package must be installed in this environment"),
+        (
+            "other",
+            "the output 'other' of busmaster-broken is an OutputKind of the name 'influx'; use one name",
+        ),
+        ("kind", "the output 'kind' of busmaster-broken is not an OutputKind but the class InfluxOutput"),
         ("absent", "the output 'absent' of busmaster-broken cannot be imported: No module named 'busmaster_absent'"),
         ("number", "the output 'number' of busmaster-broken is not an OutputKind but a float"),
     ],
@@ -109,3 +119,29 @@ def test_one_that_cannot_be_used_is_an_error_that_names_it(name: str, error: str
 def test_a_name_of_this_package_cannot_be_taken() -> None:
     assert kinds.find("csv").about == "Values as lines of a CSV file."
     assert kinds.names().count("csv") == 1
+
+
+@pytest.mark.usefixtures("_installed")
+@pytest.mark.asyncio
+async def test_it_is_not_down_when_nobody_receives_and_sends_numbers_only() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+        closed.bind(("127.0.0.1", 0))
+        port = closed.getsockname()[1]
+    reported: list[str] = []
+    file = read(Source("line.toml", f"{LINE}[outputs.influx]\nport = {port}\n"))
+    async with ConfiguredLine(file, port=MemoryPort(emulated_line(file)), report=reported.append) as line:
+        await until(lambda: line.outputs.statistics()[0].written >= 5)
+        assert line.outputs.statistics()[0].error == ""
+    assert [text for text in reported if "down" in text] == []
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_labelled_value_is_sent_as_its_number_and_an_empty_cycle_is_not_sent() -> None:
+    influx = importlib.import_module("busmaster_influx")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as telegraf:
+        telegraf.bind(("127.0.0.1", 0))
+        telegraf.settimeout(30)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            for value in ("text", Named(2, "run"), True):
+                influx.send(out, telegraf.getsockname(), cycle(1, value))
+        assert [telegraf.recv(1000).decode().split()[1] for _ in range(2)] == ["value=2.0", "value=1.0"]

@@ -290,6 +290,7 @@ def test_each_process_of_the_owners_user_stands_for_itself_and_those_of_another_
     assert connecting_peer("192.0.2.1", 0) != connecting_peer("192.0.2.2", 0)
 
 
+@pytest.mark.slow
 def test_of_a_crowd_that_connects_at_once_some_wait_and_the_rest_is_closed_and_reported(tmp_path: Path) -> None:
     async def story(crowd: Crowd) -> None:
         told: list[str] = []

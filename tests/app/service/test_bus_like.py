@@ -224,6 +224,7 @@ def test_a_group_that_is_closed_before_it_was_accepted_does_not_begin(tmp_path: 
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_a_plan_of_a_remote_bus_is_that_of_its_owner(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         point = Hcp2Controller(line.bus, 5).point("1")

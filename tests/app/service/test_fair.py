@@ -103,6 +103,7 @@ def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
@@ -140,6 +141,7 @@ def test_r9_a_program_with_thousands_of_requests_delays_anothers_by_two_exchange
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_r9_a_sequence_of_one_program_is_not_interrupted_by_another(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         async with connect(line.address) as other:

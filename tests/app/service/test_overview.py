@@ -133,6 +133,7 @@ def test_more_points_than_one_message_holds_are_all_there_and_beyond_the_bound_t
     on_a_watched_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_a_pause_and_a_suspension_are_for_all_and_say_whose_wish_they_were(tmp_path: Path) -> None:
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
         other = Picture()
@@ -229,6 +230,7 @@ def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> Non
     on_a_watched_line(tmp_path, story)
 
 
+@pytest.mark.slow
 def test_what_happened_before_somebody_looks_is_told(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         line.service.line.journal.note("the winder was threaded")

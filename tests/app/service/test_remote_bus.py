@@ -85,6 +85,7 @@ def test_a_final_refusal_stays_one() -> None:
     assert not again.confirm
 
 
+@pytest.mark.slow
 def test_an_error_of_the_line_is_raised_here_with_its_node_and_command(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         with pytest.raises(NoReply, match="no reply") as caught:

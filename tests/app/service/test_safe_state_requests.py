@@ -63,6 +63,7 @@ def on_a_line(folder: Path, text: str, story: Story) -> None:
     asyncio.run(run())
 
 
+@pytest.mark.slow
 def test_it_passes_limits_ends_what_waited_and_leaves_the_line_open(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         controller = Hcp2Controller(remote, 5)

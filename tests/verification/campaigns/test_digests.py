@@ -15,6 +15,7 @@ def test_each_hunt_has_a_digest_and_each_digest_a_hunt() -> None:
     assert sorted(kept()) == sorted(names())
 
 
+@pytest.mark.slow
 def test_a_sample_of_the_transcripts_is_what_it_was() -> None:
     sample = list(names())[::SAMPLE]
     others = changed(((name, digest(name)) for name in sample), kept())

@@ -137,6 +137,7 @@ def test_a_reply_to_noise_is_not_a_reply_that_the_line_has_to_wait_for() -> None
     assert not hunt.totals.problems
 
 
+@pytest.mark.slow
 def test_nothing_grows_without_bound() -> None:
     """What is remembered is full after some thousand transactions; then twice as many leave no more objects."""
 

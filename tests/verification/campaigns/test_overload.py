@@ -216,6 +216,7 @@ def test_r9_urgent_starts_within_one_exchange_on_a_healthy_busy_line() -> None:
     assert line.world.arbiter.statistics(line.now).utilisation > 0.99
 
 
+@pytest.mark.slow
 def test_r9_urgent_starts_within_its_bound_beside_a_dead_node() -> None:
     line = saturated()
     line.devices[1].faults.dead = 1.0

@@ -67,6 +67,7 @@ def change(module: ModuleType, old: str, new: str) -> bool:
     return replaced(functions_by_file()[str(file)], file)
 
 
+@pytest.mark.slow
 def test_methods_are_replaced_and_what_is_cached_and_what_a_function_has_made(module: ModuleType) -> None:
     assert change(module, "value + 1", "value - 1")
     thing = module.Thing()

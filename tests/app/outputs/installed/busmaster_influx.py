@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 from busmaster import Snapshot
 from busmaster.app.outputs.base import Item, Output, OutputKind, OutputLine
@@ -32,23 +32,26 @@ class InfluxOutput(Output):
 
     def __init__(self, settings: InfluxSettings, line: OutputLine) -> None:
         super().__init__("influx", settings, line.report)
-        self._address = settings.host, settings.port
+        self._settings = settings
 
     def work(self) -> None:
         """Send what is offered, in the output's own thread. It is called again, after a pause, if it raises."""
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            out.connect(self._address)
-            self.drain(lambda item: self._send(out, item))
+        host, port = self._settings.host, self._settings.port
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, socket.SOCK_DGRAM) as out:
+            self.drain(lambda item: send(out, address, item))
 
-    def _send(self, out: socket.socket, item: Item) -> None:
-        if isinstance(item, Snapshot):  # the others are events and audit entries
-            out.send("\n".join(lines(item)).encode())
+
+def send(out: socket.socket, address: Any, item: Item) -> None:
+    """Send one item. The socket is not connected, so it raises no error if nobody receives."""
+    if isinstance(item, Snapshot) and (found := lines(item)):  # the others are events and audit entries
+        out.sendto("\n".join(found).encode(), address)
 
 
 def lines(cycle: Snapshot) -> list[str]:
     """Return a line for each good value that is a number."""
     return [
-        f"busmaster,point={point.key} value={sample.value} {int(sample.wall * 1e9)}"
+        f"busmaster,point={point.key} value={float(sample.value)} {int(sample.wall * 1e9)}"
         for point, sample in cycle.samples.items()
         if sample.error is None and isinstance(sample.value, int | float)
     ]
