@@ -13,11 +13,11 @@ from busmaster.app.cli.app import STATUSES, cli
 from busmaster.registry import kinds
 
 ENVIRONMENT = {
-    "BUSMASTER_TOKEN": "The token that is shown to a line or an interface that is reached by tcp://HOST:PORT.",
-    "BUSMASTER_DEBUG": "1 shows the log on standard error, and where an internal error came from.",
-    "NO_COLOR": "Whatever it holds, nothing is coloured.",
-    "XDG_RUNTIME_DIR": "Lines of a user are served in the folder busmaster there.",
-    "RUNTIME_DIRECTORY": "Set by systemd: where a line that is a service of the system is served.",
+    "BUSMASTER_TOKEN": "The token for a line or an interface at tcp://HOST:PORT.",
+    "BUSMASTER_DEBUG": "1: print the log, and the traceback of an internal error, on standard error.",
+    "NO_COLOR": "If it is set, nothing is coloured.",
+    "XDG_RUNTIME_DIR": "The lines of a user are served in its folder busmaster.",
+    "RUNTIME_DIRECTORY": "Set by systemd: the folder in which a line that is a system service is served.",
 }
 FILES = {
     "LINE.toml": "A line: its port, nodes, points, groups and outputs.",
@@ -159,14 +159,14 @@ def page() -> str:
 
 def _page() -> Iterator[str]:
     yield "# The command line\n"
-    yield "`busmaster COMMAND --help` says the same, and so does the manual page, busmaster(1).\n"
+    yield "`busmaster COMMAND --help` and the manual page busmaster(1) contain the same text.\n"
     yield from (f"{paragraph}\n" for paragraph in described(cli).paragraphs)
     yield "## Exit status\n\n| status | meaning |\n|---|---|"
     yield from (f"| {status} | {about} |" for status, about in STATUSES.items())
-    yield "\nStandard output carries results alone; what goes wrong is one line on standard error.\n"
+    yield "\nStandard output contains only results. Each error is one line on standard error.\n"
     yield "## Environment\n\n| variable | meaning |\n|---|---|"
     yield from (f"| `{name}` | {about} |" for name, about in ENVIRONMENT.items())
-    yield "\n## ITEM\n\nWhat ITEM is, by protocol; `busmaster items PROTOCOL` says what each means.\n"
+    yield "\n## ITEM\n\nThe forms of ITEM. `busmaster items PROTOCOL` lists the items and their meaning.\n"
     yield "| protocol | ITEM |\n|---|---|"
     yield from (f"| {kind.name} | {kind.items} |" for kind in kinds().values())
     yield """

@@ -1,7 +1,7 @@
 """The base of all interfaces: one line that another program owns, followed over all disconnects.
 
 An interface makes one `Following` and runs its `follow` beside its server. It reads `picture`, is called at each
-change, and writes by `write`. docs/interfaces.md describes how to make another interface.
+change, and writes by `write`. docs/adding-an-interface.md describes how to make another interface.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from busmaster.app.service.messages import value_of
-from busmaster.app.service.picture import Picture
+from busmaster.app.service.picture import Picture, Row
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.remote_overview import RemoteOverview
 from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
@@ -21,6 +21,8 @@ from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
 FIRST_PAUSE = 0.25
 """Seconds before it is tried again to connect; each time twice as long, up to `LONGEST_PAUSE`."""
 LONGEST_PAUSE = 2.0
+OLD_AFTER, LEAST_AGE = 3, 1.0
+"""Periods of its group, and at least seconds, after which a value without a new cycle is not current any more."""
 
 Receive = Callable[[str, Mapping[str, Any]], None]
 
@@ -102,6 +104,17 @@ class Following:
     def is_connected(self) -> bool:
         """Return whether the line's owner is connected, so that `picture` is the present state."""
         return isinstance(self.state, Connected)
+
+    def is_current(self, row: Row) -> bool:
+        """Return whether the value of a row is the present one.
+
+        It is not if the owner is away, if the last read failed, after a write to its place, or if its group had no
+        cycle for some time: the group is paused, or the owner is stopped.
+        """
+        if not self.is_connected or self._remote is None or row.asked is None or row.quality not in ("good", "late"):
+            return False
+        periods = (max(group.period, group.achieved) for group in self.picture.groups if group.name == row.group)
+        return self._remote.now() - row.asked <= max(LEAST_AGE, OLD_AFTER * next(periods, 0.0))
 
     @property
     def read_only(self) -> bool:

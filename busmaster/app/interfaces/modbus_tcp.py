@@ -25,7 +25,7 @@ from typing import Any, TypeAlias
 from weakref import WeakValueDictionary
 
 from busmaster import Priority, Quality
-from busmaster.app.interfaces.following import Following
+from busmaster.app.interfaces.following import LEAST_AGE, OLD_AFTER, Following
 from busmaster.app.interfaces.reported_refusals import ReportedRefusals
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
@@ -55,8 +55,6 @@ FINISH_WITHIN = 3.0
 MOST_ON_LINE = 4
 """Pass-through requests of one address on the line at once; the others wait. With 128 at once, a further client got no
 reply within FINISH_WITHIN. A line carries one at a time, so more would not make it faster."""
-OLD_AFTER, LEAST_AGE = 3, 1.0
-"""Periods, and at least seconds, without a cycle after which a value is stale."""
 LOOK_EVERY = 0.25
 """Seconds between two looks for other points of the line."""
 ASK_AGAIN = 1.0

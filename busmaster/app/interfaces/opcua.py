@@ -20,7 +20,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from busmaster import Snapshot
-from busmaster.app.interfaces.following import Following
+from busmaster.app.interfaces.following import LEAST_AGE, OLD_AFTER, Following
 from busmaster.app.interfaces.opcua_access import Rules, guard
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
 from busmaster.app.interfaces.opcua_health import Health
@@ -44,9 +44,6 @@ from busmaster.bounds import MOST_SHOWN_POINTS
 from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.ext import read_file
 
-OLD_AFTER = 3
-"""Periods after which a value that none has followed is uncertain; not before `LEAST_AGE`."""
-LEAST_AGE = 1.0
 LOOK_EVERY = 0.25
 """Seconds between two looks for values that are old."""
 ASK_AGAIN = 5.0

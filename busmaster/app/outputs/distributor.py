@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -73,6 +74,7 @@ class Distributor:
         asks: bool = True,
     ) -> None:
         self.report = report
+        self._log = logging.getLogger("busmaster.app.outputs")
         self.authorisation = authorisation or Authorisation(bus)
         self._in_charge = in_charge
         self._asks = asks
@@ -198,9 +200,14 @@ class Distributor:
         if self._watching is None:
             self._watching = asyncio.ensure_future(self._watch())
 
-    def _fed(self, group: Source, _: asyncio.Task[None]) -> None:
+    def _fed(self, group: Source, feeding: asyncio.Task[None]) -> None:
         self._feeding.pop(group, None)
         self._news.pop(group, None)
+        # An output that gets no more values looks like a line without changes, so this must be seen.
+        if not feeding.cancelled() and (bug := feeding.exception()) is not None:
+            what = f"outputs get no more values of {group.name}: {type(bug).__name__}: {bug}"
+            self._log.error(what, exc_info=bug)
+            self.report(f"{what}; please report this bug, and restart the program")
 
     async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
         lost = 0

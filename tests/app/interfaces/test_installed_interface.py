@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from busmaster import connect
 from tests.app.cli.conftest import ENVIRONMENT, owner, serve
 from tests.docs.pages import ROOT
 from tests.patience import PATIENCE
@@ -103,7 +105,9 @@ def test_it_reads_and_writes_a_line_and_outlives_its_owner(file: Path) -> None:
             "error: winder: force = 60 N is above its maximum of 50 N",
             "error: no point 'winder/farce'",
         ]
-        while requested(port, "winder/force") == ["error: stale"]:  # until the next cycle has read what was written
+        while requested(port, "winder/force") == [
+            "error: there is no current value"
+        ]:  # until the next cycle has read what was written
             time.sleep(0.02)
         assert requested(port, "winder/force") == ["12.5"]
 
@@ -115,6 +119,25 @@ def test_a_value_of_a_line_whose_owner_is_gone_is_not_sent(file: Path) -> None:
         process.wait(PATIENCE)
         while not requested(port, "winder/force")[0].startswith("error: "):
             pass
+
+
+def test_a_value_of_a_stopped_owner_or_of_a_paused_group_is_not_sent(file: Path) -> None:
+    with owner("serve", str(file)) as (process, address), interface(str(file)) as port:
+        eventually(port, "winder/force", "0.0")
+        os.kill(process.pid, signal.SIGSTOP)
+        while requested(port, "winder/force") != ["error: there is no current value"]:
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGCONT)
+        eventually(port, "winder/force", "0.0")
+        asyncio.run(paused(address))
+        while requested(port, "winder/force") != ["error: there is no current value"]:
+            time.sleep(0.02)
+
+
+async def paused(address: str) -> None:
+    async with connect(address) as remote:
+        overview = await remote.overview(lambda *_: None)
+        await overview.pause("fast", True)
 
 
 def test_the_help_lists_it_and_says_which_package_is_broken() -> None:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import MemoryPort
+from busmaster import MemoryPort, Snapshot
 from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
+from busmaster.app.outputs.exceptions import News
 from busmaster.bus.node import Node
 
 TEXT = """
@@ -91,3 +92,21 @@ def test_an_extra_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     for output, extra in (("mqtt", "mqtt"), ("metrics", "metrics")):
         with pytest.raises(FileError, match=rf"outputs\.{output}: .* pip install 'busmaster\[{extra}\]'"):
             opened(tmp_path, f"{TEXT}[outputs.{output}]\n")
+
+
+@pytest.mark.asyncio
+async def test_a_bug_that_ends_the_feed_of_the_outputs_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: object, snapshot: Snapshot) -> Snapshot:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(News, "of", broken)
+    reported: list[str] = []
+    line = opened(tmp_path)
+    line.outputs.report = reported.append
+    await run(line, 3)
+    assert (
+        "outputs get no more values of fast: ZeroDivisionError: a bug; please report this bug, and restart"
+        in "".join(reported)
+    )

@@ -54,6 +54,5 @@ async def reply(line: Following, request: str) -> str:
             return "ok"
     except (BusError, InvalidCommand, ValueError) as error:
         return f"error: {error}"
-    # If the owner is away, or the last read failed, the row still has the last good value, which is not current.
-    is_current = line.is_connected and row.quality in ("good", "late")
-    return str(row.value) if is_current else f"error: {row.error or row.quality or 'not read yet'}"
+    # If the owner is away or stopped, or the last read failed, the row still has the last good value.
+    return str(row.value) if line.is_current(row) else f"error: {row.error or 'there is no current value'}"
