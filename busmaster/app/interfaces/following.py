@@ -108,8 +108,8 @@ class Following:
     def is_current(self, row: Row) -> bool:
         """Return whether the value of a row is the present one.
 
-        It is not if the owner is away, if the last read failed, after a write to its place, or if its group had no
-        cycle for some time: the group is paused, or the owner is stopped.
+        It is an old one if the owner is away, if the last read failed, and after a write to its place. It is also old
+        if its group had no cycle for some time, because the group is paused or the owner is stopped.
         """
         if not self.is_connected or self._remote is None or row.asked is None or row.quality not in ("good", "late"):
             return False
