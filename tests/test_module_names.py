@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -16,3 +18,11 @@ def test_no_module_takes_the_name_of_a_standard_module(folder: str) -> None:
     taken = {"queue", "trace", "serial", "statistics", "types", "typing", "logging", "random", "time", "signal"}
     names = {path.stem for path in (ROOT / folder).rglob("*.py") if path not in PUBLIC}
     assert not names & taken
+
+
+def test_no_limit_is_assigned_twice() -> None:
+    """The second would silently replace the first, for all who use it."""
+    tree = ast.parse((ROOT / "busmaster" / "bounds.py").read_text())
+    targets = [target for node in tree.body if isinstance(node, ast.Assign) for target in node.targets]
+    names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+    assert [name for name, count in Counter(names).items() if count > 1] == []
