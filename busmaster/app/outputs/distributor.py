@@ -207,7 +207,7 @@ class Distributor:
         if not feeding.cancelled() and (bug := feeding.exception()) is not None:
             what = f"outputs get no more values of {group.name}: {type(bug).__name__}: {bug}"
             self._log.error(what, exc_info=bug)
-            self.report(f"{what}; please report this bug, and restart the program")
+            self.report(f"{what}; report this bug, and restart the program")
 
     async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
         lost = 0
