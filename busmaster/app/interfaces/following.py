@@ -113,8 +113,19 @@ class Following:
         """
         if not self.is_connected or self._remote is None or row.asked is None or row.quality not in ("good", "late"):
             return False
-        periods = (max(group.period, group.achieved) for group in self.picture.groups if group.name == row.group)
-        return self._remote.now() - row.asked <= max(LEAST_AGE, OLD_AFTER * next(periods, 0.0))
+        return not self.old_groups({row.group: row.asked}, self._remote.now())
+
+    def old_groups(self, last_cycles: Mapping[str, float], now: float) -> set[str]:
+        """Return the groups that had no cycle for some time: they are paused, or the owner is stopped.
+
+        `last_cycles` has the time of the last cycle of each group. All times are on the clock of the line, in seconds.
+        """
+        periods = {group.name: max(group.period, group.achieved) for group in self.picture.groups}
+        return {
+            name
+            for name, last in last_cycles.items()
+            if now - last > max(LEAST_AGE, OLD_AFTER * periods.get(name, 0.0))
+        }
 
     @property
     def read_only(self) -> bool:

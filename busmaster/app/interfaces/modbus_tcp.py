@@ -25,7 +25,7 @@ from typing import Any, TypeAlias
 from weakref import WeakValueDictionary
 
 from busmaster import Priority, Quality
-from busmaster.app.interfaces.following import LEAST_AGE, OLD_AFTER, Following
+from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.reported_refusals import ReportedRefusals
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
@@ -465,7 +465,7 @@ class Values:
         self._fixed = fixed
         self._type, self._last, self._warn = type_, last, warn
         self._held: dict[Identity, Held] = {}
-        self._heard: dict[str, float] = {}
+        self._last_cycles: dict[str, float] = {}
         """When the last cycle of each group ended, by the line's clock."""
         self._touches = Touches()
         self._remote: RemoteBus | None = None
@@ -538,7 +538,7 @@ class Values:
         names = {row.group for row in self.rows.values()}
         await self._leave_groups(names)
         for name in names - self._groups.keys():
-            self._heard[name] = remote.now()
+            self._last_cycles[name] = remote.now()
             self._groups[name] = asyncio.ensure_future(self._follow_group(remote, name))
         self.known.set()
 
@@ -548,7 +548,7 @@ class Values:
                 group = remote.group(name)
                 try:
                     async for snapshot in group:
-                        self._heard[name] = snapshot.finished
+                        self._last_cycles[name] = snapshot.finished
                         for point, sample in snapshot.items():
                             identity = point.node.profile.name, point.node.address, point.item
                             held = self._held.setdefault(identity, Held(name))
@@ -567,7 +567,7 @@ class Values:
     async def _leave_groups(self, wanted: set[str]) -> None:
         for name in self._groups.keys() - wanted:
             task = self._groups.pop(name)
-            self._heard.pop(name, None)
+            self._last_cycles.pop(name, None)
             if self._remote is not None:  # the group has ended, and not its owner
                 for identity in [identity for identity, held in self._held.items() if held.group == name]:
                     del self._held[identity]
@@ -579,13 +579,7 @@ class Values:
         frame, remote = self.line.picture.frame, self._remote
         away = remote is None or not self.line.is_connected or frame is None
         lost = frame.now if frame is not None and frame.state == "offline" else -inf
-        old: set[str] = set()
-        if remote is not None and not away:
-            now = remote.now()
-            periods = {group.name: max(group.period, group.achieved) for group in self.line.picture.groups}
-            for name, heard in self._heard.items():
-                if now - heard > max(LEAST_AGE, OLD_AFTER * periods.get(name, 0.0)):
-                    old.add(name)
+        old = self.line.old_groups(self._last_cycles, remote.now()) if remote is not None and not away else set()
         found: dict[str, tuple[Any, int]] = {}
         for key in keys:
             row = self.rows.get(key)

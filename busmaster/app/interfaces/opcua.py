@@ -20,7 +20,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from busmaster import Snapshot
-from busmaster.app.interfaces.following import LEAST_AGE, OLD_AFTER, Following
+from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua_access import Rules, guard
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
 from busmaster.app.interfaces.opcua_health import Health
@@ -97,7 +97,7 @@ class LineServer:
         self._remote: RemoteBus | None = None
         """The connection that is shown."""
         self._groups: dict[str, asyncio.Task[None]] = {}
-        self._heard: dict[str, float] = {}
+        self._last_cycles: dict[str, float] = {}
         """When the last cycle of each group ended, by the clock of the line."""
         self._touches = Touches()
         self._changed = asyncio.Event()
@@ -185,7 +185,7 @@ class LineServer:
         names = {row.group for row in wanted.values()}
         await self._leave_groups(names)
         for name in names - self._groups.keys():
-            self._heard[name] = remote.now()
+            self._last_cycles[name] = remote.now()
             self._groups[name] = asyncio.ensure_future(self._follow_group(remote, name))
 
     async def _take_row(self, identity: Identity, row: Row) -> None:
@@ -225,7 +225,7 @@ class LineServer:
             await asyncio.sleep(ASK_AGAIN)
 
     async def _take(self, name: str, snapshot: Snapshot) -> None:
-        self._heard[name] = snapshot.finished
+        self._last_cycles[name] = snapshot.finished
         taken: set[Identity] = set()
         for count, (point, sample) in enumerate(snapshot.items(), 1):
             identity = point.node.profile.name, point.node.address, point.item
@@ -262,12 +262,7 @@ class LineServer:
 
     async def _doubt_old(self, now: float) -> None:
         """Have values ambiguous that no cycle has followed: their group rests, or the line's program stands still."""
-        periods = {group.name: max(group.period, group.achieved) for group in self._line.picture.groups}
-        old = {
-            name
-            for name, heard in self._heard.items()
-            if now - heard > max(LEAST_AGE, OLD_AFTER * periods.get(name, 0.0))
-        }
+        old = self._line.old_groups(self._last_cycles, now)
         if old:
             for shown in list(self._points.values()):
                 if shown.row.group in old:
@@ -277,7 +272,7 @@ class LineServer:
         """Follow no groups but these."""
         for name in self._groups.keys() - wanted:
             task = self._groups.pop(name)
-            self._heard.pop(name, None)
+            self._last_cycles.pop(name, None)
             task.cancel()
             await asyncio.wait([task])
 

@@ -165,7 +165,7 @@ class Reading:
         ext.start(self.node, self._request, self)
 
     def cancel(self, cause: str = BY_PROGRAM) -> None:
-        """Cancel the command. If it is on the wire, its reply is discarded."""
+        """Cancel the command. If it is on the wire, its reply is discarded. No audit log needs the cause of a read."""
         if not self._over:
             if self._request.transaction is not None:
                 ext.give_up(self.node, self._request.transaction)

@@ -370,14 +370,14 @@ class OutgoingConnection(Connection):
     @property
     def close_reason(self) -> str:
         """Return the reason with which the other end closed the connection, "" if it has not."""
-        decoded = self._core.close_rcvd
-        return "" if decoded is None else decoded.reason
+        frame = self._core.close_rcvd
+        return "" if frame is None else frame.reason
 
     @property
     def owner_ended(self) -> bool:
         """Return whether the other end closed the connection because it ends in an orderly way."""
-        decoded = self._core.close_rcvd
-        return decoded is not None and decoded.code == GOING_AWAY
+        frame = self._core.close_rcvd
+        return frame is not None and frame.code == GOING_AWAY
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)

@@ -66,7 +66,7 @@ def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
         return protocol.profile
     if not isinstance(probe, dict) or not isinstance(sync_reads, list) or not 0 < len(sync_reads) <= MOST_SYNC_READS:
         raise InvalidCommand(f"{protocol.name}: a client sends one probe, and 1 to {MOST_SYNC_READS} sync reads")
-    first, *others = [protocol.read_back(dict(decoded)) for decoded in (probe, *sync_reads)]
+    first, *others = [protocol.read_back(dict(form)) for form in (probe, *sync_reads)]
     for command in (first, *others):
         if command.writes:
             raise InvalidCommand(f"{protocol.name}: a probe or sync read must read, and {command} writes")
@@ -169,29 +169,29 @@ def _sample_of(decoded: Sequence[Any], point: Point[Any]) -> Sample[Any]:
 
 def encode_event(event: BusEvent) -> dict[str, Any] | None:
     """Return an event in the form of a message; None for one that clients do not get."""
-    decoded: dict[str, Any] = {"event": type(event).__name__}
+    form: dict[str, Any] = {"event": type(event).__name__}
     match event:
         case NodeChanged():
-            decoded |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
+            form |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
         case MaxReplyDelayRaised():
-            decoded |= {"age": event.age, "max_reply_delay": event.max_reply_delay}
+            form |= {"age": event.age, "max_reply_delay": event.max_reply_delay}
         case MaxReplyDelayLowered():
-            decoded |= {"max_reply_delay": event.max_reply_delay}
+            form |= {"max_reply_delay": event.max_reply_delay}
         case RepliesLate():
-            decoded |= {"age": event.age, "window": event.window}
+            form |= {"age": event.age, "window": event.window}
         case LineChanged():
-            return decoded | {"change": event.change.value, "cause": event.cause}
+            return form | {"change": event.change.value, "cause": event.cause}
         case PortFailed():
             bug = None if event.bug is None else f"{type(event.bug).__name__}: {event.bug}"
-            return decoded | {"cause": event.cause, "hint": event.hint, "bug": bug}
+            return form | {"cause": event.cause, "hint": event.hint, "bug": bug}
         case AlarmChanged():
             [point] = encode_points([event.point])
-            notify = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
-            return decoded | {"point": point, **notify}
+            limits = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
+            return form | {"point": point, **limits}
         case _:
             return None
     node = event.node
-    return decoded | {"protocol": node.profile.name, "address": node.address, "label": node.label}
+    return form | {"protocol": node.profile.name, "address": node.address, "label": node.label}
 
 
 def event_of(decoded: Mapping[str, Any], find: FindNode) -> BusEvent | None:

@@ -53,14 +53,14 @@ def refusal_of(method: str, error: Exception) -> Exception:
 def error_data(error: BusError, depth: int = 0) -> dict[str, Any]:
     """Return the class of an error by the nearest name that every client knows, and its fields."""
     name = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN), "BusError")
-    decoded: dict[str, Any] = {"error": name, **{field: getattr(error, field) for field in FIELDS}}
+    data: dict[str, Any] = {"error": name, **{field: getattr(error, field) for field in FIELDS}}
     if isinstance(error, Refused):
-        decoded |= {"confirm": error.confirm} | ({"temporary": True} if error.temporary else {})
+        data |= {"confirm": error.confirm} | ({"temporary": True} if error.temporary else {})
     cause = error.__cause__
     if cause is not None and depth < DEEPEST:
         text = f"{type(cause).__name__}: {cause}"
-        decoded["cause"] = error_data(cause, depth + 1) if isinstance(cause, BusError) else text
-    return decoded
+        data["cause"] = error_data(cause, depth + 1) if isinstance(cause, BusError) else text
+    return data
 
 
 def error_of(decoded: dict[str, Any]) -> Exception:

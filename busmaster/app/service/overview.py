@@ -310,13 +310,13 @@ def encode_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, A
 
 
 def _encode_groups(bus: Bus, first: int) -> list[dict[str, Any]]:
-    decoded = []
+    forms = []
     for group in islice(bus.groups, first, first + COUNTED_AT_ONCE):
         counts = group.statistics()
-        changes = {"name": group.name, "period": group.period, "paused": group.paused}
-        changes |= {name: getattr(counts, name) for name in ("cycles", "missed", "achieved")}
-        decoded.append(changes | {"jitter": counts.jitter.p99})
-    return decoded
+        form = {"name": group.name, "period": group.period, "paused": group.paused}
+        form |= {name: getattr(counts, name) for name in ("cycles", "missed", "achieved")}
+        forms.append(form | {"jitter": counts.jitter.p99})
+    return forms
 
 
 def _encode_nodes(bus: Bus, first: int) -> list[dict[str, Any]]:

@@ -35,28 +35,28 @@ def words_of(protocol: str, address: int, command: Command[Any]) -> str:
 
     Raises InvalidCommand for a command that the protocol does not have.
     """
-    decoded = protocol_of(protocol).write_down(command)
-    return words("request", {"protocol": protocol, "address": address, "command": decoded})
+    form = protocol_of(protocol).write_down(command)
+    return words("request", {"protocol": protocol, "address": address, "command": form})
 
 
 def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     """Return the number of a message that is a plain read, and that; None for any other, and for a bad one."""
     if not isinstance(message, str) or len(message) > SHORT:
         return None
-    decoded, _, rest = message.rpartition(END)
+    head, _, rest = message.rpartition(END)
     digits = rest[:-1]
     if not digits.isdecimal():
         return None
     number = int(digits)
-    asked = _asked_in(decoded) if rest == f"{number}}}" else None
+    asked = _asked_in(head) if rest == f"{number}}}" else None
     return None if asked is None else (number, asked)
 
 
 @lru_cache(KEPT)
-def _asked_in(decoded: str) -> PlainRead | None:
+def _asked_in(text: str) -> PlainRead | None:
     """Return the plain read in this text, up to END, without its number; None if it is not a plain read."""
     try:
-        message = read(f"{decoded}}}}}}}")
+        message = read(f"{text}}}}}}}")
         params = message["params"]
         if message.keys() != {"jsonrpc", "method", "params"} or message["method"] != "request":
             return None

@@ -137,7 +137,7 @@ class EventBroadcast(Broadcast):
         stream = self._bus.events()
         try:
             async for event in stream:
-                if decoded := encode_event(event):
-                    yield "event", encoded(decoded)
+                if form := encode_event(event):
+                    yield "event", encoded(form)
         finally:
             stream.close()

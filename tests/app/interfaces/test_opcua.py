@@ -108,7 +108,7 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(following, "FIRST_PAUSE", 0.001)
         patch.setattr(following, "LONGEST_PAUSE", 0.001)
-        patch.setattr(interface, "LEAST_AGE", PATIENCE)  # a machine that stands still makes no value old
+        patch.setattr(following, "LEAST_AGE", PATIENCE)  # a machine that stands still makes no value old
         servers: list[OpcuaServer] = []
 
         def made() -> OpcuaServer:
@@ -331,10 +331,10 @@ async def test_what_is_not_read_any_more_is_of_some_time_ago(opened: Opened, mon
         group = line.poll("10")
         good = await opened.is_("5/10", "Good")
         group.pause()
-        monkeypatch.setattr(interface, "LEAST_AGE", 0.1)
+        monkeypatch.setattr(following, "LEAST_AGE", 0.1)
         old = await opened.is_("5/10", "UncertainLastUsableValue")
         assert (old.value, old.when >= good.when) == (good.value, True)
-        monkeypatch.setattr(interface, "LEAST_AGE", PATIENCE)
+        monkeypatch.setattr(following, "LEAST_AGE", PATIENCE)
         group.resume()
         assert (await opened.is_("5/10", "Good")).when > old.when
 
