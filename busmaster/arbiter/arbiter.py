@@ -45,7 +45,7 @@ from collections.abc import Callable, Hashable
 from math import inf
 from typing import Any
 
-from busmaster.arbiter.choice import Choice, Idle, Send
+from busmaster.arbiter.choice import Choice, Idle, WaitUntil
 from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.counters import (
     EXCHANGE,
@@ -216,9 +216,10 @@ class Arbiter:
                 self._silent_at += late
             # Not for an ACK within the exchange: its request left earlier, and the overdue reply can be as old as that
             # request.
-            asked = self._wire.transaction
-            if late > LOOK_SLACK and output.begins and asked is not None and asked.started == sent_at:
-                asked.started = now
+            if late > LOOK_SLACK and output.begins:
+                asked = self._wire.transaction
+                if asked is not None and asked.started == sent_at:
+                    asked.started = now
 
     def line_due(self, now: float) -> bool:
         """Return True if a deadline of the line has expired. If the port can report unsent bytes, call `unsent`
@@ -283,13 +284,13 @@ class Arbiter:
             return True
         unexpected = self._unexpected
         action = self._choice.next(now, unexpected.last_byte)
-        if type(action) is not Send:
-            if isinstance(action, Idle):
-                return False
+        if type(action) is Idle:
+            return False
+        if type(action) is WaitUntil:
             self._quarantine = action.time
             self._resynchronise(now, begun=True)
             return True
-        transaction, exchange = action.transaction, action.exchange
+        transaction, exchange = action
         self.dispatcher.started(transaction, now)
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)

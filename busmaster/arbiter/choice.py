@@ -26,8 +26,9 @@ before it prepares its reply is not earlier when shifted.
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from math import inf
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import Any, TypeAlias, final
 
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
@@ -98,23 +99,20 @@ MOST_BEFORE = 3
 R9 in planning include them."""
 
 
+Send: TypeAlias = tuple[Transaction, Exchange[Any]]
+"""Send this transaction now, as this exchange. A plain tuple: to create an object takes four times as long, and this is
+done for every request."""
+
+
 @final
-class Send:
-    """Send this transaction now, as this exchange."""
-
-    __slots__ = ("exchange", "transaction")
-
-    def __init__(self, transaction: Transaction, exchange: Exchange[Any]) -> None:
-        self.transaction = transaction
-        self.exchange = exchange
-
-
-class WaitUntil(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class WaitUntil:
     """Send nothing before this time, in seconds: an overdue reply may still come."""
 
     time: float
 
 
+@final
 class Idle:
     """No request is queued."""
 
@@ -160,15 +158,15 @@ class Choice:
         if answers == last and not exchange.later:
             too_many = alike.another(exchange, last_byte, now)
             if too_many or in_sync.alert:
-                return self._carefully(Send(transaction, exchange), now, last_byte, too_many)
+                return self._carefully((transaction, exchange), now, last_byte, too_many)
         elif in_sync.alert:
-            return self._carefully(Send(transaction, exchange), now, last_byte)
+            return self._carefully((transaction, exchange), now, last_byte)
         else:
             alike.count = 0
         alike.node = node
         in_sync.last = answers
         in_sync.recent.append(answers)
-        return Send(transaction, exchange)
+        return (transaction, exchange)
 
     def _carefully(self, first: Send, now: float, last_byte: float, too_many: bool = False) -> Send | WaitUntil:
         """Select as `next` does, while a reply is overdue or ambiguous, or `too_many` replies were alike."""
@@ -177,7 +175,7 @@ class Choice:
         # First: an expired reply must not cause a sync read, and `alert` may be cleared by it.
         in_sync.lapse(now)
         chosen: Send | WaitUntil = first
-        transaction, exchange = first.transaction, first.exchange
+        transaction, exchange = first
         answers = exchange.answers
 
         def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
@@ -213,19 +211,21 @@ class Choice:
         if isinstance(chosen, WaitUntil):
             self._dispatcher.backlog.restore(transaction)
             return chosen
-        if chosen.transaction is not transaction:
+        if chosen[0] is not transaction:
             self._dispatcher.backlog.restore(transaction)
+        transaction, exchange = chosen
         # A different reply reveals a shift, so the run of similar replies is over.
-        if chosen.exchange.answers != in_sync.last:
+        if exchange.answers != in_sync.last:
             self._alike.count = 0
-        self._alike.node = chosen.transaction.node
-        in_sync.last = chosen.exchange.answers
+        self._alike.node = transaction.node
+        in_sync.last = exchange.answers
         in_sync.recent.append(in_sync.last)
         return chosen
 
     def _instead_of(self, first: Send, now: float) -> Send | WaitUntil:
         """Return a substitute for a request whose reply could be mistaken for an overdue one, or until when to wait."""
-        in_sync, answers = self._in_sync, first.exchange.answers
+        in_sync, (transaction, exchange) = self._in_sync, first
+        answers = exchange.answers
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_sync.clashes(answers, now, node)
@@ -243,7 +243,7 @@ class Choice:
         nodes_overdue = dict.fromkeys(in_sync.nodes_overdue(answers, now))
         other = None
         if self._gone_before < MOST_BEFORE - 1:
-            node = first.transaction.node
+            node = transaction.node
             # only a reply of the node itself proves that its reply is not overdue
             of = node if node in nodes_overdue else None
             # The last of the three places is reserved for a sync read: other requests may prove nothing.
@@ -251,13 +251,13 @@ class Choice:
         if other is None:
             ends = in_sync.ends(answers, now)
             if ends < inf:  # the overdue reply of its own node needs a sync read even then
-                own = in_sync.clashes(answers, ends, first.transaction.node)
+                own = in_sync.clashes(answers, ends, transaction.node)
                 return (self._ask_itself(first, now) if own else None) or WaitUntil(ends)
             asked, silent = self._whom_to_ask(now)
-            worth_it = first.transaction.writes or not first.transaction.attempts
+            worth_it = transaction.writes or not transaction.attempts
             # All nodes are silent: a sync read of its own node costs no more than the request would.
             if worth_it and not (nodes_overdue or asked):
-                asked = [first.transaction.node]
+                asked = [transaction.node]
             # Nodes with an overdue reply first: their reply clears it at once, another node's only after the maximum
             # reply delay.
             other = self._ask_sync_read([*nodes_overdue, *asked], now, clashes)
@@ -280,7 +280,7 @@ class Choice:
         The read ends the unfinished frame that a node may hold from an earlier master. Without it, a write that this
         node's NAK seems to refuse would be sent again, and be carried out twice.
         """
-        in_sync, transaction = self._in_sync, first.transaction
+        in_sync, (transaction, _) = self._in_sync, first
         node = transaction.node
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
@@ -306,7 +306,8 @@ class Choice:
         if not self._gone_before:
             self._held_since = now
         two_gone = self._gone_before >= MOST_BEFORE - 1
-        urgent, timings = first.transaction.priority is URGENT, first.transaction.node.timings
+        transaction, _ = first
+        urgent, timings = transaction.priority is URGENT, transaction.node.timings
         if two_gone and (urgent or now >= self._held_since + timings.read.max_reply_delay):
             return None
 
@@ -334,18 +335,18 @@ class Choice:
                 return False
             exchange = _opened(other)
             # A last attempt must not be sent while a reply is awaited, not even in place of a sync read.
-            if exchange is None or _is_decisive(Send(other, exchange)) or unfit(exchange.answers, node):
+            if exchange is None or _is_decisive((other, exchange)) or unfit(exchange.answers, node):
                 return False
             opened.append(exchange)
             return True
 
         transaction = self._dispatcher.backlog.take(suits)
-        return None if transaction is None else Send(transaction, opened[0])
+        return None if transaction is None else (transaction, opened[0])
 
     def _ask_itself(self, first: Send, now: float) -> Send | None:
         """Return a sync read of the node itself, whose reply to this request would be ambiguous. None if it is likely
         dead."""
-        node = first.transaction.node
+        node = first[0].node
         # A request to a dead node delays the others. If times are learned, the delay is short.
         brief = node.learning is not None and not node.failures
         dead = node.unheard > MOST_UNHEARD if brief else node.silent
@@ -363,7 +364,7 @@ class Choice:
             exchange = command.open(node.address, node.timings)
             if not self._in_sync.clashes(exchange.answers, now, node):
                 probe.command = command
-                return Send(probe, exchange)
+                return (probe, exchange)
         return None
 
     def _another(self, first: Send, now: float, unfit: Unfit, of: NodeRecord | None = None) -> Send | None:
@@ -372,8 +373,9 @@ class Choice:
         Writes are not used: an ACK may come from any node, and a failure would leave the write unconfirmed, while a
         read is repeated.
         """
+        transaction, _ = first
         opened: list[Exchange[Any]] = []
-        written = {first.transaction.node} if first.transaction.writes else set()
+        written = {transaction.node} if transaction.writes else set()
         in_sync = self._in_sync
         awaited = now < in_sync.awaited_until(self._last_byte)
 
@@ -388,13 +390,13 @@ class Choice:
             if exchange is None or unfit(exchange.answers, other.node):
                 return False
             # The overdue reply may collide with this exchange. A read that can be repeated loses nothing by that.
-            if awaited and (_is_decisive(Send(other, exchange)) or in_sync.clashes(exchange.answers, now)):
+            if awaited and (_is_decisive((other, exchange)) or in_sync.clashes(exchange.answers, now)):
                 return False
             opened.append(exchange)
             return True
 
-        transaction = self._dispatcher.backlog.pick(first.transaction.priority, suits)
-        return None if transaction is None else Send(transaction, opened[0])
+        taken = self._dispatcher.backlog.pick(transaction.priority, suits)
+        return None if taken is None else (taken, opened[0])
 
     def _ask_sync_read(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Send | None:
         """Return a sync read of the first of these nodes that has one whose reply proves something, or None."""
@@ -403,7 +405,7 @@ class Choice:
             if node.learning is not None:
                 # With the learned window, unlike the exchange that was used to find it: a sync read can be repeated.
                 exchange = command.open(node.address, check.timings())
-            return Send(check, exchange)
+            return (check, exchange)
         return None
 
     def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
@@ -434,7 +436,7 @@ def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[Nod
 
 def _is_decisive(chosen: Send) -> bool:
     """Return True for a write, or the last attempt of a read: an overdue reply must not spoil it."""
-    transaction, exchange = chosen.transaction, chosen.exchange
+    transaction, exchange = chosen
     last = transaction.retried >= transaction.retries and not transaction.probe
     return transaction.writes or not exchange.answered or last
 

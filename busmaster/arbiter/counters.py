@@ -48,20 +48,21 @@ class Histogram:
     fraction. No bucket needs to be calculated, and a batch is counted without a Python step per time.
     """
 
-    __slots__ = ("_counts", "_highest", "_new", "_total")
+    __slots__ = ("_counts", "_highest", "_total", "new")
 
     def __init__(self) -> None:
-        self._new: list[float] = []
+        self.new: list[float] = []
+        """Times that are not in buckets yet. When there are BATCH of them, `sort_in` must be called."""
         self._counts: dict[int, int] = {}
         self._total = 0.0
         self._highest = 0.0
 
     def record(self, seconds: float) -> None:
         """Record one time, in seconds."""
-        new = self._new
+        new = self.new
         new.append(seconds)
         if len(new) >= BATCH:
-            self._sort_in()
+            self.sort_in()
 
     @property
     def count(self) -> int:
@@ -101,14 +102,15 @@ class Histogram:
         return [(_upper_edge(bucket), count) for bucket, count in sorted(self._sorted().items())]
 
     def _sorted(self) -> dict[int, int]:
-        if self._new:
-            self._sort_in()
+        if self.new:
+            self.sort_in()
         return self._counts
 
-    def _sort_in(self) -> None:
+    def sort_in(self) -> None:
+        """Count the times of `new` in their buckets."""
         # Sorted first: then the times of a bucket are found together, which takes a quarter of the time of counting
         # each (benchmark `turnaround`).
-        new = sorted(self._new)
+        new = sorted(self.new)
         # A clock that was read twice may be slightly older the second time.
         if new[0] <= 0.0:
             new = [seconds if seconds > 0.0 else 0.0 for seconds in new]
@@ -120,7 +122,7 @@ class Histogram:
             first = end
         self._total += sum(new)
         self._highest = max(self._highest, new[-1])
-        self._new.clear()
+        self.new.clear()
 
 
 _DOUBLE = struct.Struct(">d")

@@ -19,7 +19,7 @@ from typing import Any
 
 from busmaster.arbiter.backlog import Backlog, Delayed, Writes
 from busmaster.arbiter.clients import Hold
-from busmaster.arbiter.counters import RESYNCHRONISING, LineCounters
+from busmaster.arbiter.counters import BATCH, RESYNCHRONISING, LineCounters
 from busmaster.arbiter.deadlines import Deadlines, Expiries
 from busmaster.arbiter.eligibility import IF_PAID, OK, Eligibility, Rejected, Wait, eligibility, unpaid
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
@@ -324,7 +324,11 @@ class Dispatcher:
         if transaction.attempts:
             transaction.first_byte = -inf
         elif not transaction.check:
-            counters.waits[transaction.priority].record(now - transaction.queued)
+            waits = counters.waits[transaction.priority]
+            times = waits.new  # same as `record`, written out: this runs for every request
+            times.append(now - transaction.queued)
+            if len(times) >= BATCH:
+                waits.sort_in()
             transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
             transaction.quiet_time_ahead = counters.spent[RESYNCHRONISING] - transaction.quiet_time_ahead
             poll = transaction.poll
@@ -396,7 +400,10 @@ class Dispatcher:
         self.unnoted = None
         node, now = transaction.node, transaction.last_byte
         counters = node.counters
-        counters.latency.record(now - transaction.started)
+        times = counters.latency.new  # same as `record`, written out
+        times.append(now - transaction.started)
+        if len(times) >= BATCH:
+            counters.latency.sort_in()
         if transaction.late:
             counters.late += 1
             counters.overdue += transaction.overdue
@@ -693,9 +700,8 @@ class Dispatcher:
             self.probes.ended(transaction)
         if not transaction.wanted and not transaction.check:
             transaction.node.counters.unheard += transaction.attempts > 0
-        for other in transaction.stops_alike:
-            other.value, other.last_byte, other.unsure = transaction.value, transaction.last_byte, transaction.unsure
-            self._end(other, now, error and make_error(type(error), error.what, other, error.hint))
+        if transaction.stops_alike:
+            self._end_alike(transaction, now, error)
         poll = transaction.poll
         if poll is not None:
             # A group that was removed in the meantime has no reader.
@@ -708,6 +714,12 @@ class Dispatcher:
         elif transaction.wanted:
             self.counters.completed += 1
             self.events.append(transaction)
+
+    def _end_alike(self, stop: Transaction, now: float, error: BusError | None) -> None:
+        """End the equal stops that were waiting for the outcome of this one."""
+        for other in stop.stops_alike:
+            other.value, other.last_byte, other.unsure = stop.value, stop.last_byte, stop.unsure
+            self._end(other, now, error and make_error(type(error), error.what, other, error.hint))
 
     def _store_counts(self, transaction: Transaction) -> None:
         """Store the line's counters. Their difference at the start of the request gives the exchanges that went ahead

@@ -60,6 +60,8 @@ MOST_UNHEARD = 4
 """Consecutive learned windows without a reply before a node is considered silent."""
 MOST_OVERDUE = 400
 """Maximum number of overdue replies. More than fit into LAPSE with any window in use; the oldest is dropped."""
+MOST_ANSWERED = 512
+"""Maximum number of keys of delivered replies. More than fit into ANSWER_MEMORY; the oldest is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +92,6 @@ class OverdueReply:
     awaited: Awaited | None = None
     """Set if the line continued after a learned window: the reply may still arrive and collide with the next
     request."""
-
-    def of(self, node: NodeRecord | None, now: float) -> bool:
-        """Return True if it could be this node's (None: any node's) reply to a request that is sent now."""
-        return now < self.until or (node is not None and self.is_of(node))
 
     def is_of(self, node: NodeRecord) -> bool:
         """Return True if this node will send it. A node that was removed and added again counts as the same node."""
@@ -133,7 +131,8 @@ class InSync:
         self.lone_bytes_until = -inf
         """Until this time a single byte may be the reply to a frame that an earlier master left unfinished; inf until
         the first frame was sent."""
-        self._answered: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
+        self._answered: dict[bytes, float] = {}
+        """When a reply with each of these keys was delivered last, the oldest first."""
         self._ambiguous_until = inf if strict else -inf
 
     # overdue replies
@@ -157,17 +156,29 @@ class InSync:
         """Remove expired entries. Clears `alert` if none are left."""
         # Counted from the end of the request and not from the end of its window: a reply is never older than its
         # request.
-        self.overdue_replies = [overdue for overdue in self.overdue_replies if now - overdue.asked <= LAPSE]
-        self._ambiguous = [entry for entry in self._ambiguous if entry[1] > now]
-        self._forgiven = [entry for entry in self._forgiven if entry[1] > now]
+        if self.overdue_replies:  # most of these lists are empty, and this runs for every request while `alert` is True
+            self.overdue_replies = [overdue for overdue in self.overdue_replies if now - overdue.asked <= LAPSE]
+        if self._ambiguous:
+            self._ambiguous = [entry for entry in self._ambiguous if entry[1] > now]
+        if self._forgiven:
+            self._forgiven = [entry for entry in self._forgiven if entry[1] > now]
         # Only here is `alert` cleared: it is set wherever something becomes uncertain, and tested for every reply.
         unsure = self.overdue_replies or self._ambiguous or self._forgiven
         self.alert = bool(unsure or self._ambiguous_until > now or self.lone_bytes_until > now)
 
     def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
-        """Return True if a reply with one of these keys, from this node if given, could be an overdue one."""
+        """Return True if a reply with one of these keys to a request that is sent now could be an overdue one.
+
+        `node`: the node that replies; None: any node.
+        """
         # Not limited to the nodes' own replies: without an address in it, any node's reply could be any other node's.
-        return any(overdue.of(node, now) and _could_be(overdue, answers) for overdue in self.overdue_replies)
+        # Most often there are none, and this runs up to five times per request while `alert` is True.
+        if not self.overdue_replies:
+            return False
+        return any(
+            (now < overdue.until or (node is not None and overdue.is_of(node))) and _could_be(overdue, answers)
+            for overdue in self.overdue_replies
+        )
 
     def over(self, answers: Sequence[bytes]) -> float:
         """Return the time after which each overdue reply with such a key is later than its maximum reply delay."""
@@ -236,7 +247,8 @@ class InSync:
         `patience`: assumed reply time, in seconds, of a node whose replies were never timed.
         """
         # A node answers in order: a reply to an earlier request cannot come after this one.
-        self.overdue_replies = [overdue for overdue in self.overdue_replies if not overdue.is_of(node)]
+        if self.overdue_replies:
+            self.overdue_replies = [overdue for overdue in self.overdue_replies if not overdue.is_of(node)]
         for overdue in self.overdue_replies:
             # Only a request sent after the maximum reply delay proves something. Before that, both replies can be on
             # the way.
@@ -359,7 +371,12 @@ class InSync:
         """Remember a delivered reply, to recognise a duplicate of it."""
         # Remembered only after a first duplicate: a healthy line must not pay for this with each reply.
         if now < self._ambiguous_until:
-            self._answered.append((answers, now))
+            answered = self._answered
+            for key in answers:
+                answered.pop(key, None)  # the latest comes last
+                answered[key] = now
+            while len(answered) > MOST_ANSWERED:
+                del answered[next(iter(answered))]
 
     def has_ambiguity(self, now: float) -> bool:
         """Return True if a duplicate reply was received in the last AMBIGUITY_PERIOD seconds."""
@@ -369,6 +386,8 @@ class InSync:
         """Return True if a reply like this may be a forgiven one, or the reply to an earlier master's unfinished
         frame."""
         # An ACK, or another reply of one byte, which the unfinished frame of an earlier master can cause (R15).
+        if not self._forgiven and now >= self.lone_bytes_until:
+            return False
         lone = any(len(key) == 1 for key in answers)
         if lone and now < self.lone_bytes_until:
             return True
@@ -394,17 +413,12 @@ class InSync:
 
     def is_ambiguous(self, answers: Sequence[bytes], now: float) -> bool:
         """Return True if a reply like this may be an overtaken reply or a duplicate."""
-        # Checked first: this list is nearly always empty, while the history below can have 256 entries.
-        if any(until > now and key in answers for key, until in self._ambiguous):
+        if self._ambiguous and any(until > now and key in answers for key, until in self._ambiguous):
             return True
         if now >= self._ambiguous_until:
             return False
-        for answered, when in reversed(self._answered):
-            if now - when > ANSWER_MEMORY:
-                return False
-            if any(key in answers for key in answered):
-                return True
-        return False
+        answered = self._answered
+        return any(key in answered and now - answered[key] <= ANSWER_MEMORY for key in answers)
 
 
 def _behind(overdue: OverdueReply, run: bytes) -> bytes | None:

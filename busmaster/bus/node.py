@@ -357,7 +357,8 @@ class Node:
         future for them. Pass the transaction to `give_up` if its caller stops waiting. Raises what `request` raises
         before anything is sent.
         """
-        record, line, command, options = self._record, self._shared, request.command, request.options
+        record, line = self._record, self._shared
+        command, options = request.command, request.options
         client, touches = request.client, request.touches
         if client is not None and isinstance(client, Hold) and client.over:
             raise hold_ended(self, client.longest, command)

@@ -130,11 +130,11 @@ class AttachedDevices:
             device.restarted = False
             self._take_back(device, now)
         if device.outbox:
-            replies = device.outbox[:]
-            device.outbox.clear()
+            replies = device.outbox
+            device.outbox = []
             if now >= device.away_until and not device.faults.dead:
                 for start, data in replies:
-                    self._send(device, max(start, now), data)
+                    self._send(device, start if start > now else now, data)
         device.lag = 0.0
         if device.attentive:
             self._attentive[device] = None

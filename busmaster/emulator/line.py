@@ -198,7 +198,8 @@ class Line:
         while arrivals and arrivals[0][0] <= now:
             self._inbox += arrivals.popleft()[1]
         data = self._inbox
-        self._inbox = b""
+        if data:
+            self._inbox = b""
         return data
 
     def next_event(self) -> float:
@@ -217,8 +218,9 @@ class Line:
                 end = min(end, self._next_byte(talk.collision, talk.given))
             elif chunk and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
-            if self._pending and self._pending[0][0] < talk.end - self._rounding:
-                end = min(end, self._pending[0][0])
+            pending = self._pending
+            if pending and pending[0][0] < talk.end - self._rounding:
+                end = min(end, pending[0][0])
             if end < when:
                 when = end
         if self._arrivals and self._arrivals[0][0] < when:
@@ -277,10 +279,10 @@ class Line:
             talk = self._active
             due = NEVER if talk is None else talk.end
             pending = self._pending
+            overlap = False
             # Talks back to back do not overlap, although rounding may make it look so.
-            overlap = bool(pending) and pending[0][0] < due - self._rounding
-            if overlap:
-                due = pending[0][0]
+            if pending and pending[0][0] < due - self._rounding:
+                overlap, due = True, pending[0][0]
             if attached.wakeup < due:
                 if attached.wakeup > now:
                     return

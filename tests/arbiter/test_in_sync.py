@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from busmaster.arbiter.health import SILENT, NodeRecord
-from busmaster.arbiter.in_sync import InSync
+from busmaster.arbiter.in_sync import MOST_ANSWERED, InSync
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -684,3 +684,20 @@ def test_r15_only_an_equal_reply_is_ambiguous_and_only_while_the_overtaken_one_c
     assert in_sync.is_ambiguous((b"\x01", b"\x03"), 5.0)
     assert not in_sync.is_ambiguous((b"\x02",), 5.0)
     assert not in_sync.is_ambiguous((b"\x01",), 11.0)
+
+
+def test_r15_after_a_duplicate_replies_of_the_last_half_second_are_ambiguous_and_memory_is_bounded() -> None:
+    in_sync = InSync()
+    keys = [number.to_bytes(2, "big") for number in range(MOST_ANSWERED + 1)]
+    in_sync.note_answered((keys[0],), 0.0)
+    in_sync.answered_twice(0.0)
+    assert not in_sync.is_ambiguous((keys[0],), 0.0)  # nothing is remembered before the first duplicate
+    for key in keys[:-1]:
+        in_sync.note_answered((key,), 1.0)
+    in_sync.note_answered((keys[0],), 1.25)  # the latest now, so the second is the oldest
+    in_sync.note_answered((keys[-1],), 1.25)
+    assert not in_sync.is_ambiguous((keys[1],), 1.25)
+    assert in_sync.is_ambiguous((b"other", keys[2]), 1.5)
+    assert not in_sync.is_ambiguous((keys[2],), 1.75)
+    assert in_sync.is_ambiguous((keys[0],), 1.75)
+    assert not in_sync.is_ambiguous((keys[0],), 2.0)

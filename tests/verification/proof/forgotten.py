@@ -279,8 +279,12 @@ def past_overdue_replies(view: View) -> None:
         book.lone_bytes_until = -inf
     if view.past(book._ambiguous_until):
         book._ambiguous_until = -inf
-    while book._answered and view.past(book._answered[0][1], in_sync.ANSWER_MEMORY, strictly=True):
-        book._answered.popleft()
+    answered = {key: when for key, when in book._answered.items() if not _is_past_memory(view, when)}
+    book._answered = dict(sorted(answered.items()))
+
+
+def _is_past_memory(view: View, when: Time) -> bool:
+    return view.past(when, in_sync.ANSWER_MEMORY, strictly=True)
 
 
 def _latest_of_each(view: View, entries: list[tuple[bytes, float]]) -> list[tuple[bytes, float]]:

@@ -23,7 +23,7 @@ from math import inf
 from typing import Any, ClassVar
 
 from busmaster.arbiter import choice, health, in_sync
-from busmaster.arbiter.choice import IDLE, Action, Choice, Send, WaitUntil
+from busmaster.arbiter.choice import IDLE, Action, Choice, WaitUntil
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
@@ -55,6 +55,15 @@ class _Uncounted:
 
     def record(self, *arguments: Any) -> None:
         pass
+
+    append = record
+
+    @property
+    def new(self) -> _Uncounted:
+        return self
+
+    def __len__(self) -> int:
+        return 0
 
     def __reduce__(self) -> str:
         return "UNCOUNTED"
@@ -265,11 +274,11 @@ def _any_of_all(self: Choice, now: float, last_byte: float) -> Action:
         if which > 1:
             node = nodes[which - 2]
             command = node.profile.sync_reads[0]
-            return Send(dispatcher.check(node, command, now), command.open(node.address, node.timings))
+            return dispatcher.check(node, command, now), command.open(node.address, node.timings)
     transaction = dispatcher.next(now)
     if transaction is None:
         return IDLE
-    first = Send(transaction, transaction.command.open(transaction.node.address, transaction.node.timings))
+    first = (transaction, transaction.command.open(transaction.node.address, transaction.node.timings))
     if len(dispatcher.backlog) and choose(2):
         other = self._another(first, now, lambda answers, node: False)
         if other is not None:
