@@ -60,7 +60,7 @@ MOST_UNHEARD = 4
 """Consecutive learned windows without a reply before a node is considered silent."""
 MOST_OVERDUE = 400
 """Maximum number of overdue replies. More than fit into LAPSE with any window in use; the oldest is dropped."""
-MOST_ANSWERED = 512
+MOST_REMEMBERED = 512
 """Maximum number of keys of delivered replies. More than fit into ANSWER_MEMORY; the oldest is dropped."""
 
 
@@ -375,7 +375,7 @@ class InSync:
             for key in answers:
                 answered.pop(key, None)  # the latest comes last
                 answered[key] = now
-            while len(answered) > MOST_ANSWERED:
+            while len(answered) > MOST_REMEMBERED:
                 del answered[next(iter(answered))]
 
     def has_ambiguity(self, now: float) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from busmaster.arbiter.health import SILENT, NodeRecord
-from busmaster.arbiter.in_sync import MOST_ANSWERED, InSync
+from busmaster.arbiter.in_sync import MOST_REMEMBERED, InSync
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -688,7 +688,7 @@ def test_r15_only_an_equal_reply_is_ambiguous_and_only_while_the_overtaken_one_c
 
 def test_r15_after_a_duplicate_replies_of_the_last_half_second_are_ambiguous_and_memory_is_bounded() -> None:
     in_sync = InSync()
-    keys = [number.to_bytes(2, "big") for number in range(MOST_ANSWERED + 1)]
+    keys = [number.to_bytes(2, "big") for number in range(MOST_REMEMBERED + 1)]
     in_sync.note_answered((keys[0],), 0.0)
     in_sync.answered_twice(0.0)
     assert not in_sync.is_ambiguous((keys[0],), 0.0)  # nothing is remembered before the first duplicate
