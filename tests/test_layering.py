@@ -348,7 +348,7 @@ def test_the_checks_see_an_import_inside_a_function_and_skip_one_for_types() -> 
 def test_what_the_core_may_import_outside_the_package_is_its_three_dependencies() -> None:
     """The extras stay optional: nothing below the command line and the outputs needs them."""
     optional = {"click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib"}
-    optional |= {"asyncua", "starlette", "uvicorn", "websockets"}
+    optional |= {"asyncua", "msgspec", "starlette", "uvicorn", "websockets"}
     wrong = [
         f"{module} needs {name}, which is an extra"
         for module in modules()

@@ -22,7 +22,7 @@ from busmaster.emulator.line import Line
 from busmaster.renames import ROOT as MOVED
 from tests.patience import PATIENCE
 
-OPTIONAL = ("click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib", "websockets")
+OPTIONAL = ("click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib", "msgspec", "websockets")
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "public-api.md"
@@ -118,7 +118,7 @@ def test_importing_it_needs_no_extra() -> None:
 @pytest.mark.parametrize(
     ("what", "unneeded"),
     [
-        ("import busmaster", r"busmaster\.(emulator|protocols|registry|config|cli)\b"),
+        ("import busmaster", r"busmaster\.(emulator|protocols|registry|config|cli)\b|msgspec\b"),
         ("from busmaster.app.cli import main; main(['--help'])", r"rich\b|textual\b"),
     ],
 )

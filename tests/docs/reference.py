@@ -1,4 +1,4 @@
-"""Generates the reference of LINE.toml, the bounds, the command line and the API, and the manual page.
+"""Generates the reference of LINE.toml, the bounds, the command line and the API, the schemas, and the manual page.
 
 `python -m tests.docs.reference` writes the files. A test verifies that they are current.
 """
@@ -15,6 +15,7 @@ import busmaster
 import busmaster.bounds
 from busmaster.app.config.keys import MILLION, Key
 from busmaster.app.config.schema import json_schema, tables
+from busmaster.app.service.schema import service_schema
 from tests.docs.api import api
 from tests.docs.command_line import manual, page
 from tests.docs.pages import ROOT
@@ -115,6 +116,7 @@ def files() -> dict[str, str]:
     return {
         "docs/reference/line-toml.md": line_toml(),
         "docs/line.schema.json": json.dumps(json_schema(), indent=1) + "\n",
+        "docs/service.schema.json": json.dumps(service_schema(), indent=1) + "\n",
         "docs/reference/command-line.md": page(),
         "docs/reference/bounds.md": bounds() + "\n",
         "docs/reference/api.md": api(),

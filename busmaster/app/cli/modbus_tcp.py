@@ -79,7 +79,7 @@ def command(
     owner's authorisation; the reply is sent when the owner has confirmed the write. Modbus TCP has no login: beyond
     this machine (--bind 0.0.0.0:502) --allow needs --allow-from. docs/modbus-tcp.md has the map file.
     """
-    if find_spec("websockets") is None:
+    if any(find_spec(module) is None for module in ("msgspec", "websockets")):
         raise click.UsageError("support for Modbus TCP is not installed; pip install 'busmaster[modbus-tcp]'")
     listen = place_of(bind)
     if read_only and (allow or allow_unit):

@@ -49,7 +49,7 @@ def command(
     points that --allow names, through the owner's authorisation. Beyond this machine (--bind 0.0.0.0:4840) they need a
     token for that: it is the password of the user of its name.
     """
-    if any(find_spec(module) is None for module in ("asyncua", "websockets")):
+    if any(find_spec(module) is None for module in ("asyncua", "msgspec", "websockets")):
         raise click.UsageError("OPC UA support is not installed; pip install 'busmaster[opcua]'")
     listen = place_of(bind)
     is_local = is_loopback(listen[0])

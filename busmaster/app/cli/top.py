@@ -47,8 +47,8 @@ def command(line: str | None, read_only: bool, of_owner: bool) -> int:
 
 def what_is_missing() -> str:
     """Return the missing package of the live view as text, "" if there is none."""
-    extras = {"textual": "tui", "websockets": "service"}
-    missing = [extra for module, extra in extras.items() if find_spec(module) is None]
+    extras = {"textual": "tui", "msgspec": "service", "websockets": "service"}
+    missing = dict.fromkeys(extra for module, extra in extras.items() if find_spec(module) is None)
     return f"an extra: pip install 'busmaster[{','.join(missing)}]'" if missing else ""
 
 

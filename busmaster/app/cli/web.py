@@ -16,7 +16,7 @@ from busmaster.app.config.service import read_tokens
 
 BIND = "127.0.0.1:8420"
 HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*")
-NEEDED = ("starlette", "uvicorn", "websockets")
+NEEDED = ("msgspec", "starlette", "uvicorn", "websockets")
 
 
 @click.command(short_help="Serve a page and a REST API for a line of another program.")

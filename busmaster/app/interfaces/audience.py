@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from busmaster.app.interfaces.following import Following, Lost
-from busmaster.app.service.messages import encoded
+from busmaster.app.service.messages import encode_json
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.errors import BusError
 
@@ -103,12 +103,12 @@ class Audience:
             self._set = params["set"]
             self._sent = {key: text for key, text in self._sent.items() if key[0] not in ("rows", "values")}
         key = method, params.get("first", 0)
-        self._sent[key] = text = encoded({"method": method, "body": params})
+        self._sent[key] = text = encode_json({"method": method, "body": params})
         for seat in self._seats:
             seat.put(key, text)
 
     def _receive_exchanges(self, params: Mapping[str, Any]) -> None:
-        text = encoded({"method": "exchanges", "body": params})
+        text = encode_json({"method": "exchanges", "body": params})
         for seat in self._seats:
             if seat.wants_exchanges:
                 seat.put_exchanges(text)
@@ -128,11 +128,11 @@ class Audience:
             body["why"] = state.why
         else:
             body["name"] = state.about["name"]
-        return encoded({"method": "state", "body": body})
+        return encode_json({"method": "state", "body": body})
 
     def _past(self) -> str:
         rows = self._line.picture.rows[:PAST_POINTS]
         past = [list(map(list, list(row.past)[-PAST_VALUES:])) for row in rows]
         # after a failure the values of the picture are None: a new page shows these
         last = [[row.value, row.asked] for row in self._line.picture.rows]
-        return encoded({"method": "past", "body": {"set": self._set, "past": past, "last": last}})
+        return encode_json({"method": "past", "body": {"set": self._set, "past": past, "last": last}})

@@ -30,7 +30,7 @@ from busmaster.app.interfaces.connections import Crowd
 from busmaster.app.interfaces.following import Following, Lost
 from busmaster.app.interfaces.guard import Guard, Guarded
 from busmaster.app.interfaces.reported_refusals import FailedLogins
-from busmaster.app.service.messages import encoded
+from busmaster.app.service.messages import encode_json
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.refusals import Logins, wait_text
@@ -444,4 +444,4 @@ async def _explain_http(_: Request, error: Exception) -> Response:
 
 
 def _json(data: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    return Response(encoded(data), status, headers, media_type="application/json")
+    return Response(encode_json(data), status, headers, media_type="application/json")

@@ -3,29 +3,60 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from itertools import islice
-from typing import Any
+from typing import Any, TypeAlias
 
-from busmaster import Node, Point, PollGroup, Priority, ext
+from busmaster import Node, Point, PollGroup, ext
+from busmaster.app.service import client_messages as messages
+from busmaster.app.service.client_messages import ClientMessage, RequestParams
 from busmaster.app.service.client_requests import ClientRequest, Writing, client_request_of
-from busmaster.app.service.encoding import encode_statistics, listed_groups, point_of, profile_of, protocol_of
+from busmaster.app.service.encoding import (
+    SyncReads,
+    encode_statistics,
+    listed_groups,
+    point_of,
+    profile_of,
+    protocol_of,
+)
 from busmaster.app.service.failures import REFUSED, encode_error, refusal_of
+from busmaster.app.service.fields import ReplyTimesForm
 from busmaster.app.service.line import ServedLine
-from busmaster.app.service.messages import NO_METHOD, Malformed, answered, check_within, timings_of, written
+from busmaster.app.service.messages import (
+    NO_METHOD,
+    InvalidParams,
+    Malformed,
+    decode_client_notification,
+    decode_part,
+    decode_request_params,
+    encode_error_reply,
+    encode_notification,
+    encode_result,
+    encode_stream_message,
+)
 from busmaster.app.service.outbox import Outbox
 from busmaster.app.service.overview import encode_details
+from busmaster.app.service.owner_messages import (
+    AccessParams,
+    NodeResult,
+    NoResult,
+    PollResult,
+    StopsParams,
+    SubscribeResult,
+    TouchedParams,
+)
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.plans import groups_of
 from busmaster.app.service.refusals import KINDS, is_interface_name
+from busmaster.app.service.reply_times import check_within, timings_of
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Rights, Role
-from busmaster.app.service.streams import Broadcast, GroupBroadcast
+from busmaster.app.service.streams import Broadcast
+from busmaster.app.service.typed import Raw
 from busmaster.bounds import (
     LONGEST_SENDER,
-    MOST_CHECKED,
     MOST_HOLDS,
     MOST_NODES,
     MOST_POLLED,
@@ -42,9 +73,6 @@ from busmaster.ext import (
     PlannedGroup,
     Requester,
     RequestOptions,
-    checked_priority,
-    seconds,
-    whole_number,
 )
 
 NodeKey = tuple[str, int]
@@ -120,18 +148,14 @@ class Client:
 
     # messages to the client
 
-    def notify(self, stream: int, method: str, body: str) -> None:
+    def notify(self, stream: int, method: str, body: Raw) -> None:
         """Send a message of a stream; it is dropped if the client does not keep up."""
-        self.outbox.put_news(stream, self._news(stream, method, body))
+        self.outbox.put_news(stream, encode_stream_message(method, stream, self.dropped.get(stream, 0), body))
 
-    def notify_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+    def notify_surely(self, stream: int, method: str, body: Raw, part: int = 0) -> None:
         """Send a message about a part of a stream, which replaces an earlier unsent one."""
-        self.outbox.put_latest((stream, method, part), self._news(stream, method, body))
-
-    def _news(self, stream: int, method: str, body: str) -> str:
-        dropped = self.dropped.get(stream, 0)
-        head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
-        return f"{head}{body}}}}}"
+        message = encode_stream_message(method, stream, self.dropped.get(stream, 0), body)
+        self.outbox.put_latest((stream, method, part), message)
 
     def notify_access(self) -> None:
         """Apply a changed role at once, and send the new permission."""
@@ -139,132 +163,117 @@ class Client:
         if role is not self._role:
             self._role, self.reads = role, _reads_of(role)
             ext.line_of(self._line.bus).arbiter.change_client(self.turn, self.rights.owner_time)
-        self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
+        self.outbox.put_latest("access", encode_notification("access", AccessParams(self.read_only)))
 
     def notify_stops(self, node: NodeRecord) -> None:
         """Send the number of stops of a node, if this client uses it."""
         key = (node.profile.name, node.address)
         if key in self._nodes:
-            params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
-            self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
+            params = StopsParams(*key, node.stops - self._stops[key])
+            self.outbox.put_latest(("stops", key), encode_notification("stops", params))
 
     @property
     def has_values(self) -> bool:
         """Return whether it follows a stream of the line, and so can hold values that a write makes stale."""
         return bool(self._streams)
 
-    def notify_touched(self, params: Mapping[str, Any], key: Hashable) -> None:
+    def notify_touched(self, params: TouchedParams, key: Hashable) -> None:
         """Send which values a write has made stale; `key` identifies these values."""
-        self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
+        self.outbox.put_latest(("touched", key), encode_notification("touched", params))
 
     # messages from the client
 
-    def take(self, decoded: Mapping[str, Any]) -> None:
+    def take(self, message: ClientMessage) -> None:
         """Handle a message. Raises Malformed for one that no client of this version sends."""
-        number, method, params = decoded.get("id"), decoded.get("method"), decoded.get("params", {})
-        if not isinstance(method, str) or not isinstance(params, dict):
-            raise Malformed("a message has a method, and its parameters by name")
+        number, method = message.id, message.method
         if self.in_safe_place and method not in FOR_SAFE_STATE:
             raise Malformed("all other places are taken; this program can only send the safe state")
         if number is None:
-            try:
-                self._notified(method, params)
-            except TypeError as error:  # a list for a number
-                raise Malformed(f"{method[:40]}: {error}") from None
-            return
-        if isinstance(number, bool) or not isinstance(number, int):
-            raise Malformed("the id of a request is a whole number")
-        if method in ("request", "write"):
-            self.requests.begin(number, params)
-            return
-        if method == "safe":
-            self.requests.begin_safe(number, params)
-            return
-        self.requests.check_number(number)
-        if method == "plan":
-            self._begin_plan(number, params)
+            self._take_notification(method, message.params)
             return
         try:
-            answer = self._answer(method, params)
-        except REFUSED as error:
-            self._refuse(number, refusal_of(method, error))
+            params = decode_request_params(method, message.params)
+        except (InvalidParams, Malformed) as error:
+            self.requests.check_number(number)
+            node: messages.StopParams | None = decode_part("stop", message.params) if method == "node" else None
+            if node is not None:
+                self._note_refused((node.protocol, node.address), str(error))
+            self._refuse(number, error)
+            return
+        if method in ("request", "write"):
+            self.requests.begin(number, params)
+        elif method == "safe":
+            self.requests.begin_safe(number, params)
         else:
-            self._report_result(number, answer)
+            self.requests.check_number(number)
+            self._take_request(number, method, params)
 
-    def _notified(self, method: str, params: Mapping[str, Any]) -> None:
-        match method:
-            case "cancel":
-                self.requests.cancel(params.get("id"))
-            case "end":
-                self._end_stream(params.get("stream", -1))
-            case "hold":
-                self._hold(params)
-            case "release":
-                self._release(params.get("sequence", -1))
-            case "refusals":
-                self._take_refusals(params.get("interface"), params.get("kind"), params.get("peers"))
-            case "stop":
-                node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
+    def _take_notification(self, method: str, encoded: Raw) -> None:
+        """Handle a notification. One of a later version is ignored. Raises Malformed for invalid parameters."""
+        try:
+            params = decode_client_notification(method, encoded)
+        except InvalidParams as error:
+            held: messages.SequenceParams | None = decode_part("release", encoded) if method == "hold" else None
+            if held is not None:
+                self._begin_sequence(held.sequence, error)  # the requests of the sequence are refused with the reason
+                return
+            raise Malformed(str(error)) from None
+        match params:
+            case messages.CancelParams():
+                self.requests.cancel(params.id)
+            case messages.StreamParams():
+                self._end_stream(params.stream)
+            case messages.HoldParams():
+                self._begin_sequence(params.sequence, params)
+            case messages.SequenceParams():
+                self._release(params.sequence)
+            case messages.RefusalsParams():
+                self._take_refusals(params)
+            case messages.StopParams():
+                node = self._nodes.get((params.protocol, params.address))
                 if node is not None and self.permission.covers(node):
                     node.note_stop()
                 elif node is not None:
                     self._stopping.add(node)
 
-    def _take_refusals(self, interface: object, kind: object, peers: object) -> None:
-        """Count the refusals that an interface in another process reports. Other data is ignored."""
-        if not (isinstance(interface, str) and is_interface_name(interface)):
-            return
-        if not (isinstance(kind, str) and kind in KINDS and isinstance(peers, dict)):
+    def _take_refusals(self, params: messages.RefusalsParams) -> None:
+        """Count the refusals that an interface in another process reports. Names that cannot be shown are ignored."""
+        if not is_interface_name(params.interface) or params.kind not in KINDS:
             return
         refusals = self._line.authorisation.refusals
-        refusals.begin(interface, kind)
-        for peer, count in islice(peers.items(), MOST_REPORTED + 1):
-            if type(count) is int and 0 < count <= MOST_FAILED and len(peer) <= LONGEST_SENDER and peer.isprintable():
-                refusals.note(interface, kind, peer, count)
+        refusals.begin(params.interface, params.kind)
+        for peer, count in islice(params.peers.items(), MOST_REPORTED + 1):
+            if 0 < count <= MOST_FAILED and len(peer) <= LONGEST_SENDER and peer.isprintable():
+                refusals.note(params.interface, params.kind, peer, count)
 
-    def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
-        """Return the immediate reply to a request. Raises InvalidCommand, BusError, or Malformed."""
-        match method:
-            case "node":
-                return self._name_node(params)
-            case "check":
-                if len(params["commands"]) > MOST_CHECKED:
-                    raise InvalidCommand(f"more than {MOST_CHECKED} writes in one check; send several checks")
-                for command in params["commands"]:
-                    request = client_request_of({**params, "command": command}, self, self._line)
-                    if isinstance(request, Writing):
-                        request.check()
-                return None
-            case "now":
-                return self._line.bus.now()
-            case "statistics":
-                return encode_statistics(ext.line_statistics(self._line.bus))
-            case "groups":
-                return listed_groups(self._line.bus)
-            case "subscribe":
-                return self._follow(params, self._line.broadcast_of(self._line.group(params["group"])))
-            case "events":
-                return self._follow(params, self._line.events())
-            case "gather":
-                return self._gather(params)
-            case "poll":
-                return self._poll(params)
-            case "overview":
-                return self._follow(params, self._line.overview())
-            case "exchanges":
-                return self._follow(params, self._line.exchanges())
-            case "details":
-                return encode_details(self._line.bus, *self._line.point(params["group"], params["key"]))
-            case "pause" | "demand" | "suspend":
-                return self._steer(method, params)
-        raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
+    def _take_request(self, number: int, method: str, params: Any) -> None:
+        """Handle a request that is not for a node's command."""
+        if method == "plan":
+            self._begin_plan(number, params)
+            return
+        try:
+            handler = HANDLERS.get(method)
+            if handler is None:
+                raise Malformed(f"no method {method!r} after the first message", NO_METHOD)
+            result = handler(self, params)
+        except REFUSED as error:
+            self._refuse(number, refusal_of(method, error))
+        else:
+            self._report_result(number, result)
 
-    def _begin_plan(self, number: int, params: Mapping[str, Any]) -> None:
+    def _check(self, params: messages.CheckParams) -> None:
+        for command in params.commands:
+            single = RequestParams(params.protocol, params.address, command, stop=params.stop)
+            request = client_request_of(single, self, self._line)
+            if isinstance(request, Writing):
+                request.check()
+
+    def _begin_plan(self, number: int, params: messages.PlanParams) -> None:
         """Begin to calculate a plan: one at a time."""
         try:
             if self._planning is not None and not self._planning.done():
                 raise InvalidCommand("a plan for this program is already being calculated; wait for it")
-            more = groups_of(params.get("groups", []), self._line.bus)
+            more = groups_of(params.groups, self._line.bus)
         except REFUSED as error:
             self._refuse(number, refusal_of("plan", error))
         else:
@@ -278,25 +287,24 @@ class Client:
         else:
             self._report_result(number, plan)
 
-    def _steer(self, method: str, params: Mapping[str, Any]) -> None:
-        """Change how the line is polled for all clients. The events name the program that did it.
+    # Each changes how the line is polled for all clients. The events name the program. They raise InvalidCommand if the
+    # program may not write to the nodes.
 
-        Raises InvalidCommand if the program may not write to the nodes.
-        """
-        if method == "suspend":
-            node = self._line.node(params["protocol"], params["address"])
-            self._check_steering(node)
-            node.suspend(params["for"])
-            did = f"{node.label} is suspended for {params['for']:g} s" if node.suspended else f"{node.label} is resumed"
-        else:
-            group = self._line.group(params["group"])
-            if method == "demand":
-                self._line.demand(group, self._role)
-                return
-            self._check_steering(*(point.node for point in group.points))
-            group.pause() if params["paused"] is True else group.resume()
-            did = f"{group.name} is {'paused' if group.paused else 'resumed'}"
-        self._line.journal.note(f"{did} by {self.peer}")
+    def _suspend(self, params: messages.SuspendParams) -> None:
+        node = self._line.node(params.protocol, params.address)
+        self._check_steering(node)
+        node.suspend(params.for_)
+        did = f"is suspended for {params.for_:g} s" if node.suspended else "is resumed"
+        self._line.journal.note(f"{node.label} {did} by {self.peer}")
+
+    def _pause(self, params: messages.PauseParams) -> None:
+        group = self._line.group(params.group)
+        self._check_steering(*(point.node for point in group.points))
+        group.pause() if params.paused else group.resume()
+        self._line.journal.note(f"{group.name} is {'paused' if group.paused else 'resumed'} by {self.peer}")
+
+    def _demand(self, params: messages.DemandParams) -> None:
+        self._line.demand(self._line.group(params.group), self._role)
 
     def _check_steering(self, *nodes: Requester) -> None:
         if not all(map(self.permission.reaches, nodes)):
@@ -306,25 +314,28 @@ class Client:
 
     # nodes
 
-    def _name_node(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        key = params["protocol"], params["address"]
+    def _name_node(self, params: messages.NodeParams) -> NodeResult:
+        key = params.protocol, params.address
         self._refused.pop(key, None)
         try:
-            sync_reads = params.get("probe"), params.get("sync_reads")
-            node = self.node(*key, params.get("timings"), params.get("retries"), sync_reads)
+            node = self.node(*key, params.timings, params.retries, SyncReads(params.probe, params.sync_reads))
         except InvalidCommand as error:
-            if len(self._refused) < MOST_NODES:
-                self._refused[key] = str(error)
+            self._note_refused(key, str(error))
             raise
-        return {"label": node.label, "health": node.health.value}
+        return NodeResult(node.label, node.health.value)
+
+    def _note_refused(self, key: NodeKey, reason: str) -> None:
+        """Refuse the requests to a node until it is named correctly."""
+        if len(self._refused) < MOST_NODES:
+            self._refused[key] = reason
 
     def node(
         self,
         name: str,
         address: int,
-        timings: Any = None,
+        timings: ReplyTimesForm | None = None,
         retries: int | None = None,
-        sync_reads: tuple[Any, Any] = (None, None),
+        sync_reads: SyncReads = SyncReads(),  # noqa: B008  it is immutable
     ) -> Node:
         """Return a node, which this client has until it leaves. Raises InvalidCommand as `Bus.node` does."""
         if refused := self._refused.get((name, address)):
@@ -336,7 +347,7 @@ class Client:
         if known is None and len(self._nodes) >= MOST_NODES:
             raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
         bus, rights = self._line.bus, self.rights
-        profile = profile_of(protocol, *sync_reads)
+        profile = profile_of(protocol, sync_reads)
         times = timings_of(timings)
         if known is None and not ext.has_node(bus, profile, address):
             if sum(not ext.is_kept(node) for node in self._nodes.values()) >= rights.new_nodes:
@@ -366,10 +377,10 @@ class Client:
     # answers
 
     def _report_result(self, number: int, result: Any) -> None:
-        self.outbox.put(answered(number, result))
+        self.outbox.put(encode_result(number, result))
 
     def _refuse(self, number: int, error: Exception) -> None:
-        self.outbox.put(written({"id": number, "error": encode_error(error)}))
+        self.outbox.put(encode_error_reply(number, encode_error(error)))
 
     # sequences
 
@@ -384,24 +395,22 @@ class Client:
             raise InvalidCommand(f"{node.label}: no sequence {sequence} was begun for it, of {MOST_HOLDS} at most")
         return hold
 
-    def _hold(self, params: Mapping[str, Any]) -> None:
+    def _begin_sequence(self, number: int, params: messages.HoldParams | InvalidCommand) -> None:
         """Begin a sequence. If it cannot begin, its requests are refused with the reason."""
-        number = params.get("sequence")
-        if isinstance(number, int) and not isinstance(self._holds.get(number), Hold) and len(self._holds) < MOST_HOLDS:
-            try:
-                self._holds[number] = self._begin_hold(params)
-            except InvalidCommand as error:
-                self._holds[number] = str(error)
-            except KeyError as missing:
-                self._holds[number] = f"a sequence is held with protocol, address and max_hold: {missing} is missing"
-
-    def _begin_hold(self, params: Mapping[str, Any]) -> Hold:
-        node = self.node(params["protocol"], params["address"])
-        if not self.permission.reaches(node):  # a program that only reads must not keep others waiting like this
-            raise InvalidCommand(
-                f"{node.label}: {self.permission.who} may not hold the line; that needs the permission to write to it"
-            )
-        return ext.hold(node, seconds(params["max_hold"], "max_hold"), self.turn)
+        if isinstance(self._holds.get(number), Hold) or len(self._holds) >= MOST_HOLDS:
+            return
+        try:
+            if isinstance(params, InvalidCommand):
+                raise params
+            node = self.node(params.protocol, params.address)
+            if not self.permission.reaches(node):  # a program that only reads must not keep others waiting like this
+                raise InvalidCommand(
+                    f"{node.label}: {self.permission.who} may not hold the line; "
+                    "that needs the permission to write to it"
+                )
+            self._holds[number] = ext.hold(node, params.max_hold, self.turn)
+        except InvalidCommand as error:
+            self._holds[number] = str(error)
 
     def _release(self, sequence: int) -> None:
         hold = self._holds.pop(sequence, None)
@@ -410,49 +419,55 @@ class Client:
 
     # streams
 
-    def _follow(self, params: Mapping[str, Any], source: Broadcast) -> dict[str, Any]:
-        stream = whole_number(params["stream"], 0, 2**53, "a stream")
+    def _follow(self, stream: int, source: Broadcast) -> None:
         if stream in self._streams or len(self._streams) >= MOST_STREAMS:
             raise InvalidCommand(f"one program has {MOST_STREAMS} streams at most, each with a number of its own")
         self._streams[stream] = source
         source.join(self, stream)
-        return {"period": source.group.period} if isinstance(source, GroupBroadcast) else {}
 
-    def _gather(self, params: Mapping[str, Any]) -> dict[str, Any]:
+    def _follow_line(self, stream: int, source: Broadcast) -> NoResult:
+        self._follow(stream, source)
+        return NoResult()
+
+    def _subscribe(self, params: messages.SubscribeParams) -> SubscribeResult:
+        group = self._line.group(params.group)
+        self._follow(params.stream, self._line.broadcast_of(group))
+        return SubscribeResult(group.period)
+
+    def _gather(self, params: messages.GatherParams | messages.PollParams) -> NoResult:
         """Keep points for a poll group: a message is too short for as many as one may have."""
-        stream, points = whole_number(params["stream"], 0, 2**53, "a stream"), params.get("points", [])
+        stream = params.stream
         if stream not in self._gathered and len(self._gathered) >= MOST_POLLED:
             raise InvalidCommand(f"one program has {MOST_POLLED} poll groups at most")
         known = self._gathered.get(stream, [])
-        if not isinstance(points, list) or len(known) + len(points) > MOST_POLLED_POINTS:
+        if len(known) + len(params.points) > MOST_POLLED_POINTS:
             raise InvalidCommand(f"a poll group of a program has {MOST_POLLED_POINTS} points at most")
-        read = [point_of(point, self.node) for point in points]
+        read = [point_of(point, self.node) for point in params.points]
         if any(point.command.writes for point in read):
             raise InvalidCommand("a poll group reads: it writes nothing")
         self._gathered[stream] = known + read
-        return {}
+        return NoResult()
 
-    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
+    def _poll(self, params: messages.PollParams) -> PollResult:
         if len(self._groups) >= self.rights.groups:
             raise InvalidCommand(f"one program has {self.rights.groups} poll groups at most")
         self._gather(params)
-        read = self._gathered.pop(params["stream"])
-        phase = params.get("phase")
+        read = self._gathered.pop(params.stream)
         group = self._line.bus.poll_group(
-            f"{str(params['name'])[:40]} ({self.peer.short}-{self._number})",
-            period=seconds(params["period"], "a period"),
+            f"{params.name[:40]} ({self.peer.short}-{self._number})",
+            period=params.period,
             points=read,
-            phase=None if phase is None else seconds(phase, "a phase"),
-            priority=checked_priority(max(self.rights.polls, params.get("priority", Priority.POLL))),
+            phase=params.phase,
+            priority=max(self.rights.polls, params.priority),
             client=self.turn,
         )
         try:
-            answer = self._follow(params, self._line.broadcast_of(group))
+            self._follow(params.stream, self._line.broadcast_of(group))
         except BaseException:
             group.close()
             raise
-        self._groups[params["stream"]] = group
-        return {**answer, "name": group.name}
+        self._groups[params.stream] = group
+        return PollResult(group.period, group.name)
 
     def _end_stream(self, stream: int) -> None:
         source = self._streams.pop(stream, None)
@@ -483,3 +498,24 @@ class Client:
         for node in self._nodes.values():
             ext.give_back(self._line.bus, node)
         self._nodes.clear()
+
+
+Handler: TypeAlias = Callable[[Client, Any], Any]
+HANDLERS: dict[str, Handler] = {
+    "node": Client._name_node,
+    "check": Client._check,
+    "now": lambda client, _: client._line.bus.now(),
+    "statistics": lambda client, _: encode_statistics(ext.line_statistics(client._line.bus)),
+    "groups": lambda client, _: listed_groups(client._line.bus),
+    "subscribe": Client._subscribe,
+    "events": lambda client, params: client._follow_line(params.stream, client._line.events()),
+    "gather": Client._gather,
+    "poll": Client._poll,
+    "overview": lambda client, params: client._follow_line(params.stream, client._line.overview()),
+    "exchanges": lambda client, params: client._follow_line(params.stream, client._line.exchanges()),
+    "details": lambda client, params: encode_details(client._line.bus, *client._line.point(params.group, params.key)),
+    "pause": Client._pause,
+    "demand": Client._demand,
+    "suspend": Client._suspend,
+}
+"""The requests that get a reply at once, by their methods. A handler raises InvalidCommand, BusError, or Malformed."""

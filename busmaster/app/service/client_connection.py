@@ -5,14 +5,20 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from busmaster.app.service.client import Client
+from busmaster.app.service.client_messages import ClientMessage
 from busmaster.app.service.connection import GOING_AWAY, POLICY, IncomingConnection
-from busmaster.app.service.messages import INTERNAL, INVALID_PARAMS, Malformed, read_request, written
+from busmaster.app.service.messages import (
+    INTERNAL,
+    INVALID_PARAMS,
+    Malformed,
+    decode_client_message,
+    encode_error_reply,
+)
+from busmaster.app.service.owner_messages import ErrorForm
 from busmaster.app.service.peers import Peer
-from busmaster.app.service.reads import plain_read_of
 from busmaster.bounds import HELLO_WITHIN, LONGEST_REQUEST
 
 if TYPE_CHECKING:
@@ -64,7 +70,7 @@ class Host(Protocol):
         """Store the peer; return the HTTP status and text of a refusal, None if it is admitted."""
         ...
 
-    def admit(self, connection: ClientConnection, decoded: Mapping[str, Any], /) -> Client:
+    def admit(self, connection: ClientConnection, message: ClientMessage, /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
         ...
 
@@ -133,14 +139,12 @@ class ClientConnection:
         if self._ended:
             return
         try:
-            message = self._messages.popleft()
+            message = decode_client_message(self._messages.popleft())
             if self.client is None:
-                self.client = self._host.admit(self, read_request(message))
+                self.client = self._host.admit(self, message)
                 self._hello_timer.cancel()
-            elif not self.client.in_safe_place and (read := plain_read_of(message)) is not None:
-                self.client.requests.begin(*read)
             else:
-                self.client.take(read_request(message))
+                self.client.take(message)
         except Malformed as error:
             self._reject(error)
         except Exception as bug:  # without this, the connection would stay paused for ever and keep its place
@@ -173,11 +177,11 @@ class ClientConnection:
 
     def _reject(self, error: Malformed) -> None:
         self._host.count_rejected(self)
-        text = written({"id": None, "error": {"code": error.code, "message": str(error)}})
+        reply = encode_error_reply(None, ErrorForm(error.code, str(error)))
         if self.client is not None:
-            self.client.outbox.put(text)
+            self.client.outbox.put(reply)
         else:
-            self.websocket.send(text)
+            self.websocket.send(reply)
         self._end(POLICY, str(error)[:100])
 
     def _end(self, code: int, reason: str) -> None:

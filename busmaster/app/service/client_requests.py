@@ -9,14 +9,16 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster import Node, Point, ext
 from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
+from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.encoding import protocol_of
+from busmaster.app.service.fields import OptionsForm
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.permission import Permission
-from busmaster.app.service.reads import PlainRead
 from busmaster.app.service.record import RAW_COMMAND
 from busmaster.app.service.rights import Rights
+from busmaster.app.service.typed import asdict
 from busmaster.bounds import LONGEST_WAIT
 from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.ext import (
@@ -32,8 +34,6 @@ from busmaster.ext import (
     seconds,
 )
 
-OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
-"""Options of a request that a client can set."""
 INTERFACE = "service"
 BY_PROGRAM, BY_OWNER = "its program cancelled it", "the program that owns the line ended"
 """Why a request was cancelled."""
@@ -94,21 +94,21 @@ class RequestedCommand(NamedTuple):
     point: Point[Any] | None = None
 
     @classmethod
-    def of_node(cls, params: Mapping[str, Any], sender: RequestSender) -> RequestedCommand:
+    def of_node(cls, params: RequestParams, sender: RequestSender) -> RequestedCommand:
         """Return the command that a client sends. Raises InvalidCommand for one that the protocol does not have."""
-        node, protocol = sender.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
-        command, touches = protocol.read_back(params["command"]), params.get("touches")
+        node, protocol = sender.node(params.protocol, params.address), protocol_of(params.protocol)
+        command, touches = protocol.read_back(params.command), params.touches
         value = str(command) if command.writes else None
         return cls(node, command, None if touches is None else protocol.read_back(touches), value)
 
     @classmethod
-    def of_point(cls, params: Mapping[str, Any], sender: RequestSender, line: ServedLine) -> RequestedCommand:
+    def of_point(cls, params: WriteParams, sender: RequestSender, line: ServedLine) -> RequestedCommand:
         """Return the write of a value to a point of a poll group.
 
         Raises InvalidCommand, after an audit entry, for a value that cannot be written.
         """
-        _, point = line.point(params["group"], params["key"])
-        value = value_of(params["value"])
+        _, point = line.point(params.group, params.key)
+        value = value_of(params.value)
         assert isinstance(point.node, Node)
         try:
             if isinstance(value, str) and point.meaning.labels:
@@ -324,31 +324,35 @@ class Writing:
 ClientRequest: TypeAlias = Reading | Writing
 
 
-def client_request_of(decoded: Mapping[str, Any] | PlainRead, sender: RequestSender, line: ServedLine) -> ClientRequest:
+def client_request_of(params: RequestParams | WriteParams, sender: RequestSender, line: ServedLine) -> ClientRequest:
     """Return the request of a client. Raises InvalidCommand for a command that the protocol does not have."""
-    if isinstance(decoded, PlainRead):
-        return Reading(sender.node(decoded.protocol, decoded.address), decoded.command, sender.turn, None, sender.reads)
-    task = (
-        RequestedCommand.of_point(decoded, sender, line)
-        if "key" in decoded
-        else RequestedCommand.of_node(decoded, sender)
-    )
+    if isinstance(params, WriteParams):
+        task, stops_seen, client, stop = RequestedCommand.of_point(params, sender, line), None, sender.turn, False
+    else:
+        task = RequestedCommand.of_node(params, sender)
+        stops_seen = None if params.stops_seen is None else params.stops_seen + sender.stops_before(task.node)
+        client = sender.client_of(params.sequence, task.node)
+        stop = params.stop and _check_stop(task.node, task.command)
     node, command = task.node, task.command
-    given = cast("CommandOptions", decoded.get("options") or {})
-    if not set(given) <= OPTIONS:
-        raise InvalidCommand(f"unknown options in {', '.join(given)}; use {', '.join(sorted(OPTIONS))}")
-    RequestOptions.of(given, node.label)  # checked here, before it may wait
-    _check_waits(given, node)
-    now, stops_seen = line.bus.now(), decoded.get("stops_seen")
-    stops_seen = None if stops_seen is None else stops_seen + sender.stops_before(node)
-    client = sender.client_of(decoded.get("sequence"), node)
-    stop = decoded.get("stop") is True and _check_stop(node, command)
-    asked = min(now, seconds(decoded.get("requested", now), "requested"))
+    if params.options is None and params.requested is None and not command.writes:
+        return Reading(node, command, client, stops_seen, sender.reads)
+    given = _options_of(params.options, node)
+    now = line.bus.now()
+    asked = now if params.requested is None else min(now, seconds(params.requested, "requested"))
     if not command.writes:
         options = RequestOptions.of(_left(given, now - asked), node.label)
         options = replace(options, priority=max(options.priority, sender.rights.reads))
         return Reading(node, command, client, stops_seen, options)
     return Writing(task, given, line=line, sender=sender, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+
+
+def _options_of(form: OptionsForm | None, node: Node) -> CommandOptions:
+    """Return the options of a request. Raises InvalidCommand for a time to wait that is too long."""
+    if form is None:
+        return {}
+    given = cast("CommandOptions", asdict(form))
+    _check_waits(given, node)
+    return given
 
 
 def _check_waits(options: CommandOptions, node: Node) -> None:

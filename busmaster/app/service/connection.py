@@ -113,11 +113,11 @@ class Connection(asyncio.BufferedProtocol):
         assert self._transport is not None
         return self._transport
 
-    def send(self, text: str) -> None:
+    def send(self, message: bytes) -> None:
         """Send a message, unless the connection is ending."""
         transport = self._transport
         if self._talks and transport is not None and not transport.is_closing():
-            transport.write(text_frame(text.encode(), self._key))
+            transport.write(text_frame(message, self._key))
             if self._masks:
                 self._key = new_key()  # in advance, so that the next message does not wait for it
 
@@ -420,11 +420,13 @@ def origin_of(connected: socket.socket | None) -> int | str | None:
 def check_installed() -> tuple[type[ServerProtocol], type[ClientProtocol], Callable[[str], Any]]:
     """Return the protocol classes of the library. Raises InvalidCommand with the missing package."""
     try:
+        import msgspec  # noqa: F401  typed.py has placeholders without it
         from websockets.client import ClientProtocol
         from websockets.server import ServerProtocol
         from websockets.uri import parse_uri
-    except ImportError:
-        raise InvalidCommand("sharing a line needs websockets; pip install 'busmaster[service]'") from None
+    except ImportError as missing:
+        name = (missing.name or "websockets").partition(".")[0]
+        raise InvalidCommand(f"sharing a line needs {name}; pip install 'busmaster[service]'") from None
     return ServerProtocol, ClientProtocol, parse_uri
 
 

@@ -1,4 +1,4 @@
-"""Encodes snapshots, events and statistics for messages, and decodes them at the client."""
+"""Converts snapshots, events and statistics to the structures of messages, and back at the client."""
 
 from __future__ import annotations
 
@@ -6,17 +6,30 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
-from busmaster import Bus, Health, Point, Quality, Sample, Snapshot
+from busmaster import Bus, Point, Quality, Sample, Snapshot
 from busmaster.app.service.failures import bus_error_of, error_data
-from busmaster.app.service.messages import value_of
-from busmaster.bounds import MOST_SYNC_READS
+from busmaster.app.service.fields import GroupForm, PointForm
+from busmaster.app.service.messages import encode_number, encode_value, value_of
+from busmaster.app.service.owner_messages import (
+    AlarmChangedForm,
+    EventForm,
+    LineChangedForm,
+    MaxReplyDelayLoweredForm,
+    MaxReplyDelayRaisedForm,
+    NodeChangedForm,
+    PortFailedForm,
+    RepliesLateForm,
+    SampleForm,
+    SnapshotBody,
+    StatisticsResult,
+)
+from busmaster.app.service.typed import Raw, convert, to_builtins
 from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.events import (
     AlarmChanged,
     BusEvent,
-    LineChange,
     LineChanged,
     MaxReplyDelayLowered,
     MaxReplyDelayRaised,
@@ -27,7 +40,7 @@ from busmaster.events import (
 from busmaster.ext import NodeRecord, Profile, Requester
 from busmaster.registry import Protocol as BusProtocol
 from busmaster.registry import protocols
-from busmaster.statistics import DriverErrors, LineStatistics, Quantiles, Timeline
+from busmaster.statistics import DriverErrors, LineStatistics, Quantiles
 
 
 class FindNode(Protocol):
@@ -45,56 +58,62 @@ def protocol_of(name: str) -> BusProtocol:
     raise InvalidCommand(f"no such protocol {name!r}; there are {', '.join(one.name for one in protocols())}")
 
 
-def encode_sync_reads(profile: Profile) -> dict[str, Any]:
-    """Return the probe and the sync reads of a kind of node, as they are sent, where they are not its protocol's."""
+class SyncReads(NamedTuple):
+    """The probe and the sync reads of a kind of node, in the form of messages; None: those of its protocol."""
+
+    probe: dict[str, Any] | None = None
+    sync_reads: list[dict[str, Any]] | None = None
+
+
+def encode_sync_reads(profile: Profile) -> SyncReads:
+    """Return the probe and the sync reads of a kind of node, if they are not those of its protocol."""
     protocol = protocol_of(profile.name)
     usual = protocol.profile
     if (profile.probe, tuple(profile.sync_reads)) == (usual.probe, tuple(usual.sync_reads)):
-        return {}
-    return {
-        "probe": protocol.write_down(profile.probe),
-        "sync_reads": [protocol.write_down(command) for command in profile.sync_reads],
-    }
+        return SyncReads()
+    return SyncReads(
+        protocol.write_down(profile.probe), [protocol.write_down(command) for command in profile.sync_reads]
+    )
 
 
-def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
-    """Return the profile with the probe and the sync reads that a client has sent; None: the protocol's.
+def profile_of(protocol: BusProtocol, form: SyncReads) -> Profile:
+    """Return the profile with the probe and the sync reads that a client has sent.
 
     Raises InvalidCommand for a command that is not a read of the protocol.
     """
-    if probe is None and sync_reads is None:
+    if form.probe is None and form.sync_reads is None:
         return protocol.profile
-    if not isinstance(probe, dict) or not isinstance(sync_reads, list) or not 0 < len(sync_reads) <= MOST_SYNC_READS:
-        raise InvalidCommand(f"{protocol.name}: a client sends one probe, and 1 to {MOST_SYNC_READS} sync reads")
-    first, *others = [protocol.read_back(dict(form)) for form in (probe, *sync_reads)]
-    for command in (first, *others):
+    if form.probe is None or form.sync_reads is None:
+        raise InvalidCommand(f"{protocol.name}: a client sends a probe together with sync reads")
+    probe, *sync_reads = [protocol.read_back(command) for command in (form.probe, *form.sync_reads)]
+    for command in (probe, *sync_reads):
         if command.writes:
             raise InvalidCommand(f"{protocol.name}: a probe or sync read must read, and {command} writes")
-    return replace(protocol.profile, probe=first, sync_reads=tuple(others))
+    return replace(protocol.profile, probe=probe, sync_reads=tuple(sync_reads))
 
 
 # poll groups
 
 
-def listed_groups(bus: Bus) -> list[dict[str, Any]]:
-    """Return the poll groups of a line as they are sent."""
-    return [{"name": group.name, "period": group.period} for group in bus.groups]
+def listed_groups(bus: Bus) -> list[GroupForm]:
+    """Return the poll groups of a line in the form of messages."""
+    return [GroupForm(group.name, group.period) for group in bus.groups]
 
 
 # snapshots
 
 
-def encode_points(points: Iterable[Point[Any]]) -> list[dict[str, Any]]:
+def encode_points(points: Iterable[Point[Any]]) -> list[PointForm]:
     """Return points in the form of messages: their names and their commands."""
     return [
-        {
-            "key": point.key,
-            "item": point.item,
-            "unit": point.unit,
-            "protocol": point.node.profile.name,
-            "address": point.node.address,
-            "command": protocol_of(point.node.profile.name).write_down(point.command),
-        }
+        PointForm(
+            point.node.profile.name,
+            point.node.address,
+            protocol_of(point.node.profile.name).write_down(point.command),
+            point.key,
+            point.item,
+            point.unit,
+        )
         for point in points
     ]
 
@@ -118,119 +137,144 @@ class OwnersPoint(Point[Any]):
     __hash__ = Point.__hash__
 
 
-def point_of(decoded: Mapping[str, Any], find: FindNode) -> Point[Any]:
+def point_of(form: PointForm, find: FindNode) -> Point[Any]:
     """Return the point in a message. It does not change values, because they were decoded by the owner."""
-    protocol = protocol_of(decoded.get("protocol"))
-    node = find(protocol.name, decoded["address"])
-    command = protocol.read_back(decoded["command"])
-    return Point(node, str(decoded.get("item", "")), command, str(decoded.get("unit", "")))
+    protocol = protocol_of(form.protocol)
+    node = find(protocol.name, form.address)
+    return Point(node, form.item, protocol.read_back(form.command), form.unit)
 
 
-def owners_point_of(decoded: Mapping[str, Any], find: FindNode) -> Point[Any]:
+def owners_point_of(form: PointForm, find: FindNode) -> Point[Any]:
     """Return the owner's point in a message, with the owner's name for it."""
-    point = point_of(decoded, find)
-    return OwnersPoint(point.node, point.item, point.command, point.unit, owners_key=str(decoded["key"]))
+    point = point_of(form, find)
+    return OwnersPoint(point.node, point.item, point.command, point.unit, owners_key=form.key)
 
 
-def encode_snapshot(snapshot: Snapshot) -> dict[str, Any]:
-    """Return a cycle in the form of a message, without its samples."""
-    return {name: getattr(snapshot, name) for name in ("cycle", "due", "started", "finished", "missed", "wall")}
+def encode_snapshot(snapshot: Snapshot, set_: int, samples: list[Raw]) -> SnapshotBody:
+    """Return a cycle in the form of a message. Its samples are encoded already, a few at a time."""
+    return SnapshotBody(
+        set_,
+        snapshot.cycle,
+        snapshot.due,
+        snapshot.started,
+        snapshot.finished,
+        snapshot.missed,
+        snapshot.wall,
+        cast("list[SampleForm]", samples),
+    )
 
 
-def snapshot_of(decoded: Mapping[str, Any], group: str, points: Sequence[Point[Any]]) -> Snapshot:
+def snapshot_of(body: SnapshotBody, group: str, points: Sequence[Point[Any]]) -> Snapshot:
     """Return the cycle in a message; its samples are in the order of its points."""
-    names = ("cycle", "due", "started", "finished", "missed", "wall")
-    samples = {point: _sample_of(one, point) for point, one in zip(points, decoded["samples"], strict=True)}
-    return Snapshot(group=group, samples=samples, **{name: decoded[name] for name in names})
+    samples = {point: _sample_of(form, point) for point, form in zip(points, body.samples, strict=True)}
+    return Snapshot(
+        group=group,
+        samples=samples,
+        cycle=body.cycle,
+        due=body.due,
+        started=body.started,
+        finished=body.finished,
+        missed=body.missed,
+        wall=body.wall,
+    )
 
 
-def encode_sample(sample: Sample[Any]) -> list[Any]:
+def encode_sample(sample: Sample[Any]) -> SampleForm:
     """Return a sample in the form of a message."""
-    error = None if sample.error is None else error_data(sample.error)
-    times = (sample.due, sample.started, sample.finished, sample.wall)
-    return [sample.value, error, *times, sample.quality.value, sample.timeline]
+    return SampleForm(
+        encode_value(sample.value),
+        None if sample.error is None else error_data(sample.error),
+        sample.due,
+        sample.started,
+        sample.finished,
+        sample.wall,
+        sample.quality.value,
+        sample.timeline,
+    )
 
 
-def _sample_of(decoded: Sequence[Any], point: Point[Any]) -> Sample[Any]:
-    value, error, due, started, finished, wall, quality, timeline = decoded
-    failed = None if error is None else bus_error_of(error)
-    how_good = Quality(quality)
-    value = value_of(value)
-    if failed is None:
+def _sample_of(form: SampleForm, point: Point[Any]) -> Sample[Any]:
+    error = None if form.error is None else bus_error_of(form.error)
+    quality, value = Quality(form.quality), value_of(form.value)
+    if error is None:
         try:
             value = point.value_of(value)
         except GarbledReply as bad:
-            value, failed, how_good = None, bad, Quality.BAD
-    return Sample(value, failed, due, started, finished, how_good, Timeline(*timeline), wall)
+            value, error, quality = None, bad, Quality.BAD
+    return Sample(value, error, form.due, form.started, form.finished, quality, form.timeline, form.wall)
 
 
 # events
 
 
-def encode_event(event: BusEvent) -> dict[str, Any] | None:
+def encode_event(event: BusEvent) -> EventForm | None:
     """Return an event in the form of a message; None for one that clients do not get."""
-    form: dict[str, Any] = {"event": type(event).__name__}
     match event:
-        case NodeChanged():
-            form |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
-        case MaxReplyDelayRaised():
-            form |= {"age": event.age, "max_reply_delay": event.max_reply_delay}
-        case MaxReplyDelayLowered():
-            form |= {"max_reply_delay": event.max_reply_delay}
-        case RepliesLate():
-            form |= {"age": event.age, "window": event.window}
         case LineChanged():
-            return form | {"change": event.change.value, "cause": event.cause}
+            return LineChangedForm(event.change, event.cause)
         case PortFailed():
             bug = None if event.bug is None else f"{type(event.bug).__name__}: {event.bug}"
-            return form | {"cause": event.cause, "hint": event.hint, "bug": bug}
+            return PortFailedForm(event.cause, event.hint, bug)
         case AlarmChanged():
             [point] = encode_points([event.point])
-            limits = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
-            return form | {"point": point, **limits}
-        case _:
-            return None
-    node = event.node
-    return form | {"protocol": node.profile.name, "address": node.address, "label": node.label}
+            return AlarmChangedForm(
+                point, event.limit, encode_number(event.bound), encode_value(event.value), event.active
+            )
+        case NodeChanged() | MaxReplyDelayRaised() | MaxReplyDelayLowered() | RepliesLate():
+            return _encode_node_event(event)
+    return None
 
 
-def event_of(decoded: Mapping[str, Any], find: FindNode) -> BusEvent | None:
-    """Return the event in a message; its `node` is the client's own. None for one of a later version."""
-    name = decoded["event"]
-    if name == "LineChanged":
-        return LineChanged(LineChange(decoded["change"]), decoded["cause"])
-    if name == "PortFailed":
-        return PortFailed(
-            decoded["cause"], decoded["hint"], None if decoded["bug"] is None else Exception(decoded["bug"])
-        )
-    if name == "AlarmChanged":
-        point = owners_point_of(decoded["point"], find)
-        return AlarmChanged(point, decoded["limit"], decoded["bound"], decoded["value"], decoded["active"])
-    if name not in ("NodeChanged", "MaxReplyDelayRaised", "MaxReplyDelayLowered", "RepliesLate"):
-        return None
+def _encode_node_event(event: NodeChanged | MaxReplyDelayRaised | MaxReplyDelayLowered | RepliesLate) -> EventForm:
+    node = event.node.profile.name, event.node.address, event.node.label
+    match event:
+        case NodeChanged():
+            return NodeChangedForm(*node, event.before, event.after, event.returning)
+        case MaxReplyDelayRaised():
+            return MaxReplyDelayRaisedForm(*node, event.age, event.max_reply_delay)
+        case MaxReplyDelayLowered():
+            return MaxReplyDelayLoweredForm(*node, event.max_reply_delay)
+        case RepliesLate():
+            return RepliesLateForm(*node, event.age, event.window)
+
+
+def event_of(form: EventForm, find: FindNode) -> BusEvent:
+    """Return the event in a message; its `node` is the client's own."""
+    match form:
+        case LineChangedForm():
+            return LineChanged(form.change, form.cause)
+        case PortFailedForm():
+            return PortFailed(form.cause, form.hint, None if form.bug is None else Exception(form.bug))
+        case AlarmChangedForm():
+            bound, value = value_of(to_builtins(form.bound)), value_of(form.value)
+            return AlarmChanged(owners_point_of(form.point, find), form.limit, bound, value, form.active)
     # It has all attributes of a node that events need: label, address, profile, line.
-    node = cast("NodeRecord", find(decoded["protocol"], decoded["address"]))
-    if name == "NodeChanged":
-        return NodeChanged(node, Health(decoded["before"]), Health(decoded["after"]), decoded["returning"])
-    if name == "MaxReplyDelayRaised":
-        return MaxReplyDelayRaised(node, decoded["age"], decoded["max_reply_delay"])
-    if name == "RepliesLate":
-        return RepliesLate(node, decoded["age"], decoded["window"])
-    return MaxReplyDelayLowered(node, decoded["max_reply_delay"])
+    node = cast("NodeRecord", find(form.protocol, form.address))
+    match form:
+        case NodeChangedForm():
+            return NodeChanged(node, form.before, form.after, form.returning)
+        case MaxReplyDelayRaisedForm():
+            return MaxReplyDelayRaised(node, form.age, form.max_reply_delay)
+        case RepliesLateForm():
+            return RepliesLate(node, form.age, form.window)
+        case MaxReplyDelayLoweredForm():
+            return MaxReplyDelayLowered(node, form.max_reply_delay)
 
 
 # statistics
 
 
-def encode_statistics(statistics: LineStatistics) -> dict[str, Any]:
+def encode_statistics(statistics: LineStatistics) -> StatisticsResult:
     """Return the counters of a line in the form of a message."""
-    return {**dataclasses.asdict(statistics), "utilisation": statistics.utilisation}
+    counters = {**dataclasses.asdict(statistics), "utilisation": statistics.utilisation}
+    return convert(encode_value(counters), StatisticsResult, from_attributes=True)
 
 
-def statistics_of(decoded: Mapping[str, Any]) -> LineStatistics:
+def statistics_of(form: StatisticsResult) -> LineStatistics:
     """Return the counters in a message."""
+    counters: Mapping[str, Any] = value_of(to_builtins(form))
     known = {part.name for part in dataclasses.fields(LineStatistics)}
-    counts: dict[str, Any] = {name: value for name, value in decoded.items() if name in known}
-    counts["waits"] = tuple(Quantiles(**wait) for wait in decoded["waits"])
-    counts["driver"] = None if decoded["driver"] is None else DriverErrors(**decoded["driver"])
+    counts = {name: value for name, value in counters.items() if name in known}
+    counts["waits"] = tuple(Quantiles(**wait) for wait in counters["waits"])
+    counts["driver"] = None if counters["driver"] is None else DriverErrors(**counters["driver"])
     return LineStatistics(**counts)

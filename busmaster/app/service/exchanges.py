@@ -8,8 +8,10 @@ from collections.abc import AsyncGenerator, Callable
 from typing import Any
 
 from busmaster import Bus, ext
-from busmaster.app.service.messages import encoded
+from busmaster.app.service.messages import encode
+from busmaster.app.service.owner_messages import ExchangeForm, ExchangesBody, Transmission, UnexpectedBytes
 from busmaster.app.service.streams import Broadcast
+from busmaster.app.service.typed import Raw
 from busmaster.app.service.values import value_text
 from busmaster.ext import Attempt
 
@@ -33,15 +35,14 @@ class TracedExchange:
 
     def __init__(self, attempt: Attempt | None) -> None:
         self.attempt = attempt
-        self.transmissions: list[list[Any]] = []
-        """Time, sender and bytes, in the form of the message."""
+        self.transmissions: list[Transmission] = []
         self.bytes = 0
 
     def add(self, now: float, by_master: bool, data: bytes) -> None:
         """Add bytes that were sent or received."""
         if self.bytes < MOST_BYTES:
             text = data[: MOST_BYTES - self.bytes].hex()
-            self.transmissions.append([round(now * 1e6), "master" if by_master else "node", text])
+            self.transmissions.append(Transmission(round(now * 1e6), "master" if by_master else "node", text))
         self.bytes += len(data)
 
     @property
@@ -116,32 +117,31 @@ class ExchangesBroadcast(Broadcast):
         super().__init__(on_end)
         self._bus = bus
 
-    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+    async def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
         listener = Listener()
         ext.add_tap(self._bus, listener)
         try:
             while True:
-                parts: list[str] = []
+                parts: list[Any] = []
                 exchanges, left_out = listener.take()
-                for first in range(0, len(exchanges), ENCODED_AT_ONCE):
-                    if first:
+                for number, exchange in enumerate(exchanges):
+                    if number and number % ENCODED_AT_ONCE == 0:
                         await asyncio.sleep(0)
-                    parts.append(encoded(list(map(exchange_to_json, exchanges[first : first + ENCODED_AT_ONCE])))[1:-1])
-                head = encoded({"now": self._bus.now(), "left_out": left_out})
-                yield "exchanges", f'{head[:-1]},"exchanges":[{",".join(parts)}]}}'
+                    parts.append(Raw(encode(encode_exchange(exchange))))
+                yield "exchanges", Raw(encode(ExchangesBody(self._bus.now(), left_out, parts)))
                 await asyncio.sleep(INTERVAL)
         finally:
             ext.remove_tap(self._bus, listener)
 
 
-def exchange_to_json(exchange: TracedExchange) -> list[Any]:
-    """Return a completed exchange as a list for JSON: values in a fixed order, times in whole microseconds, bytes in
-    hexadecimal digits. Names would be repeated for each exchange, and floats take ten times as long.
+def encode_exchange(exchange: TracedExchange) -> UnexpectedBytes | ExchangeForm:
+    """Return a completed exchange, or unexpected bytes, in the form of a message: values in a fixed order, times in
+    whole microseconds. Names would be repeated for each exchange, and floats are longer.
     """
     attempt = exchange.attempt
     if attempt is None or attempt.verdict is None:
-        return [exchange.transmissions, exchange.bytes]
-    return [
+        return UnexpectedBytes(exchange.transmissions, exchange.bytes)
+    return ExchangeForm(
         exchange.transmissions,
         exchange.bytes,
         round(attempt.ended_at * 1e6),
@@ -156,7 +156,7 @@ def exchange_to_json(exchange: TracedExchange) -> list[Any]:
         _result(attempt.result),
         attempt.late,
         round(attempt.quiet_time * 1e6),
-    ]
+    )
 
 
 def _result(result: Any) -> str:

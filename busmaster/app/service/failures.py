@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from busmaster import errors
-from busmaster.app.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS, Malformed
+from busmaster.app.service.fields import BusErrorData, InvalidCommandData
+from busmaster.app.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS, InvalidParams, Malformed, encode
+from busmaster.app.service.owner_messages import ErrorForm
+from busmaster.app.service.typed import UNSET, Decoder, Raw, Struct, UnsetType
 from busmaster.errors import BusError, InvalidCommand, Refused
 
 FIELDS = ("what", "line", "label", "address", "command", "attempts", "hint")
@@ -14,14 +15,12 @@ DEEPEST = 5
 REFUSED = (
     BusError,
     Malformed,
-    KeyError,
     TypeError,
     ValueError,
-    AttributeError,
     OverflowError,  # a number of some hundred digits
     RecursionError,  # a list in a list in a list
 )
-"""Exceptions of a request: from the line, or from invalid parameters."""
+"""Exceptions of a request: from the line, or from values whose type is the protocol's affair."""
 KNOWN: dict[str, type[BusError]] = {
     name: thing
     for name in errors.__all__
@@ -29,60 +28,78 @@ KNOWN: dict[str, type[BusError]] = {
 }
 
 
-def encode_error(error: Exception) -> dict[str, Any]:
+def encode_error(error: Exception) -> ErrorForm:
     """Return an error in the form of JSON-RPC; its class is in its `data`."""
     if isinstance(error, Malformed):
-        return {"code": error.code, "message": str(error)}
+        return ErrorForm(error.code, str(error))
     if isinstance(error, BusError):
-        return {"code": BUS_ERROR, "message": str(error), "data": error_data(error)}
+        return ErrorForm(BUS_ERROR, str(error), Raw(encode(error_data(error))))
     if isinstance(error, InvalidCommand):
-        return {"code": INVALID_PARAMS, "message": str(error), "data": {"error": "InvalidCommand", "what": str(error)}}
-    return {"code": INTERNAL, "message": f"{type(error).__name__}: {error}"}
+        return ErrorForm(INVALID_PARAMS, str(error), Raw(encode(InvalidCommandData("InvalidCommand", str(error)))))
+    return ErrorForm(INTERNAL, f"{type(error).__name__}: {error}")
 
 
 def refusal_of(method: str, error: Exception) -> Exception:
-    """Return why a request is refused, as text for its program. Exceptions from invalid parameters get a text with the
+    """Return why a request is refused, as text for its program. Exceptions from invalid values get a text with the
     method.
     """
     if isinstance(error, BusError | InvalidCommand | Malformed):
         return error
-    what = f"{error} is missing" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-    return InvalidCommand(f"{method}: {what}; service.schema.json has its parameters")
+    return InvalidParams(method, f"{type(error).__name__}: {error}")
 
 
-def error_data(error: BusError, depth: int = 0) -> dict[str, Any]:
+def error_data(error: BusError, depth: int = 0) -> BusErrorData:
     """Return the class of an error by the nearest name that every client knows, and its fields."""
     name = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN), "BusError")
-    data: dict[str, Any] = {"error": name, **{field: getattr(error, field) for field in FIELDS}}
+    confirm: bool | UnsetType = UNSET
+    temporary: bool | UnsetType = UNSET
     if isinstance(error, Refused):
-        data |= {"confirm": error.confirm} | ({"temporary": True} if error.temporary else {})
-    cause = error.__cause__
-    if cause is not None and depth < DEEPEST:
-        text = f"{type(cause).__name__}: {cause}"
-        data["cause"] = error_data(cause, depth + 1) if isinstance(cause, BusError) else text
-    return data
+        confirm, temporary = error.confirm, True if error.temporary else UNSET
+    cause: str | BusErrorData | UnsetType = UNSET
+    if error.__cause__ is not None and depth < DEEPEST:
+        text = f"{type(error.__cause__).__name__}: {error.__cause__}"
+        cause = error_data(error.__cause__, depth + 1) if isinstance(error.__cause__, BusError) else text
+    return BusErrorData(
+        name,
+        error.what,
+        error.line,
+        error.label,
+        error.address,
+        error.command,
+        error.attempts,
+        error.hint,
+        confirm,
+        temporary,
+        cause,
+    )
 
 
-def error_of(decoded: dict[str, Any]) -> Exception:
+def error_of(form: ErrorForm) -> Exception:
     """Return a new error with all fields of the received one."""
-    data = decoded.get("data") or {}
-    if data.get("error") == "InvalidCommand":
-        return InvalidCommand(data["what"])
-    if data:
-        return bus_error_of(data)
-    return BusError(f"the program that owns the line could not do it: {decoded.get('message')}", hint="see its log")
+    if isinstance(form.data, UnsetType):
+        return BusError(f"the program that owns the line could not do it: {form.message}", hint="see its log")
+    if _ERROR_NAME.decode(form.data).error == "InvalidCommand":
+        return InvalidCommand(_INVALID_COMMAND.decode(form.data).what)
+    return bus_error_of(_BUS_ERROR.decode(form.data))
 
 
-def bus_error_of(data: dict[str, Any]) -> BusError:
+def bus_error_of(data: BusErrorData) -> BusError:
     """Return the BusError that has these fields."""
-    kind = KNOWN.get(data["error"], BusError)
-    error = kind(data["what"])
+    error = KNOWN.get(data.error, BusError)(data.what)
     for field in FIELDS:
-        if getattr(error, field) != data.get(field):  # a hint that its class has is not kept twice
-            setattr(error, field, data.get(field))
+        if getattr(error, field) != getattr(data, field):  # a hint that its class has is not kept twice
+            setattr(error, field, getattr(data, field))
     if isinstance(error, Refused):
-        error.confirm, error.temporary = data.get("confirm", True), data.get("temporary", False)
-    cause = data.get("cause")
-    if cause is not None:
-        error.__cause__ = bus_error_of(cause) if isinstance(cause, dict) else Exception(cause)
+        error.confirm, error.temporary = data.confirm is not False, data.temporary is True
+    if not isinstance(data.cause, UnsetType):
+        error.__cause__ = bus_error_of(data.cause) if isinstance(data.cause, BusErrorData) else Exception(data.cause)
     return error
+
+
+class _ErrorName(Struct, frozen=True):
+    error: str
+
+
+_ERROR_NAME = Decoder(_ErrorName)
+_INVALID_COMMAND = Decoder(InvalidCommandData)
+_BUS_ERROR = Decoder(BusErrorData)

@@ -5,14 +5,24 @@ from __future__ import annotations
 import asyncio
 import os
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
-from busmaster.app.service.connection import OutgoingConnection
+from busmaster.app.service.client_messages import CancelParams, HelloParams
+from busmaster.app.service.connection import OutgoingConnection, check_installed
 from busmaster.app.service.failures import error_of
 from busmaster.app.service.folder import socket_path
-from busmaster.app.service.messages import VERSIONS, numbered, read, words, written
+from busmaster.app.service.messages import (
+    VERSIONS,
+    decode_owner_message,
+    decode_owner_notification,
+    decode_result,
+    encode_notification,
+    encode_request,
+)
+from busmaster.app.service.owner_messages import HelloResult, OwnerMessage
+from busmaster.app.service.typed import Struct, UnsetType
 from busmaster.bounds import LONGEST_ANSWER
 from busmaster.errors import (
     Addressed,
@@ -39,11 +49,12 @@ AGAIN = "check whether it is running, and connect again"
 class PendingRequest:
     """One request in progress. `writes`: its error must state whether the write may have been sent."""
 
-    __slots__ = ("command", "future", "handed", "node", "number", "writes")
+    __slots__ = ("command", "future", "handed", "method", "node", "number", "writes")
 
     def __init__(
         self,
         number: int,
+        method: str,
         future: asyncio.Future[Any],
         writes: bool,
         node: Addressed | None,
@@ -51,6 +62,8 @@ class PendingRequest:
         handed: bool = False,
     ) -> None:
         self.number = number
+        self.method = method
+        """The type of its result depends on it."""
         self.future = future
         self.writes = writes
         self.node = node
@@ -78,13 +91,13 @@ def _text(command: Command[Any] | None) -> str | None:
 
 
 class Link:
-    """One connection to the owner of a line. `on_news` is called with the notifications, in their order."""
+    """One connection to the owner of a line. `on_notification` is called with each method and its parameters."""
 
     def __init__(
         self,
         address: str,
         token: str | None,
-        on_news: Callable[[str, Mapping[str, Any]], None],
+        on_notification: Callable[[str, Any], None],
         on_lost: Callable[[], None],
         *,
         safe_only: bool = False,
@@ -92,35 +105,34 @@ class Link:
         self.address = address
         self._safe_only = safe_only
         self._token = token
-        self._on_news = on_news
+        self._on_notification = on_notification
         self._on_lost = on_lost
         self._connection: OutgoingConnection | None = None
-        self._waiting: deque[tuple[str, PendingRequest | None]] = deque()
+        self._waiting: deque[tuple[bytes, PendingRequest | None]] = deque()
         """Messages to send when the connection is ready, each with its request."""
         self._asked: dict[int, PendingRequest] = {}
         self._count = 0
         self._over: tuple[type[BusError], str, str] | None = None
         self._is_open = False
 
-    async def open(self, program: str) -> dict[str, Any]:
+    async def open(self, program: str) -> HelloResult:
         """Connect, agree on a version, and return the owner's description of the line. Raises LineDown."""
+        check_installed()
         # A thread, since the host of a serial server may have to be found.
         where, place = (
             await asyncio.to_thread(_where, self.address) if is_a_name(self.address) else _where(self.address)
         )
         loop = asyncio.get_running_loop()
-        self._asked[0] = hello = PendingRequest(0, loop.create_future(), False, None, None)
-        params: dict[str, Any] = {"versions": list(VERSIONS), "program": program}
-        if self._safe_only:
-            params["safe_only"] = True
-        self._waiting.appendleft((numbered(words("hello", params), 0), hello))
+        self._asked[0] = hello = PendingRequest(0, "hello", loop.create_future(), False, None, None)
+        params = HelloParams(list(VERSIONS), program, self._safe_only)
+        self._waiting.appendleft((encode_request("hello", 0, params), hello))
         try:
             async with asyncio.timeout(CONNECT_WITHIN):
                 if place is None:
                     await loop.create_unix_connection(self._connect, where)
                 else:
                     await loop.create_connection(self._connect, *place)
-                decoded: dict[str, Any] = await hello.future
+                about: HelloResult = await hello.future
         except BaseException as error:
             hello.future.cancel()  # its result is not awaited any more
             shut = self._shut(where, error)
@@ -128,7 +140,7 @@ class Link:
             if shut is not None:
                 raise shut from error
             raise
-        return decoded
+        return about
 
     async def close(self) -> None:
         """Close the connection. Requests in progress end with BusClosed."""
@@ -137,35 +149,33 @@ class Link:
             self._connection.close()
             await self._connection.closed()
 
-    def notify(self, method: str, params: Mapping[str, Any]) -> None:
+    def notify(self, method: str, params: Struct) -> None:
         """Send a notification, which has no reply. Does nothing if the connection is lost."""
         if self._over is None:
-            text = written({"method": method, "params": params})
-            if not self._passes(text):
-                self._waiting.append((text, None))
+            message = encode_notification(method, params)
+            if not self._passes(message):
+                self._waiting.append((message, None))
 
     def ask(
-        self, method: str, params: Mapping[str, Any], *, writes: bool = False, node: Addressed | None = None
+        self,
+        method: str,
+        params: Struct,
+        *,
+        writes: bool = False,
+        node: Addressed | None = None,
+        command: Command[Any] | None = None,
     ) -> PendingRequest:
-        """Do what `put` does, for a method and its parameters."""
-        return self.put(words(method, params), writes, node)
-
-    def put(
-        self, question: str, writes: bool, node: Addressed | None = None, command: Command[Any] | None = None
-    ) -> PendingRequest:
-        """Send a request in the form of `words`, after all earlier messages. Its future gets the reply.
-
-        Raises LineDown or BusClosed.
-        """
+        """Send a request after all earlier messages. Its future gets the result. Raises LineDown or BusClosed."""
         if self._over is not None:
             self.check(node, command)
         self._count = number = self._count + 1
-        text = numbered(question, number)
-        handed = self._passes(text)  # first: the other end begins while this end creates the objects for it
-        asked = PendingRequest(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
+        message = encode_request(method, number, params)
+        handed = self._passes(message)  # first: the other end begins while this end creates the objects for it
+        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        asked = PendingRequest(number, method, future, writes, node, command, handed)
         self._asked[number] = asked
         if not handed:
-            self._waiting.append((text, asked))
+            self._waiting.append((message, asked))
         return asked
 
     def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
@@ -204,9 +214,9 @@ class Link:
         self.writable()
 
     def received(self, message: str | bytes) -> None:
-        """Pass a reply to its request, and a notification to `on_news`."""
+        """Pass a reply to its request, and a notification to `on_notification`."""
         try:
-            self._take(read(message))
+            self._take(decode_owner_message(message))
         except Exception as error:  # invalid messages of any kind
             what = f"the program that owns the line sent an invalid message: {type(error).__name__}: {error}"
             self._end(LineDown, what, AGAIN)
@@ -218,12 +228,12 @@ class Link:
         connection = self._connection
         assert connection is not None
         while self._waiting and self._is_open and not connection.full:
-            text, asked = self._waiting.popleft()
+            message, asked = self._waiting.popleft()
             if asked is not None:
                 if asked.future.done():
                     continue  # cancelled before it was sent
                 asked.handed = True
-            connection.send(text)
+            connection.send(message)
 
     def lost(self) -> None:
         """End all requests, because the connection is over."""
@@ -260,18 +270,18 @@ class Link:
             return None
         return LineDown(f"no program serves {where}: {complaint}", hint="start busmaster run, or see busmaster status")
 
-    def _passes(self, text: str) -> bool:
+    def _passes(self, message: bytes) -> bool:
         """Send it at once if nothing waits before it; return whether it was sent."""
         connection = self._connection
         if self._waiting or not self._is_open or connection is None or connection.full:
             return False
-        connection.send(text)
+        connection.send(message)
         return True
 
     def _drop(self, asked: PendingRequest) -> None:
         """Stop waiting for a request, and cancel it at the line."""
         if self._asked.pop(asked.number, None) is not None and asked.handed:
-            self.notify("cancel", {"id": asked.number})
+            self.notify("cancel", CancelParams(asked.number))
 
     def _overdue(self, asked: PendingRequest) -> None:
         what = "the time of the request is over, and the program that owns the line did not reply"
@@ -287,22 +297,25 @@ class Link:
             self._waiting.clear()
             self._on_lost()
 
-    def _take(self, decoded: Mapping[str, Any]) -> None:
-        if "method" in decoded:
-            self._on_news(decoded["method"], decoded["params"])
+    def _take(self, message: OwnerMessage) -> None:
+        if not isinstance(message.method, UnsetType):
+            params = decode_owner_notification(message.method, message.params)
+            if params is not None:  # one of a later version is ignored
+                self._on_notification(message.method, params)
             return
-        asked = self._asked.get(decoded.get("id"))  # type: ignore[arg-type]  # the other end can send anything
+        asked = None if message.id is None else self._asked.get(message.id)
         if asked is None:
             return
         # Decoded first: if that fails, the request is still registered, and ends with the connection.
-        error = error_of(decoded["error"]) if "error" in decoded else None
+        error = None if isinstance(message.error, UnsetType) else error_of(message.error)
+        result = None if isinstance(message.result, UnsetType) else decode_result(asked.method, message.result)
         del self._asked[asked.number]
         if asked.future.done():
             return
         if error is not None:
             asked.future.set_exception(error)
         else:
-            asked.future.set_result(decoded.get("result"))
+            asked.future.set_result(result)
 
 
 def is_a_name(address: str) -> bool:

@@ -17,14 +17,14 @@ class MessageSink(Protocol):
         """Return whether earlier messages are still unsent."""
         ...
 
-    def send(self, text: str, /) -> None: ...
+    def send(self, message: bytes, /) -> None: ...
 
 
 class _Message:
-    __slots__ = ("key", "text")
+    __slots__ = ("encoded", "key")
 
-    def __init__(self, text: str, key: Hashable = None) -> None:
-        self.text = text
+    def __init__(self, encoded: bytes, key: Hashable = None) -> None:
+        self.encoded = encoded
         self.key = key
 
 
@@ -52,34 +52,34 @@ class Outbox:
         """Return whether so many replies wait that no further requests of this client must be read."""
         return len(self._messages) >= MOST_WAITING
 
-    def put(self, text: str) -> None:
+    def put(self, encoded: bytes) -> None:
         """Send a message that is never dropped."""
         if self._messages or self._sink.full:
-            self._messages[_Message(text)] = None
+            self._messages[_Message(encoded)] = None
         else:
-            self._sink.send(text)
+            self._sink.send(encoded)
 
-    def put_latest(self, key: Hashable, text: str) -> None:
+    def put_latest(self, key: Hashable, encoded: bytes) -> None:
         """Send a message that replaces an earlier unsent one with the same key."""
         message = self._latest.get(key)
         if message is not None:
-            message.text = text
+            message.encoded = encoded
         elif self._messages or self._sink.full:
-            self._latest[key] = message = _Message(text, key)
+            self._latest[key] = message = _Message(encoded, key)
             self._messages[message] = None
         else:
-            self._sink.send(text)
+            self._sink.send(encoded)
 
-    def put_news(self, key: Hashable, text: str) -> None:
+    def put_news(self, key: Hashable, encoded: bytes) -> None:
         """Send a notification of a stream, unless the client does not keep up."""
         if not self._messages and not self._sink.full:
-            self._sink.send(text)
+            self._sink.send(encoded)
             return
         while len(self._news) >= MOST_UNREAD:
             oldest = self._news.popleft()
             del self._messages[oldest]
             self._on_drop(oldest.key)
-        message = _Message(text, key)
+        message = _Message(encoded, key)
         self._news.append(message)
         self._messages[message] = None
 
@@ -91,4 +91,4 @@ class Outbox:
                 self._news.popleft()
             elif self._latest.get(message.key) is message:
                 del self._latest[message.key]
-            self._sink.send(message.text)
+            self._sink.send(message.encoded)

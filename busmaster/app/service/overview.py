@@ -15,8 +15,24 @@ from typing import Any
 
 from busmaster import Bus, Health, LineState, Node, Point, PollGroup, Sample, Snapshot, ext
 from busmaster.app.service.authorisation import Authorisation
-from busmaster.app.service.messages import encoded
+from busmaster.app.service.fields import Number
+from busmaster.app.service.messages import encode, encode_number
+from busmaster.app.service.owner_messages import (
+    DetailsResult,
+    FrameBody,
+    GroupCounts,
+    GroupsBody,
+    LimitForm,
+    NodeCounts,
+    NodesBody,
+    RowForm,
+    RowsBody,
+    ShownValue,
+    TimelineForm,
+    ValuesBody,
+)
 from busmaster.app.service.streams import READERS_IN_A_TURN, Broadcast, Place
+from busmaster.app.service.typed import Raw
 from busmaster.app.service.values import event_text, value_text
 from busmaster.events import AlarmChanged
 from busmaster.ext import Placed, RecentUtilisation
@@ -80,14 +96,14 @@ class Part:
         self._seen: object = None
         """What its values were worked out of: the cycle, the last write, and whether the line was there."""
         self._snapshot: Snapshot | None = None
-        self.rows = ""
-        self.values = ""
+        self.rows = b""
+        self.values = b""
 
     def send_rows(self, number: int) -> None:
         """Work out what these points are, in the picture's `number`-th set."""
         rows = [_encode_point(self.group, point) for point in self._points]
-        self.rows = encoded({"set": number, "first": self.first, "rows": rows})
-        self.values = encoded({"set": number, "first": self.first, "values": []})
+        self.rows = encode(RowsBody(number, self.first, rows))
+        self.values = encode(ValuesBody(number, self.first, []))
 
     def send_values(self, number: int, bus: Bus) -> bool:
         """Work out what these points hold now, and return whether that is something else than before."""
@@ -102,7 +118,7 @@ class Part:
         self._snapshot = snapshot  # kept: no other can have its id then, as one with a value read after a write could
         alarms = bus.alarms
         values = [_encode_value(bus, point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
-        before, self.values = self.values, encoded({"set": number, "first": self.first, "values": values})
+        before, self.values = self.values, encode(ValuesBody(number, self.first, values))
         return self.values != before
 
 
@@ -128,7 +144,7 @@ class Overview(Broadcast):
         self._parts: list[Part] = []
         self._left_out = 0
         self._counted_at = -COUNTED_EVERY
-        self._counts: dict[tuple[str, int], str] = {}
+        self._counts: dict[tuple[str, int], bytes] = {}
         self._utilisation = RecentUtilisation(UTILISATION_WINDOW)
 
     def join(self, reader: Any, stream: int) -> None:
@@ -141,15 +157,15 @@ class Overview(Broadcast):
             fresh, self._fresh = self._fresh, []
             await self._send_points(fresh)
             await self._send_counts(fresh)
-            await self._send("frame", 0, encoded(self._frame()), tuple(self.readers))
+            await self._send("frame", 0, encode(self._frame()), tuple(self.readers))
             await asyncio.sleep(INTERVAL)
 
-    async def _send(self, method: str, part: int, body: str, places: Sequence[Place]) -> None:
+    async def _send(self, method: str, part: int, body: bytes, places: Sequence[Place]) -> None:
         for number, place in enumerate(places):
             if number and number % READERS_IN_A_TURN == 0:
                 await asyncio.sleep(0)
             if place in self.readers:
-                place[0].notify_surely(place[1], method, body, part)
+                place[0].notify_surely(place[1], method, Raw(body), part)
 
     # points
 
@@ -192,15 +208,15 @@ class Overview(Broadcast):
         due = now >= self._counted_at + COUNTED_EVERY
         if due:
             self._counted_at = now
-            self._counts = {key: self._counts.get(key, "") for key in self._count_keys()}
-        for (method, first), text in self._counts.items():
+            self._counts = {key: self._counts.get(key, b"") for key in self._count_keys()}
+        for (method, first), body in self._counts.items():
             if due:
-                things = _encode_groups if method == "groups" else _encode_nodes
-                changes = things(self._bus, first)
-                text = encoded({"first": first, method: changes})
-                self._counts[method, first] = text
+                body = encode(
+                    _encode_groups(self._bus, first) if method == "groups" else _encode_nodes(self._bus, first)
+                )
+                self._counts[method, first] = body
                 await asyncio.sleep(0)
-            await self._send(method, first, text, tuple(self.readers) if due else fresh)
+            await self._send(method, first, body, tuple(self.readers) if due else fresh)
 
     def _count_keys(self) -> Iterator[tuple[str, int]]:
         for method, number in (("groups", len(self._bus.groups)), ("nodes", len(self._bus.nodes))):
@@ -208,30 +224,30 @@ class Overview(Broadcast):
 
     # the line
 
-    def _frame(self) -> dict[str, Any]:
+    def _frame(self) -> FrameBody:
         now, statistics = self._bus.now(), ext.line_statistics(self._bus)
         condition = self._bus.condition
         settings = self._bus.endpoint.settings
-        return {
-            "set": self._set,
-            "title": self._title(),
-            "line": self._bus.endpoint.name,
-            "settings": f"{settings.baudrate} {settings.framing}" if settings else "",
-            "read_only": self._authorisation.read_only,
-            "now": now,
-            "elapsed": statistics.elapsed,
-            "state": state_text(self._bus),
-            "why": condition.reason,
-            "since": condition.since if condition.is_lost else None,
-            "utilisation": self._utilisation.note(now, statistics),
-            "backlog": statistics.backlog,
-            "losses": statistics.losses,
-            "groups": min(len(self._bus.groups), MOST_COUNTED),
-            "nodes": min(len(self._bus.nodes), MOST_COUNTED),
-            "points": sum(len(points) for _, points in self._groups) - self._left_out,
-            "left_out": self._left_out,
-            "events": list(self._journal.entries),
-        }
+        return FrameBody(
+            set=self._set,
+            title=self._title(),
+            line=self._bus.endpoint.name,
+            settings=f"{settings.baudrate} {settings.framing}" if settings else "",
+            read_only=self._authorisation.read_only,
+            now=now,
+            elapsed=statistics.elapsed,
+            state=state_text(self._bus),
+            why=condition.reason,
+            since=condition.since if condition.is_lost else None,
+            utilisation=self._utilisation.note(now, statistics),
+            backlog=statistics.backlog,
+            losses=statistics.losses,
+            groups=min(len(self._bus.groups), MOST_COUNTED),
+            nodes=min(len(self._bus.nodes), MOST_COUNTED),
+            points=sum(len(points) for _, points in self._groups) - self._left_out,
+            left_out=self._left_out,
+            events=list(self._journal.entries),
+        )
 
 
 def state_text(bus: Bus) -> str:
@@ -250,34 +266,37 @@ def _same(one: tuple[PollGroup, tuple[Point[Any], ...]], other: tuple[PollGroup,
     return one[0] is other[0] and len(one[1]) == len(other[1]) and all(map(is_, one[1], other[1]))
 
 
-def _encode_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
-    return {
-        "group": group.name,
-        "key": point.key,
-        "node": point.node.label,
-        "protocol": point.node.profile.name,
-        "kind": point.node.profile.kind_name,
-        "address": point.node.address,
-        "item": point.item,
-        "unit": point.unit,
-        "precision": point.meaning.precision,
-        "writable": point.writable,
-    }
+def _encode_point(group: PollGroup, point: Point[Any]) -> RowForm:
+    return RowForm(
+        group=group.name,
+        key=point.key,
+        node=point.node.label,
+        protocol=point.node.profile.name,
+        kind=point.node.profile.kind_name,
+        address=point.node.address,
+        item=point.item,
+        unit=point.unit,
+        precision=point.meaning.precision,
+        writable=point.writable,
+    )
 
 
 def _encode_value(
     bus: Bus, point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None
-) -> list[Any] | None:
-    """Return value, quality, time of the request, error, and alarm ("" for none).
+) -> ShownValue | None:
+    """Return the value of a point as it is at present, not at the time of the read.
 
-    All are present values, not those at the time of the read. None if the cycle did not read the point.
+    None if the cycle did not read the point.
     """
     if sample is None:
         return None
     sample = bus.as_of_now(point, sample)
-    asked = sample.finished if sample.started is None else sample.started
+    requested = sample.finished if sample.started is None else sample.started
     error = "" if sample.error is None else sample.error.what
-    return [shown(point, sample.value), sample.quality.value, asked, error, alarm.name if alarm else ""]
+    value = shown(point, sample.value)
+    if isinstance(value, float):
+        value = encode_number(value)
+    return ShownValue(value, sample.quality.value, requested, error, alarm.name if alarm else "")
 
 
 def shown(point: Point[Any], value: Any) -> Any:
@@ -285,55 +304,73 @@ def shown(point: Point[Any], value: Any) -> Any:
     return value if type(value) in (int, float) or value is None else value_text(value, point.meaning.precision)
 
 
-def encode_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any]:
+def encode_details(bus: Bus, group: PollGroup, point: Point[Any]) -> DetailsResult:
     """Return the details of one point of a group: its last exchange, its limits, and the meaning of its value."""
     sample = None if group.latest is None else group.latest.samples.get(point)
     if sample is not None:
         sample = bus.as_of_now(point, sample)
     meaning = point.meaning
     node = point.node if isinstance(point.node, Node) else None
-    return {
-        "command": str(point.command),
-        "sample": _encode_value(bus, point, sample),
-        "hint": "" if sample is None or sample.error is None else sample.error.hint or "",
-        "timeline": None if sample is None else sample.timeline._asdict(),
-        "due": None if sample is None else sample.due,
-        "low": meaning.low,
-        "high": meaning.high,
-        "labels": {str(number): label for number, label in meaning.labels.items()},
-        "limits": [
-            {name: getattr(limit, name) for name in ("name", "minimum", "maximum", "max_step", "writable")}
+    return DetailsResult(
+        command=str(point.command),
+        sample=_encode_value(bus, point, sample),
+        hint="" if sample is None or sample.error is None else sample.error.hint or "",
+        timeline=None if sample is None else TimelineForm(*sample.timeline),
+        due=None if sample is None else sample.due,
+        low=_encode_limit(meaning.low),
+        high=_encode_limit(meaning.high),
+        labels={str(number): label for number, label in meaning.labels.items()},
+        limits=[
+            LimitForm(
+                limit.name,
+                _encode_limit(limit.minimum),
+                _encode_limit(limit.maximum),
+                _encode_limit(limit.max_step),
+                limit.writable,
+            )
             for limit in (() if node is None else node.limits)
             if isinstance(point.command, Placed) and set(limit.places) & set(point.command.places)
         ],
-    }
+    )
 
 
-def _encode_groups(bus: Bus, first: int) -> list[dict[str, Any]]:
-    forms = []
+def _encode_limit(limit: float | None) -> Number | None:
+    return None if limit is None else encode_number(limit)
+
+
+def _encode_groups(bus: Bus, first: int) -> GroupsBody:
+    groups = []
     for group in islice(bus.groups, first, first + COUNTED_AT_ONCE):
         counts = group.statistics()
-        form = {"name": group.name, "period": group.period, "paused": group.paused}
-        form |= {name: getattr(counts, name) for name in ("cycles", "missed", "achieved")}
-        forms.append(form | {"jitter": counts.jitter.p99})
-    return forms
+        groups.append(
+            GroupCounts(
+                name=group.name,
+                period=group.period,
+                paused=group.paused,
+                cycles=counts.cycles,
+                missed=counts.missed,
+                achieved=counts.achieved,
+                jitter=counts.jitter.p99,
+            )
+        )
+    return GroupsBody(first, groups)
 
 
-def _encode_nodes(bus: Bus, first: int) -> list[dict[str, Any]]:
-    return [_encode_node(node) for node in islice(bus.nodes, first, first + COUNTED_AT_ONCE)]
+def _encode_nodes(bus: Bus, first: int) -> NodesBody:
+    return NodesBody(first, [_encode_node(node) for node in islice(bus.nodes, first, first + COUNTED_AT_ONCE)])
 
 
-def _encode_node(node: Node) -> dict[str, Any]:
+def _encode_node(node: Node) -> NodeCounts:
     counts = node.statistics()
-    return {
-        "label": node.label,
-        "protocol": node.profile.name,
-        "kind": node.profile.kind_name,
-        "address": node.address,
-        "health": health_text(node),
-        "requests": counts.attempts,
-        "failed": counts.fruitless,
-        "late": counts.late,
-        "p50": counts.latency.p50,
-        "p99": counts.latency.p99,
-    }
+    return NodeCounts(
+        label=node.label,
+        protocol=node.profile.name,
+        kind=node.profile.kind_name,
+        address=node.address,
+        health=health_text(node),
+        requests=counts.attempts,
+        failed=counts.fruitless,
+        late=counts.late,
+        p50=counts.latency.p50,
+        p99=counts.latency.p99,
+    )

@@ -8,9 +8,13 @@ from dataclasses import asdict
 from typing import Any
 
 from busmaster import Bus, LineSettings, Priority, ext
+from busmaster.app.service.client_messages import PlannedGroupForm, PlannedRead
 from busmaster.app.service.encoding import protocol_of
-from busmaster.app.service.messages import encode_timings, timings_of, value_of
-from busmaster.bounds import MOST_PLANNED_GROUPS, MOST_PLANNED_READS
+from busmaster.app.service.messages import encode_value, value_of
+from busmaster.app.service.owner_messages import PlanResult
+from busmaster.app.service.reply_times import encode_timings, timings_of
+from busmaster.app.service.typed import convert, to_builtins
+from busmaster.bounds import LONGEST_PERIOD, MOST_PLANNED_GROUPS, MOST_PLANNED_READS, SHORTEST_PERIOD
 from busmaster.errors import InvalidCommand
 from busmaster.ext import (
     Command,
@@ -23,15 +27,11 @@ from busmaster.ext import (
     PlannedNode,
     checked_priority,
     seconds,
-    whole_number,
 )
 
 PAUSE = 0.005
 """Seconds between two milliseconds of calculation: clients that request one plan after the other take a sixth of the
 owner's processor time at most."""
-
-SHORTEST, LONGEST = 0.001, 86_400.0
-"""Seconds of the period of a planned group: the timetable is played through cycle by cycle."""
 
 
 class Planner:
@@ -41,14 +41,14 @@ class Planner:
         self._bus = bus
         self._turn = asyncio.Lock()
 
-    async def plan(self, more: Sequence[PlannedGroup]) -> dict[str, Any]:
+    async def plan(self, more: Sequence[PlannedGroup]) -> PlanResult:
         """Return the plan as it is sent. Raises InvalidCommand for a line with too many groups."""
         async with self._turn:
             _check_groups(len(self._bus.groups) + len(more))
             return encode_plan(await ext.plan_with_pauses(self._bus, *more, pause=PAUSE))
 
 
-def encode_groups(groups: Sequence[PlannedGroup]) -> list[dict[str, Any]]:
+def encode_groups(groups: Sequence[PlannedGroup]) -> list[PlannedGroupForm]:
     """Return planned groups as they are sent. Raises InvalidCommand for those that cannot be."""
     if any(group.merge for group in groups):
         raise InvalidCommand("merges of planned groups cannot be sent to the program that owns the line")
@@ -57,66 +57,61 @@ def encode_groups(groups: Sequence[PlannedGroup]) -> list[dict[str, Any]]:
     for _, command in (read for group in groups for read in group.reads):
         _check_reads(command)
     return [
-        {
-            "name": group.name,
-            "period": _period(group.period),
-            "phase": group.phase,
-            "priority": group.priority,
-            "reads": [
-                {
-                    "protocol": node.profile.name,
-                    "address": node.address,
-                    "command": protocol_of(node.profile.name).write_down(command),
-                    "timings": encode_timings(node.timings),
-                    "reply_time": node.reply_time,
-                }
-                for node, command in group.reads
-            ],
-        }
+        PlannedGroupForm(
+            group.name,
+            _period(group.period),
+            [_encode_read(node, command) for node, command in group.reads],
+            group.phase,
+            checked_priority(group.priority),
+        )
         for group in groups
     ]
 
 
-def groups_of(decoded: Any, bus: Bus) -> list[PlannedGroup]:
-    """Return the planned groups that a client has sent: nodes of the line are as the line has measured them.
-
-    Raises InvalidCommand for what no planned group is.
-    """
-    if not isinstance(decoded, list) or not all(isinstance(group, dict) for group in decoded):
-        raise InvalidCommand("the groups of a plan are a list of objects")
-    _check_size(sum(len(group["reads"]) for group in decoded))
-    known = {(node.profile.name, node.address): node.planned() for node in bus.nodes}
-    return [
-        PlannedGroup(
-            str(group["name"])[:80],
-            _period(group["period"]),
-            [_read(read, known) for read in group["reads"]],
-            None if group.get("phase") is None else seconds(group["phase"], "a phase"),
-            checked_priority(group.get("priority", Priority.POLL)),
+def _period(period: float) -> float:
+    if not SHORTEST_PERIOD <= (period := seconds(period, "a period")) <= LONGEST_PERIOD:
+        raise InvalidCommand(
+            f"the period of a planned group is {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s, not {period:g}"
         )
-        for group in decoded
-    ]
-
-
-def _period(decoded: Any) -> float:
-    if not SHORTEST <= (period := seconds(decoded, "a period")) <= LONGEST:
-        raise InvalidCommand(f"the period of a planned group is {SHORTEST:g} to {LONGEST:g} s, not {period:g}")
     return period
 
 
-def _read(decoded: Mapping[str, Any], known: Mapping[tuple[str, int], PlannedNode]) -> tuple[PlannedNode, Any]:
-    protocol = protocol_of(decoded["protocol"])
-    address = whole_number(decoded["address"], 0, 2**31, "an address")
-    command = protocol.read_back(decoded["command"])
+def _encode_read(node: PlannedNode, command: Command[Any]) -> PlannedRead:
+    return PlannedRead(
+        node.profile.name,
+        node.address,
+        protocol_of(node.profile.name).write_down(command),
+        encode_timings(node.timings),
+        node.reply_time,
+    )
+
+
+def groups_of(forms: Sequence[PlannedGroupForm], bus: Bus) -> list[PlannedGroup]:
+    """Return the planned groups that a client has sent: nodes of the line are as the line has measured them.
+
+    Raises InvalidCommand for groups that cannot be planned.
+    """
+    _check_size(sum(len(group.reads) for group in forms))
+    known = {(node.profile.name, node.address): node.planned() for node in bus.nodes}
+    return [
+        PlannedGroup(
+            group.name[:80], group.period, [_read(read, known) for read in group.reads], group.phase, group.priority
+        )
+        for group in forms
+    ]
+
+
+def _read(form: PlannedRead, known: Mapping[tuple[str, int], PlannedNode]) -> tuple[PlannedNode, Any]:
+    protocol = protocol_of(form.protocol)
+    command = protocol.read_back(form.command)
     _check_reads(command)
-    if (node := known.get((protocol.name, address))) is not None:
+    if (node := known.get((protocol.name, form.address))) is not None:
         return node, command
-    protocol.profile.check_address(address)
-    times, reply_time = timings_of(decoded.get("timings")), decoded.get("reply_time")
+    protocol.profile.check_address(form.address)
+    times = timings_of(form.timings)
     if isinstance(times, Learned):
         times = times.document
-    reply_time = None if reply_time is None else seconds(reply_time, "a reply time")
-    return PlannedNode(protocol.profile.with_default_merge(), address, times, reply_time), command
+    return PlannedNode(protocol.profile.with_default_merge(), form.address, times, form.reply_time), command
 
 
 def _check_reads(command: Command[Any]) -> None:
@@ -136,14 +131,15 @@ def _check_size(reads: int) -> None:
         raise InvalidCommand(f"a client has {MOST_PLANNED_READS} reads planned at once, and not {reads}")
 
 
-def encode_plan(plan: Plan) -> dict[str, Any]:
+def encode_plan(plan: Plan) -> PlanResult:
     """Return a plan as it is sent."""
-    return {**asdict(plan), "worst_waits": [plan.worst_waits[priority] for priority in Priority]}
+    parts = {**asdict(plan), "worst_waits": [plan.worst_waits[priority] for priority in Priority]}
+    return convert(encode_value(parts), PlanResult, from_attributes=True)
 
 
-def plan_of(decoded: Mapping[str, Any]) -> Plan:
+def plan_of(form: PlanResult) -> Plan:
     """Return the plan that was sent."""
-    plan = value_of(decoded)
+    plan = value_of(to_builtins(form))
     groups = tuple(
         GroupPlan(**{**group, "merged": tuple(MergedReads(**merged) for merged in group["merged"])})
         for group in plan["groups"]

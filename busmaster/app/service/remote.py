@@ -5,13 +5,24 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from functools import partial
 from math import inf
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from busmaster import Point, Priority, Sample, Timings
+from busmaster.app.service.client_messages import (
+    GatherParams,
+    NodeParams,
+    NoParams,
+    PlanParams,
+    PollParams,
+    RefusalsParams,
+    SafeParams,
+    StreamParams,
+    SubscribeParams,
+)
 from busmaster.app.service.encoding import (
     encode_points,
     encode_sync_reads,
@@ -20,14 +31,25 @@ from busmaster.app.service.encoding import (
     statistics_of,
 )
 from busmaster.app.service.link import TCP, Link
-from busmaster.app.service.messages import encode_timings, words
+from busmaster.app.service.messages import encode
+from busmaster.app.service.owner_messages import (
+    AccessParams,
+    PollGroupsParams,
+    PollResult,
+    StopsParams,
+    StreamMessage,
+    SubscribeResult,
+    TouchedParams,
+)
 from busmaster.app.service.plans import encode_groups, plan_of
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.app.service.remote_node import RemoteNode
 from busmaster.app.service.remote_overview import RemoteOverview
+from busmaster.app.service.reply_times import encode_timings
 from busmaster.app.service.safe import outcomes_of
 from busmaster.app.service.sequences import RequestLimit
+from busmaster.app.service.typed import Struct, replace, to_builtins
 from busmaster.bounds import LONGEST_REQUEST, MOST_CHECKED
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.events import BusEvent, Stream
@@ -36,6 +58,8 @@ from busmaster.registry import protocols
 from busmaster.statistics import LineStatistics
 
 T = TypeVar("T")
+RequestGroup: TypeAlias = Callable[[RemoteGroup, int], Awaitable[None]]
+"""Requests the cycles of a group as a stream of this number."""
 EVENT_BUFFER = 256
 POINTS_IN_A_MESSAGE = 50
 CLOCK_IS_RECEIVED = 3
@@ -102,7 +126,7 @@ class RemoteBus:
         self._touched: dict[tuple[str, int], float] = {}
         """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
-        self._hears_events = False
+        self._follows_events = False
         self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
         """Writes to check before the first of them is sent."""
 
@@ -111,13 +135,13 @@ class RemoteBus:
             raise InvalidCommand(f"the bus of {self.address} was already entered; enter it once, and share it")
         link = Link(self.address, self._token, self._receive, self._lost, safe_only=self._safe_only)
         self._link = link
-        decoded = await link.open(sys.argv[0])
-        self.about, self.line = decoded, decoded["line"]
-        self._listed = {group["name"]: group["period"] for group in decoded["groups"]}
-        for known in decoded["nodes"]:
-            node = self._nodes.get((known["protocol"], known["address"]))
+        about = await link.open(sys.argv[0])
+        self.about, self.line = to_builtins(about), about.line
+        self._listed = {group.name: group.period for group in about.groups}
+        for known in about.nodes:
+            node = self._nodes.get((known.protocol, known.address))
             if node is not None:
-                node.label = known["label"]
+                node.label = known.label
         for node in self._named:
             self._name(node)
         try:
@@ -126,7 +150,7 @@ class RemoteBus:
                 self._ahead = max([await self._receive_clock() for _ in range(CLOCK_IS_RECEIVED)])
             for node, commands, stop in self._prepared:
                 for first in range(0, len(commands), MOST_CHECKED):
-                    await self._ask("check", node.encode_sync_read(commands[first : first + MOST_CHECKED], stop))
+                    await self._ask("check", node.check_params(commands[first : first + MOST_CHECKED], stop))
         except BaseException:
             await link.close()
             raise
@@ -177,8 +201,8 @@ class RemoteBus:
         """
         profile.check_address(address)
         node = self._find(profile, address)
-        decoded = self._named.setdefault(node, (timings, retries))
-        if timings not in (None, decoded[0]) or retries not in (None, decoded[1]):
+        named = self._named.setdefault(node, (timings, retries))
+        if timings not in (None, named[0]) or retries not in (None, named[1]):
             raise InvalidCommand(
                 f"{node.label} is already in use with other timings or retries; "
                 "give all handles of an address the same options, or set them only in the first"
@@ -214,17 +238,13 @@ class RemoteBus:
             return
         self._reported.add(node)
         timings, retries = self._named[node]
-        params: dict[str, Any] = {"protocol": node.profile.name, "address": node.address}
-        if timings is not None:
-            params["timings"] = encode_timings(timings)
-        if retries is not None:
-            params["retries"] = retries
-        params |= encode_sync_reads(node.profile)
+        probe, sync_reads = encode_sync_reads(node.profile)
+        params = NodeParams(node.profile.name, node.address, encode_timings(timings), retries, probe, sync_reads)
         asked = self.link.ask("node", params, node=node)
 
         def named(future: asyncio.Future[Any]) -> None:
             if not future.cancelled() and future.exception() is None:
-                node.label = future.result()["label"]
+                node.label = future.result().label
 
         asked.future.add_done_callback(named)
 
@@ -232,7 +252,7 @@ class RemoteBus:
 
     async def statistics(self) -> LineStatistics:
         """Return an immutable snapshot of the line's counts, as `Bus.statistics`."""
-        return statistics_of(await self._ask("statistics", {}))
+        return statistics_of(await self._ask("statistics", NoParams()))
 
     async def plan(self, *more: PlannedGroup) -> Plan:
         """Have the line's owner calculate what becomes of the groups that run, and of `more`, as `Bus.plan` does.
@@ -240,11 +260,11 @@ class RemoteBus:
         Nodes that the owner has are as it has measured them. Raises InvalidCommand for groups that have more than 200
         reads in all, or merges.
         """
-        question = words("plan", {"groups": encode_groups(more)})
-        if len(question) > LONGEST_REQUEST // 2:
+        params = PlanParams(encode_groups(more))
+        if len(encode(params)) > LONGEST_REQUEST // 2:
             raise InvalidCommand("these groups are too long for one message; plan fewer of them at once")
         async with self._planning:  # the owner calculates one at a time for each program
-            return plan_of(await self.link.answer(self.link.put(question, False)))
+            return plan_of(await self.link.answer(self.link.ask("plan", params)))
 
     @property
     def groups(self) -> tuple[RemoteGroup, ...]:
@@ -257,7 +277,7 @@ class RemoteBus:
         listed = {name: period for name, period in self._listed.items() if name not in self._own_names}
         for name, period in listed.items():
             if (known := self._owners.get(name)) is None or known.over:
-                self._owners[name] = self._new_group(name, (), period, "subscribe", {"group": name})
+                self._owners[name] = self._new_group(name, (), period, partial(self._subscribe, name))
         return (*(self._owners[name] for name in listed), *own)
 
     def group(self, name: str) -> RemoteGroup:
@@ -299,8 +319,8 @@ class RemoteBus:
                 raise InvalidCommand(
                     f"poll group {name!r}: no node replies to a read of {point.key}, which is the address of all nodes"
                 )
-        params = {"name": name, "period": period, "phase": phase, "priority": priority}
-        self._own[name] = group = self._new_group(name, read, period, "poll", params)
+        begin = partial(self._poll, read, PollParams(name, period, 0, phase=phase, priority=priority))
+        self._own[name] = group = self._new_group(name, read, period, begin)
         group.begin()
         return group
 
@@ -322,118 +342,115 @@ class RemoteBus:
         `values`: the safe state that the caller expects, by the names of the file's points. Raises InvalidCommand, and
         nothing is sent, if it is another one, or this program may not write all of it.
         """
-        return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
+        return outcomes_of(await self._ask("safe", SafeParams(dict(values)), writes=True))
 
     def report_refusals(self, interface: str, kind: str, peers: Mapping[str, int]) -> None:
         """Report to the owner how often the interface that this program serves has refused each peer.
 
         `kind` is "logins", "connections" or "requests". Without peers, the owner begins to count the kind at 0.
         """
-        self.link.notify("refusals", {"interface": interface, "kind": kind, "peers": dict(peers)})
+        self.link.notify("refusals", RefusalsParams(interface, kind, dict(peers)))
 
     def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens to line and nodes from now on; a node in it is this program's."""
         stream: Stream[BusEvent] = Stream(self._events, EVENT_BUFFER)
-        if not self._hears_events:
-            self._hears_events = True
-            self.link.ask("events", {"stream": 0})
+        if not self._follows_events:
+            self._follows_events = True
+            self.link.ask("events", StreamParams(0))
         return stream
 
     async def overview(self, receive: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
         """Call `receive` with the overview of the line, a few times a second, as described in docs/service.md."""
         self._count += 1
         overview = self._streams[self._count] = RemoteOverview(self.link, self.now, receive)
-        await self._ask("overview", {"stream": self._count})
+        await self._ask("overview", StreamParams(self._count))
         return overview
 
     async def exchanges(self, receive: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
         """Call `receive` with the exchanges on the line, as described in docs/service.md."""
         self._count += 1
         exchanges = self._streams[self._count] = RemoteExchanges(receive, partial(self.end_stream, self._count))
-        await self._ask("exchanges", {"stream": self._count})
+        await self._ask("exchanges", StreamParams(self._count))
         return exchanges
 
     def end_stream(self, number: int) -> None:
         """End a stream."""
         stream = self._streams.pop(number, None)
         if stream is not None:
-            self.link.notify("end", {"stream": number})
+            self.link.notify("end", StreamParams(number))
             stream.end()
 
     # inside
 
     async def _receive_clock(self) -> float:
         """Return the offset of the owner's clock, less the time of the message: never more than the real offset."""
-        now: float = await self._ask("now", {})
+        now: float = await self._ask("now", NoParams())
         return now - time.monotonic()
 
-    async def _ask(self, method: str, params: Mapping[str, Any], *, writes: bool = False) -> Any:
+    async def _ask(self, method: str, params: Struct, *, writes: bool = False) -> Any:
         asked = self.link.ask(method, params, writes=writes)
         return await self.link.answer(asked)
 
     def _new_group(
-        self, name: str, points: tuple[Point[Any], ...], period: float, method: str, params: Mapping[str, Any]
+        self, name: str, points: tuple[Point[Any], ...], period: float, request: RequestGroup
     ) -> RemoteGroup:
-        """Return a poll group that requests its cycles by this method once it begins."""
+        """Return a poll group that requests its cycles once it begins."""
 
         def begin(group: RemoteGroup) -> tuple[int, asyncio.Task[None]]:
             self._count += 1
             self._streams[self._count] = group
-            opening = asyncio.ensure_future(self._open(group, points, self._count, method, params))
+            opening = asyncio.ensure_future(self._open(group, self._count, request))
             self._tasks.add(opening)
             opening.add_done_callback(self._tasks.discard)
             return self._count, opening
 
         return RemoteGroup(name, points, period=period, find=self.find, begin=begin, end=self.end_stream)
 
-    async def _open(
-        self,
-        group: RemoteGroup,
-        points: tuple[Point[Any], ...],
-        number: int,
-        method: str,
-        params: Mapping[str, Any],
-    ) -> None:
+    async def _open(self, group: RemoteGroup, stream: int, request: RequestGroup) -> None:
         """Have the owner send the cycles of a group. An error ends the group, whose consumers raise it."""
-        decoded = encode_points(points)
         try:
-            while len(decoded) > POINTS_IN_A_MESSAGE:
-                await self._ask("gather", {"stream": number, "points": decoded[:POINTS_IN_A_MESSAGE]})
-                del decoded[:POINTS_IN_A_MESSAGE]
-            if decoded:
-                params = {**params, "points": decoded}
-            answer = await self._ask(method, {**params, "stream": number})
+            await request(group, stream)
         except (BusError, InvalidCommand) as error:
             group.end(error)
-            self.end_stream(number)
-        else:
-            group.period = answer["period"]
-            if method == "poll":
-                group.owners_name = answer["name"]
-                self._own_names.add(group.owners_name)
+            self.end_stream(stream)
 
-    def _receive(self, method: str, params: Mapping[str, Any]) -> None:
-        if method == "stops":
-            node = self._nodes.get((params["protocol"], params["address"]))
-            if node is not None:
-                node.stops = params["stops"]
-        elif method == "poll_groups":
-            self._listed = {decoded["name"]: decoded["period"] for decoded in params["groups"]}
-        elif method == "access":
-            self.about = {**self.about, **params}
-            for notify in self.on_access:
-                notify()
-        elif method == "touched":
-            self._touched[params["protocol"], params["address"]] = params["when"]
-            for take in self.on_touched:
-                take(params)
-        elif method == "event":
-            event = event_of(params["body"], self.find)
-            for stream in self._events:
-                if event is not None:
+    async def _subscribe(self, name: str, group: RemoteGroup, stream: int) -> None:
+        result: SubscribeResult = await self._ask("subscribe", SubscribeParams(name, stream))
+        group.period = result.period
+
+    async def _poll(self, points: tuple[Point[Any], ...], params: PollParams, group: RemoteGroup, stream: int) -> None:
+        forms = encode_points(points)
+        while len(forms) > POINTS_IN_A_MESSAGE:
+            await self._ask("gather", GatherParams(stream, forms[:POINTS_IN_A_MESSAGE]))
+            del forms[:POINTS_IN_A_MESSAGE]
+        result: PollResult = await self._ask("poll", replace(params, stream=stream, points=forms))
+        group.period, group.owners_name = result.period, result.name
+        self._own_names.add(group.owners_name)
+
+    def _receive(self, method: str, params: Any) -> None:
+        """Handle a notification of the owner."""
+        match params:
+            case StopsParams():
+                node = self._nodes.get((params.protocol, params.address))
+                if node is not None:
+                    node.stops = params.stops
+            case PollGroupsParams():
+                self._listed = {group.name: group.period for group in params.groups}
+            case AccessParams():
+                self.about = {**self.about, "read_only": params.read_only}
+                for notify in self.on_access:
+                    notify()
+            case TouchedParams():
+                self._touched[params.protocol, params.address] = params.when
+                for take in self.on_touched:
+                    take(to_builtins(params))
+            case StreamMessage() if method == "event":
+                event = event_of(params.body, self.find)
+                for stream in self._events:
                     stream.put(event)
-        elif (listener := self._streams.get(params.get("stream", -1))) is not None:
-            listener.receive(method, params)
+            case StreamMessage():
+                if (listener := self._streams.get(params.stream)) is not None:
+                    listener.receive(method, params)
 
     def _lost(self) -> None:
         for listener in list(self._streams.values()):

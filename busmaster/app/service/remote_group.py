@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from busmaster import Point, Snapshot
 from busmaster.app.service.encoding import FindNode, owners_point_of, snapshot_of
+from busmaster.app.service.owner_messages import NoBody, PointsBody, SnapshotBody, StreamMessage
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import Stream
 from busmaster.ext import Cycles
@@ -97,21 +98,21 @@ class RemoteGroup(Cycles):
             self._end_stream(self._stream)
         self.end()
 
-    def receive(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner sends of it."""
-        body = params["body"]
+    def receive(self, method: str, message: StreamMessage[Any]) -> None:
+        """Handle a message of the line's owner about the group."""
         for consumer in self._consumers:
-            consumer.dropped += params["dropped"] - self.dropped
-        self.dropped = params["dropped"]
-        if method == "points":
-            self._set = body["set"]
-            # By its own points, a program gets the values that they decode.
-            if not self._own:
-                self._points = tuple(owners_point_of(decoded, self._find) for decoded in body["points"])
-        elif method == "snapshot" and body["set"] == self._set:
-            self._publish(snapshot_of(body, self.name, self._points))
-        elif method == "ended":
-            self.close()
+            consumer.dropped += message.dropped - self.dropped
+        self.dropped = message.dropped
+        match message.body:
+            case PointsBody() as body:
+                self._set = body.set
+                # By its own points, a program gets the values that they decode.
+                if not self._own:
+                    self._points = tuple(owners_point_of(form, self._find) for form in body.points)
+            case SnapshotBody() as body if body.set == self._set:
+                self._publish(snapshot_of(body, self.name, self._points))
+            case NoBody():
+                self.close()
 
     def end(self, cause: BusError | InvalidCommand | None = None) -> None:
         """End its consumers after the snapshots that they hold, with an error if that is the cause."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster import Point, Sample
+from busmaster.app.service.client_messages import CheckParams, RequestParams, StopParams
 from busmaster.app.service.encoding import protocol_of
+from busmaster.app.service.fields import OptionsForm
 from busmaster.app.service.link import Link
-from busmaster.app.service.messages import value_of, words
-from busmaster.app.service.reads import words_of
+from busmaster.app.service.messages import value_of
 from busmaster.app.service.sequences import HoldsLine, RequestLimit, held_remotely, shortened
 from busmaster.errors import InvalidCommand
 from busmaster.ext import (
@@ -25,11 +26,10 @@ from busmaster.ext import (
     Requester,
     RequestOptions,
     checked_hold,
+    checked_priority,
 )
 
 T = TypeVar("T")
-LEFT_OUT = ("verify", "safe")
-"""Options without use on another's line. If they are given, they are false."""
 
 
 class RemoteLine(HoldsLine, Protocol):
@@ -88,7 +88,7 @@ class RemoteNode:
     def note_stop(self) -> None:
         """Inform the line that this node is being stopped, before all later requests."""
         self.stops += 1
-        self._bus.link.notify("stop", {"protocol": self.profile.name, "address": self.address})
+        self._bus.link.notify("stop", StopParams(self.profile.name, self.address))
 
     def now(self) -> float:
         """Return the time of the line's clock, in seconds: that of its owner's machine."""
@@ -155,13 +155,9 @@ class RemoteNode:
         waits = sequence is None and chosen.priority is not URGENT
         waited = await room.wait(chosen, self, command) if waits and not room.take() else 0.0
         try:
-            left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
-            more = left or stop or touches is not None or stops_seen is not None or sequence is not None
-            if more or getattr(command, "writes", True):
-                question = self._words(command, left, touches, stops_seen, stop, sequence)
-            else:
-                question = words_of(self._profile.name, self._address, command)  # type: ignore[arg-type]  # is hashable
-            asked = link.put(question, command.writes, self, command)
+            left = shortened(options, waited) if waited else options
+            params = self._params(command, left, touches, stops_seen, stop, sequence)
+            asked = link.ask("request", params, writes=command.writes, node=self, command=command)
             value: T = value_of(await link.answer(asked, left.get("finish_within")))
             return value
         finally:
@@ -175,36 +171,41 @@ class RemoteNode:
         """
         return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
 
-    def _words(
+    def _params(
         self,
         command: Command[Any],
-        options: Mapping[str, Any],
+        options: CommandOptions,
         touches: Command[Any] | None,
         stops_seen: int | None,
         stop: bool,
         sequence: int | None,
-    ) -> str:
-        """Return the text of a request that is not a plain read."""
-        params: dict[str, Any] = {
-            "protocol": self._profile.name,
-            "address": self._address,
-            "command": self._protocol.write_down(command),
-            "requested": self._bus.now(),
-        }
-        if touches is not None:
-            params["touches"] = self._protocol.write_down(touches)
-        if stops_seen is not None:
-            params["stops_seen"] = stops_seen
-        if stop:
-            params["stop"] = True
-        if sequence is not None:
-            params["sequence"] = sequence
-        if options:
-            given = {name: value for name, value in options.items() if value is not None}
-            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
-        return words("request", params)
+    ) -> RequestParams:
+        is_limited = command.writes or bool(options)
+        return RequestParams(
+            self._profile.name,
+            self._address,
+            self._protocol.write_down(command),
+            touches=None if touches is None else self._protocol.write_down(touches),
+            options=_encode_options(options) if options else None,
+            stops_seen=stops_seen,
+            stop=stop,
+            requested=self._bus.now() if is_limited else None,
+            sequence=sequence,
+        )
 
-    def encode_sync_read(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
-        """Return writes of this node in the form of the message with which the line checks them."""
-        decoded = [self._protocol.write_down(command) for command in commands]
-        return {"protocol": self.profile.name, "address": self.address, "commands": decoded, "stop": stop}
+    def check_params(self, commands: Iterable[Command[Any]], stop: bool) -> CheckParams:
+        """Return the message with which the line checks these writes of the node."""
+        forms = [self._protocol.write_down(command) for command in commands]
+        return CheckParams(self.profile.name, self.address, forms, stop)
+
+
+def _encode_options(options: CommandOptions) -> OptionsForm:
+    """Return the options of a request. `safe` is false, and `verify` is a handle's affair."""
+    priority = options.get("priority")
+    return OptionsForm(
+        None if priority is None else checked_priority(priority),
+        options.get("start_within"),
+        options.get("finish_within"),
+        options.get("retries"),
+        options.get("idempotent"),
+    )

@@ -6,7 +6,18 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from busmaster.app.service.client_messages import (
+    DemandParams,
+    DetailsParams,
+    PauseParams,
+    SuspendParams,
+    WriteParams,
+)
+from busmaster.app.service.fields import OptionsForm
 from busmaster.app.service.link import Link
+from busmaster.app.service.messages import encode_value
+from busmaster.app.service.owner_messages import StreamMessage
+from busmaster.app.service.typed import Struct, to_builtins
 from busmaster.errors import BusError
 
 SOON = 1.0
@@ -22,12 +33,12 @@ class RemoteOverview:
         self._receive = receive
         self._ended = asyncio.Event()
 
-    def receive(self, method: str, params: Mapping[str, Any]) -> None:
+    def receive(self, method: str, message: StreamMessage[Any]) -> None:
         """Handle a message of the line's owner."""
         if method == "ended":
             self.end()
         else:
-            self._receive(method, params["body"])
+            self._receive(method, to_builtins(message.body))
 
     def end(self) -> None:
         """Wake the functions that wait for the end."""
@@ -41,32 +52,26 @@ class RemoteOverview:
 
     async def pause(self, group: str, paused: bool) -> None:
         """Have a poll group rest, or go on, for all who use the line. Raises InvalidCommand for one that is gone."""
-        await self._ask("pause", {"group": group, "paused": paused})
+        await self._ask("pause", PauseParams(group, paused))
 
     async def demand(self, group: str) -> None:
         """Have a poll group read now. Raises InvalidCommand for one that is gone."""
-        await self._ask("demand", {"group": group})
+        await self._ask("demand", DemandParams(group))
 
     async def suspend(self, protocol: str, address: int, for_: float) -> None:
         """Let a node rest for so many seconds, 0 for no longer, for all who use the line."""
-        await self._ask("suspend", {"protocol": protocol, "address": address, "for": for_})
+        await self._ask("suspend", SuspendParams(protocol, address, for_))
 
     async def details(self, group: str, key: str) -> Mapping[str, Any]:
         """Return what there is to know of one point of a group. Raises InvalidCommand for one that is gone."""
-        decoded: Mapping[str, Any] = await self._ask("details", {"group": group, "key": key})
-        return decoded
+        details: Mapping[str, Any] = to_builtins(await self._ask("details", DetailsParams(group, key)))
+        return details
 
     async def write(self, group: str, key: str, value: Any) -> None:
         """Write a point of a group. Raises BusError or InvalidCommand as `Point.write`; the owner's limits hold."""
-        params = {
-            "group": group,
-            "key": key,
-            "value": value,
-            "requested": self._now(),
-            "options": {"start_within": SOON},
-        }
+        params = WriteParams(group, key, encode_value(value), OptionsForm(start_within=SOON), self._now())
         asked = self._link.ask("write", params, writes=True)
         await self._link.answer(asked)
 
-    async def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
+    async def _ask(self, method: str, params: Struct) -> Any:
         return await self._link.answer(self._link.ask(method, params))

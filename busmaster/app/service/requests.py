@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from busmaster import Priority
+from busmaster.app.service.client_messages import RequestParams, SafeParams, WriteParams
 from busmaster.app.service.client_requests import BY_OWNER, ClientRequest, RequestSender, Writing, client_request_of
 from busmaster.app.service.failures import REFUSED, refusal_of
 from busmaster.app.service.line import ServedLine
-from busmaster.app.service.messages import Malformed
-from busmaster.app.service.reads import PlainRead
+from busmaster.app.service.messages import Malformed, encode_value
+from busmaster.app.service.safe import SafeResult
 from busmaster.bounds import MOST_REQUESTS, MOST_URGENT
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
 
@@ -51,35 +52,35 @@ class Requests:
         """Return whether the safe state is being sent for this program."""
         return None in self._under_way.values()
 
-    def begin(self, number: int, decoded: Mapping[str, Any] | PlainRead) -> None:
+    def begin(self, number: int, params: RequestParams | WriteParams) -> None:
         """Start a command. Raises Malformed if the number belongs to a request without a reply."""
         under_way = self._under_way
         if number in under_way:  # as check_number does: this is done for every request
             self.check_number(number)
         try:
             if len(under_way) >= MOST_REQUESTS:
-                self._check_room(decoded)
-            under_way[number] = request = client_request_of(decoded, self._sender, self._line)
+                self._check_room(urgent=_is_urgent(params))
+            under_way[number] = request = client_request_of(params, self._sender, self._line)
             request.begin(partial(self._ended, number))
         except REFUSED as error:
             under_way.pop(number, None)
             self._refuse(number, refusal_of("request", error))
 
-    def begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
+    def begin_safe(self, number: int, params: SafeParams) -> None:
         """Start to send the safe state. Raises Malformed if the number belongs to a request without a reply."""
         self.check_number(number)
         try:
-            self._check_room({})
-            sending = self._line.safe_writes.begin(params["writes"], self._sender.peer)
+            self._check_room(urgent=False)
+            sending = self._line.safe_writes.begin(params.writes, self._sender.peer)
         except REFUSED as error:
             self._refuse(number, refusal_of("safe", error))
         else:
             self._under_way[number] = None
             sending.add_done_callback(partial(self._safe_sent, number))
 
-    def cancel(self, number: object) -> None:
+    def cancel(self, number: int) -> None:
         """Cancel a command; it gets no reply. An unknown number is ignored."""
-        request = self._under_way.get(number)  # type: ignore[call-overload]  # a program can send anything
+        request = self._under_way.get(number)
         if request is not None:
             request.cancel()
 
@@ -101,9 +102,9 @@ class Requests:
 
     # inside
 
-    def _check_room(self, decoded: Mapping[str, Any] | PlainRead) -> None:
+    def _check_room(self, *, urgent: bool) -> None:
         waiting = len(self._under_way)
-        if waiting >= MOST_REQUESTS and not (_is_urgent(decoded) and waiting < MOST_REQUESTS + MOST_URGENT):
+        if waiting >= MOST_REQUESTS + (MOST_URGENT if urgent else 0):
             raise BacklogFull(f"{waiting} requests of this program have no reply yet")
 
     def _ended(self, number: int, request: ClientRequest, value: Any, error: BaseException | None) -> None:
@@ -113,7 +114,7 @@ class Requests:
         try:
             if error is not None:
                 raise error
-            self._answer(number, value)
+            self._answer(number, encode_value(value))
         except (BusError, InvalidCommand) as refusal:
             self._refuse(number, refusal)
         except Exception as bug:  # an error of a protocol: the client gets it, and the line continues
@@ -121,7 +122,7 @@ class Requests:
             what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
             self._refuse(number, _unreported(request, BusError, what))
 
-    def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
+    def _safe_sent(self, number: int, sending: asyncio.Task[SafeResult]) -> None:
         del self._under_way[number]
         error = WriteUnconfirmed("the program that owns the line ends") if sending.cancelled() else sending.exception()
         if error is None:
@@ -137,5 +138,5 @@ def _unreported(request: ClientRequest, kind: type[BusError], what: str) -> BusE
     return kind(what, node=request.node, command=str(request.command))
 
 
-def _is_urgent(decoded: Mapping[str, Any] | PlainRead) -> bool:
-    return isinstance(decoded, Mapping) and bool(decoded.get("options", {}).get("priority") == Priority.URGENT)
+def _is_urgent(params: RequestParams | WriteParams) -> bool:
+    return params.options is not None and params.options.priority is Priority.URGENT

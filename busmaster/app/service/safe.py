@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
-from typing import Any
+from typing import TypeAlias
 
 from busmaster.app.service.authorisation import Authorisation, SafeWrites
 from busmaster.app.service.failures import bus_error_of, error_data
+from busmaster.app.service.fields import BusErrorData
 from busmaster.app.service.peers import Peer
 from busmaster.errors import BusError, InvalidCommand
+
+SafeResult: TypeAlias = dict[str, BusErrorData | None]
+"""For each point why it is not confirmed, None if it is."""
 
 
 class SafeStateRequests:
@@ -17,14 +21,14 @@ class SafeStateRequests:
 
     def __init__(self, authorisation: Authorisation) -> None:
         self._authorisation = authorisation
-        self._sending: asyncio.Task[dict[str, Any]] | None = None
+        self._sending: asyncio.Task[SafeResult] | None = None
 
     @property
     def under_way(self) -> bool:
         """Whether it is being sent."""
         return self._sending is not None and not self._sending.done()
 
-    def begin(self, wanted: Mapping[str, Any], peer: Peer) -> asyncio.Task[dict[str, Any]]:
+    def begin(self, wanted: Mapping[str, float], peer: Peer) -> asyncio.Task[SafeResult]:
         """Send the safe state, if it is the expected one; the task returns the result of each point.
 
         A request while it is being sent joins that transmission. Raises InvalidCommand if the program may not do this,
@@ -55,15 +59,15 @@ class SafeStateRequests:
             self._sending.cancel()
             await asyncio.wait([self._sending])
 
-    async def _send(self, state: SafeWrites, by: str) -> dict[str, Any]:
+    async def _send(self, state: SafeWrites, by: str) -> SafeResult:
         outcomes = await state.enter(self._authorisation, by, leaving=False)
         return {name: None if error is None else error_data(error) for name, error in outcomes.items()}
 
 
-def outcomes_of(decoded: Mapping[str, Any]) -> dict[str, BusError | None]:
+def outcomes_of(decoded: SafeResult) -> dict[str, BusError | None]:
     """Return the result of each point in a message."""
     return {name: None if error is None else bus_error_of(error) for name, error in decoded.items()}
 
 
-def _text(values: Mapping[str, Any]) -> str:
+def _text(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name} = {value}" for name, value in values.items()) or "nothing"

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar, Unpack
 
+from busmaster.app.service.client_messages import HoldParams, SequenceParams
 from busmaster.app.service.link import Link
 from busmaster.bounds import MOST_UNDER_WAY
 from busmaster.errors import NotStarted
@@ -66,10 +67,14 @@ class RequestLimit:
             raise
 
 
-def shortened(options: RequestOptions, by: float) -> dict[str, float]:
-    """Return the times of a request that has waited, reduced by that."""
-    times = {"start_within": options.start_within, "finish_within": options.finish_within}
-    return {name: max(0.0, limit - by) for name, limit in times.items() if limit is not None}
+def shortened(options: CommandOptions, by: float) -> CommandOptions:
+    """Return the options of a request that has waited, its times reduced by that."""
+    left = options.copy()
+    if (start_within := left.get("start_within")) is not None:
+        left["start_within"] = max(0.0, start_within - by)
+    if (finish_within := left.get("finish_within")) is not None:
+        left["finish_within"] = max(0.0, finish_within - by)
+    return left
 
 
 class AsksInSequence(Requester, Protocol):
@@ -104,12 +109,11 @@ class HoldsLine(Protocol):
 async def held_remotely(node: AsksInSequence, bus: HoldsLine, longest: float) -> AsyncIterator[Requester]:
     """Have the owner of a line hold it for one sequence, `longest` seconds at most, and yield the node for it."""
     sequence, link = bus.new_sequence(), bus.link
-    named = {"sequence": sequence, "protocol": node.profile.name, "address": node.address}
-    link.notify("hold", {**named, "max_hold": longest})
+    link.notify("hold", HoldParams(sequence, node.profile.name, node.address, longest))
     try:
         yield _HeldRemoteNode(node, sequence)
     finally:
-        link.notify("release", {"sequence": sequence})
+        link.notify("release", SequenceParams(sequence))
 
 
 class _HeldRemoteNode(HeldNode):

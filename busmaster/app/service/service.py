@@ -7,7 +7,7 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
@@ -21,13 +21,23 @@ from busmaster.app.service.admission import Admission, ConnectionRate, connectin
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_connection import ClientConnection, MessageOrder
+from busmaster.app.service.client_messages import ClientMessage, HelloParams
 from busmaster.app.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.app.service.encoding import listed_groups
 from busmaster.app.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
 from busmaster.app.service.line import ServedLine
-from busmaster.app.service.messages import INVALID_PARAMS, VERSIONS, Malformed, written
+from busmaster.app.service.messages import (
+    INVALID_PARAMS,
+    VERSIONS,
+    InvalidParams,
+    Malformed,
+    decode_request_params,
+    encode_notification,
+    encode_result,
+)
 from busmaster.app.service.outbox import Outbox
 from busmaster.app.service.overview import state_text
+from busmaster.app.service.owner_messages import HelloResult, KnownNode, PollGroupsParams, TouchedParams
 from busmaster.app.service.peers import Holder, Peer, find_name, process_of
 from busmaster.app.service.refusals import SERVICE, Logins, wait_text
 from busmaster.app.service.tcp import HostPort, check_listening, holder, is_our_name, listening
@@ -211,9 +221,9 @@ class Service:
         clients = [client for client in self._clients if client.has_values]
         if not clients:
             return
-        params: dict[str, Any] = {"protocol": record.profile.name, "address": record.address, "when": when}
-        params["all"] = record.address == record.profile.broadcast
-        items = params["items"] = None if params["all"] else self.line.stale_items(record, when)
+        of_all = record.address == record.profile.broadcast
+        items = None if of_all else self.line.stale_items(record, when)
+        params = TouchedParams(record.profile.name, record.address, when, of_all, items)
         key = (record.profile.name, record.address, None if items is None else tuple(items))
         for client in clients:
             client.notify_touched(params, key)
@@ -227,9 +237,9 @@ class Service:
 
     def _send_groups(self) -> None:
         self._groups_timer, self._groups_sent = None, asyncio.get_running_loop().time()
-        text = written({"method": "poll_groups", "params": {"groups": listed_groups(self.bus)}})
+        message = encode_notification("poll_groups", PollGroupsParams(listed_groups(self.bus)))
         for client in self._clients:
-            client.outbox.put_latest("poll_groups", text)
+            client.outbox.put_latest("poll_groups", message)
 
     # connections
 
@@ -306,23 +316,25 @@ class Service:
             else:
                 connection.websocket.abort()
 
-    def admit(self, connection: ClientConnection, decoded: Mapping[str, Any], /) -> Client:
+    def admit(self, connection: ClientConnection, message: ClientMessage, /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
-        params = decoded.get("params", {})
-        wanted = params.get("versions") if isinstance(params, dict) else None
-        if decoded.get("method") != "hello" or not isinstance(wanted, list):
+        if message.method != "hello":
             raise Malformed("the first message must be hello, with the supported versions")
-        common = [version for version in VERSIONS if version in wanted]
+        try:
+            params: HelloParams = decode_request_params(message.method, message.params)
+        except InvalidParams as error:
+            raise Malformed(f"the first message must be hello, with the supported versions ({error})") from None
+        common = [version for version in VERSIONS if version in params.versions]
         if not common:
             raise Malformed(
-                f"the service protocol has version {VERSIONS[-1]} here, not {wanted}; "
+                f"the service protocol has version {VERSIONS[-1]} here, not {params.versions}; "
                 "update the older of the two programs",
                 INVALID_PARAMS,
             )
         if not connection.peer.may_stay(self.authorisation.access):
             raise Malformed("this token is not valid any more")
-        permission, safe_only = connection.peer.permission(self.authorisation.access), params.get("safe_only") is True
-        in_safe_place = self._admission.admit(permission, self._clients, safe_only=safe_only)
+        permission = connection.peer.permission(self.authorisation.access)
+        in_safe_place = self._admission.admit(permission, self._clients, safe_only=params.safe_only)
 
         def drop(stream: object) -> None:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
@@ -332,7 +344,7 @@ class Service:
         client = Client(self.line, connection.peer, self._count, outbox, in_safe_place=in_safe_place)
         del self._strangers[connection]
         self._clients[client] = connection
-        client.outbox.put(written({"id": decoded.get("id"), "result": self._about(client, max(common))}))
+        client.outbox.put(encode_result(message.id, self._about(client, max(common))))
         return client
 
     def count_rejected(self, connection: ClientConnection, /) -> None:
@@ -353,37 +365,30 @@ class Service:
         finally:
             del self._clients[client]
 
-    def _about(self, client: Client, version: int) -> dict[str, Any]:
+    def _about(self, client: Client, version: int) -> HelloResult:
         """Return the description of the line for a program."""
-        owner = self._served.owner
-        nodes = [
-            {
-                "protocol": node.profile.name,
-                "address": node.address,
-                "label": node.label,
-                "health": node.health.value,
-            }
-            for node in self.bus.nodes
-        ]
-        return {
-            "version": version,
-            "now": self.bus.now(),
-            "name": owner.name,
-            "line": owner.port,
-            "baudrate": owner.baudrate,
-            "framing": owner.framing,
-            "echo": owner.echo,
-            "tcp": self.tcp_address,
-            "process": owner.pid,
-            "read_only": client.read_only,
-            "clients": len(self._clients),
-            "refused_connections": self.authorisation.refusals.total("connections"),
-            "refused_requests": self.authorisation.refusals.total("requests"),
-            "failed_logins": self.authorisation.refusals.logins.total(),
-            "state": state_text(self.bus),
-            "nodes": nodes,
-            "groups": listed_groups(self.bus),
-        }
+        owner, refusals = self._served.owner, self.authorisation.refusals
+        return HelloResult(
+            version=version,
+            now=self.bus.now(),
+            name=owner.name,
+            line=owner.port,
+            baudrate=owner.baudrate,
+            framing=owner.framing,
+            echo=owner.echo,
+            tcp=self.tcp_address,
+            process=owner.pid,
+            read_only=client.read_only,
+            clients=len(self._clients),
+            refused_connections=refusals.total("connections"),
+            refused_requests=refusals.total("requests"),
+            failed_logins=refusals.logins.total(),
+            state=state_text(self.bus),
+            nodes=[
+                KnownNode(node.profile.name, node.address, node.label, node.health.value) for node in self.bus.nodes
+            ],
+            groups=listed_groups(self.bus),
+        )
 
 
 async def _closed(connections: Iterable[ClientConnection]) -> None:

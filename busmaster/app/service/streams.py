@@ -10,7 +10,9 @@ from typing import Any, Protocol
 
 from busmaster import Bus, Point, PollGroup, Snapshot
 from busmaster.app.service.encoding import encode_event, encode_points, encode_sample, encode_snapshot
-from busmaster.app.service.messages import encoded
+from busmaster.app.service.messages import encode
+from busmaster.app.service.owner_messages import PointsBody
+from busmaster.app.service.typed import Raw
 from busmaster.ext import Outdated, ReadAfterWrite
 
 READERS_IN_A_TURN = 4
@@ -21,11 +23,11 @@ SAMPLES_IN_A_TURN = 50
 class Reader(Protocol):
     """A client with a stream."""
 
-    def notify(self, stream: int, method: str, body: str) -> None:
+    def notify(self, stream: int, method: str, body: Raw) -> None:
         """Send a message of a stream; it is dropped if the client does not keep up."""
         ...
 
-    def notify_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+    def notify_surely(self, stream: int, method: str, body: Raw, part: int = 0) -> None:
         """Send a message about a part of a stream, which replaces an earlier unsent one."""
         ...
 
@@ -63,7 +65,7 @@ class Broadcast:
             logging.getLogger("busmaster.app.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:
-            reader.notify_surely(stream, "ended", "{}")
+            reader.notify_surely(stream, "ended", Raw(b"{}"))
 
     async def _notify(self) -> None:
         async with contextlib.aclosing(self._bodies()) as bodies:
@@ -74,7 +76,7 @@ class Broadcast:
                     if (reader, stream) in self.readers:
                         reader.notify(stream, method, body)
 
-    def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+    def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
         raise NotImplementedError
 
 
@@ -93,11 +95,11 @@ class GroupBroadcast(Broadcast):
         super().join(reader, stream)
 
     def _send_points(self, *places: Place) -> None:
-        body = encoded({"set": self._set, "points": encode_points(self._points)})
+        body = Raw(encode(PointsBody(self._set, encode_points(self._points))))
         for reader, stream in places:
             reader.notify_surely(stream, "points", body)
 
-    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+    async def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
         stream = self.group.subscribe(changes=True)
         try:
             async for snapshot in stream:
@@ -110,20 +112,18 @@ class GroupBroadcast(Broadcast):
                     self._points = points
                     self._set += 1
                     self._send_points(*self.readers)
-                yield "snapshot", await self._encoded(snapshot)
+                yield "snapshot", await self._encode(snapshot)
         finally:
             stream.close()
 
-    async def _encoded(self, snapshot: Snapshot) -> str:
+    async def _encode(self, snapshot: Snapshot) -> Raw:
         """Return a cycle as JSON; of a long one, some samples are encoded in a turn of the loop."""
-        samples = list(snapshot.samples.values())
-        parts = []
-        for begin in range(0, len(samples), SAMPLES_IN_A_TURN):
-            if begin:
+        samples: list[Raw] = []
+        for number, sample in enumerate(snapshot.samples.values()):
+            if number and number % SAMPLES_IN_A_TURN == 0:
                 await asyncio.sleep(0)
-            parts.append(encoded(list(map(encode_sample, samples[begin : begin + SAMPLES_IN_A_TURN])))[1:-1])
-        head = encoded({"set": self._set, **encode_snapshot(snapshot)})
-        return f'{head[:-1]},"samples":[{",".join(parts)}]}}'
+            samples.append(Raw(encode(encode_sample(sample))))
+        return Raw(encode(encode_snapshot(snapshot, self._set, samples)))
 
 
 class EventBroadcast(Broadcast):
@@ -133,11 +133,11 @@ class EventBroadcast(Broadcast):
         super().__init__(on_end)
         self._bus = bus
 
-    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
+    async def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
         stream = self._bus.events()
         try:
             async for event in stream:
                 if form := encode_event(event):
-                    yield "event", encoded(form)
+                    yield "event", Raw(encode(form))
         finally:
             stream.close()

@@ -180,10 +180,11 @@ def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_sa
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("missing", ["msgspec", "websockets"])
 def test_where_the_extra_is_not_installed_a_line_runs_and_says_what_it_takes_to_share_it(
-    file: Path, tmp_path: Path
+    file: Path, tmp_path: Path, missing: str
 ) -> None:
-    (tmp_path / "websockets.py").write_text("raise ImportError")
+    (tmp_path / f"{missing}.py").write_text("raise ImportError")
     ran = subprocess.run(
         [sys.executable, "-m", "busmaster", "run", str(file), "--plain", "--seconds", "0.1"],
         check=True,

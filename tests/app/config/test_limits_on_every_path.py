@@ -18,6 +18,7 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.mqtt_commands import Answer, Commands
+from busmaster.app.service.client_messages import WriteParams
 from busmaster.app.service.client_requests import client_request_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.peers import Process
@@ -207,7 +208,7 @@ class Person:
 
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
-        params = {"group": "all", "key": f"drive/{name}", "value": value}
+        params = WriteParams("all", f"drive/{name}", value)
         request = client_request_of(params, Person(), ServedLine(plant.line.bus, plant.line.authorisation, 1.0, ""))
         ended: asyncio.Future[BaseException | None] = asyncio.get_running_loop().create_future()
         request.begin(lambda _, __, error: ended.set_result(error))

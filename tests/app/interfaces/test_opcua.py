@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from busmaster.app.interfaces.opcua import serving
 from busmaster.app.interfaces.opcua_access import Rules
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
 from busmaster.app.service.authorisation import Authorisation
+from busmaster.app.service.owner_messages import StreamMessage
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.bus.meaning import Meaning
@@ -232,8 +233,8 @@ async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
 ) -> None:
     really = RemoteGroup.receive
 
-    def receive(group: RemoteGroup, method: str, params: Mapping[str, Any]) -> None:
-        really(group, method, {**params, "dropped": 3})  # as the owner counts them
+    def receive(group: RemoteGroup, method: str, message: StreamMessage[Any]) -> None:
+        really(group, method, StreamMessage(message.stream, 3, message.body))  # as the owner counts them
 
     monkeypatch.setattr(RemoteGroup, "receive", receive)
     async with opened.owned() as line:

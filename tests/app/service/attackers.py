@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.served_line import ServedLine
 from busmaster import BusError, InvalidCommand, Priority, RemoteBus, connect
+from busmaster.app.service.client_messages import DemandParams, PauseParams
 from busmaster.bus.points import Point
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.ext import PlannedGroup, PlannedNode
@@ -138,7 +139,7 @@ async def groups(bus: RemoteBus, number: int) -> None:
 
 async def demands(bus: RemoteBus, number: int) -> None:
     while True:
-        await quiet(bus.link.answer(bus.link.ask("demand", {"group": GROUP})))
+        await quiet(bus.link.answer(bus.link.ask("demand", DemandParams(GROUP))))
 
 
 async def writes(bus: RemoteBus, number: int) -> None:
@@ -169,7 +170,7 @@ async def holds(bus: RemoteBus, number: int) -> None:
 
 async def pauses(bus: RemoteBus, number: int) -> None:
     while True:
-        await quiet(bus.link.answer(bus.link.ask("pause", {"group": GROUP, "paused": True})))
+        await quiet(bus.link.answer(bus.link.ask("pause", PauseParams(GROUP, True))))
 
 
 async def plans(bus: RemoteBus, number: int) -> None:

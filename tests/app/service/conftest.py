@@ -1,14 +1,14 @@
-"""Every message that programs and owners exchange in these tests is one of docs/service.schema.json."""
+"""Every message between a RemoteBus and an owner in these tests is one of docs/service.schema.json."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from busmaster.app.service import link
-from busmaster.app.service.messages import numbered, written
 from tests.app.service import schema
 from tests.patience import PATIENCE
 
@@ -25,39 +25,34 @@ def _unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Hold what both sides say against the schema. What a test says by hand, rightly or not, is not held."""
+    """Check the messages of every RemoteBus and its owner. Those that a test writes itself are not checked."""
     wrong: list[str] = []
-    asked: dict[tuple[link.Link, int], str] = {}
-    put, take = link.Link.put, link.Link._take
+    methods: dict[tuple[link.Link, int], str] = {}
+    passes, receive = link.Link._passes, link.Link.received
 
-    def note(check: Callable[[Any], None], said: Any) -> None:
+    def note(check: Callable[[Any], None], message: Any) -> None:
         try:
-            check(said)
+            check(message)
         except schema.ValidationError as error:
-            wrong.append(f"{said!r:.400}: {error.message:.400}")
+            wrong.append(f"{message!r:.400}: {error.message:.400}")
 
-    def asked_for(self: link.Link, question: str, *arguments: Any, **options: Any) -> link.PendingRequest:
-        request = put(self, question, *arguments, **options)
-        asked[self, request.number] = schema.heard(numbered(question, request.number))["method"]
-        return request
+    def checked_passes(self: link.Link, encoded: bytes) -> bool:
+        message = json.loads(encoded)
+        note(schema.check_program, message)
+        if "id" in message:
+            methods[self, message["id"]] = message["method"]
+        return passes(self, encoded)
 
-    def checked(text: str) -> str:
-        note(schema.check_program, schema.heard(text))
-        return text
+    def checked_receive(self: link.Link, text: str | bytes) -> None:
+        message = json.loads(text)
+        note(schema.check_owner, message)
+        number = message.get("id")
+        if number is not None and "result" in message:
+            method = "hello" if number == HELLO else methods[self, number]
+            note(lambda result: schema.check_result(method, result), message["result"])
+        receive(self, text)
 
-    def receive(self: link.Link, said: Mapping[str, Any]) -> None:
-        note(schema.check_owner, said)
-        number = said.get("id")
-        if number is not None and "result" in said:
-            method = "hello" if number == HELLO else asked[self, number]
-            note(lambda result: schema.check_result(method, result), said["result"])
-        take(self, said)
-
-    monkeypatch.setattr(link.Link, "put", asked_for)
-    monkeypatch.setattr(link.Link, "_take", receive)
-    monkeypatch.setattr("busmaster.app.service.link.written", lambda message: checked(written(message)))
-    monkeypatch.setattr(
-        "busmaster.app.service.link.numbered", lambda question, number: checked(numbered(question, number))
-    )
+    monkeypatch.setattr(link.Link, "_passes", checked_passes)
+    monkeypatch.setattr(link.Link, "received", checked_receive)
     yield
     assert not wrong

@@ -23,7 +23,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from busmaster import RemoteBus, connect
-from busmaster.app.service.messages import written
+from busmaster.app.service.messages import encode
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters
 
 MANY = 10_000
@@ -148,7 +148,8 @@ async def _flood(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 async def queued_reads(host: str, port: int, token: str) -> None:
     """Request 10^6 reads, and read no reply."""
     params = {"protocol": "modbus", "address": 1, "command": {"command": "read_registers", "first": 0}}
-    requests = [frame(written({"id": one, "method": "request", "params": params}).encode()) for one in range(1, 1001)]
+    request = {"jsonrpc": "2.0", "method": "request", "params": params}
+    requests = [frame(encode({**request, "id": number})) for number in range(1, 1001)]
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(upgrade("/", "localhost", token) + HELLO)

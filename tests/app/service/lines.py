@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from websockets.asyncio.client import ClientConnection, unix_connect
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, MicroFlexDrive, RemoteBus, Service, connect
 from busmaster.app.service.authorisation import Authorisation
-from busmaster.app.service.messages import read, written
 from busmaster.app.service.permission import Access
 from busmaster.app.service.record import WriteRecord
 from busmaster.contract.timing import ReplyTiming, Timings
@@ -62,10 +62,10 @@ class SlowWay:
 
     def __init__(self) -> None:
         self.full = False
-        self.said: list[str] = []
+        self.sent: list[bytes] = []
 
-    def send(self, text: str, /) -> None:
-        self.said.append(text)
+    def send(self, message: bytes, /) -> None:
+        self.sent.append(message)
 
 
 async def until(fact: Callable[[], object]) -> None:
@@ -115,10 +115,10 @@ class Raw:
         self.connection = connection
 
     async def say(self, **message: Any) -> None:
-        await self.connection.send(written(message))
+        await self.connection.send(json.dumps({"jsonrpc": "2.0", **message}))
 
     async def hear(self) -> dict[str, Any]:
-        said = read(await self.connection.recv())
+        said: dict[str, Any] = json.loads(await self.connection.recv())
         check_owner(said)
         return said
 

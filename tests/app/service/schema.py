@@ -1,4 +1,4 @@
-"""docs/service.schema.json, and what is held against it."""
+"""Checks messages by docs/service.schema.json."""
 
 from __future__ import annotations
 
@@ -16,39 +16,35 @@ DEFINED: dict[str, Any] = SCHEMA["$defs"]
 
 @functools.cache
 def _validator(name: str) -> Draft202012Validator:
-    """What checks one definition."""
+    """Return the validator of one definition."""
     return Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": DEFINED})
 
 
-def check(name: str, said: Any) -> None:
-    """Raise ValidationError for what is not as the schema defines it."""
-    for error in _validator(name).iter_errors(said):
+def check(name: str, message: Any) -> None:
+    """Raise ValidationError for a message that is not as the schema defines it."""
+    for error in _validator(name).iter_errors(message):
         raise error
 
 
-def check_program(said: Any) -> None:
-    """Raise ValidationError for what no program says."""
-    method = said.get("method")
-    part = "params" if "id" in said else "told"
-    check(f"{method}_{part}" if f"{method}_{part}" in DEFINED else "from_program", said.get("params", {}))
-    check("from_program", said)
+def check_program(message: Any) -> None:
+    """Raise ValidationError for a message that no client sends."""
+    method = message.get("method")
+    name = f"{method}_{'params' if 'id' in message else 'from_client'}"
+    if name in DEFINED:
+        check(name, message.get("params", {}))  # first: its error names the field
+    check("client_message", message)
 
 
-def check_owner(said: Any) -> None:
-    """Raise ValidationError for what no owner of a line says."""
-    if "method" in said and f"{said['method']}_news" in DEFINED:
-        check(f"{said['method']}_news", said["params"])  # first: its message says what is wrong
-    check("from_owner", said)
+def check_owner(message: Any) -> None:
+    """Raise ValidationError for a message that no owner of a line sends."""
+    if "method" in message and f"{message['method']}_from_owner" in DEFINED:
+        check(f"{message['method']}_from_owner", message["params"])  # first: its error names the field
+    check("owner_message", message)
 
 
 def check_result(method: str, result: Any) -> None:
-    """Raise ValidationError for what is no answer to a request."""
+    """Raise ValidationError for a result that the request does not have."""
     check(f"{method}_result", result)
 
 
-def heard(text: str) -> Any:
-    """What a message is on the other side."""
-    return json.loads(text)
-
-
-__all__ = ["DEFINED", "SCHEMA", "ValidationError", "check", "check_owner", "check_program", "check_result", "heard"]
+__all__ = ["DEFINED", "SCHEMA", "ValidationError", "check", "check_owner", "check_program", "check_result"]

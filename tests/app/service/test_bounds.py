@@ -15,7 +15,9 @@ from websockets.exceptions import ConnectionClosed
 from busmaster import Hcp2Controller, RemoteBus, bounds, connect
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_connection import READ_AT_ONCE, ClientConnection, MessageOrder
+from busmaster.app.service.client_messages import CancelParams, ClientMessage, RequestParams, StreamParams
 from busmaster.app.service.folder import Owner, ServedSocket
+from busmaster.app.service.messages import decode_client_message, encode_notification, encode_request
 from busmaster.app.service.outbox import Outbox
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
@@ -27,9 +29,9 @@ def test_news_that_were_dropped_take_no_memory() -> None:
     way = SlowWay()
     outbox = Outbox(way, lambda _: None)
     way.full = True
-    outbox.put("an answer that is not read")
+    outbox.put(b"an answer that is not read")
     for number in range(10 * bounds.MOST_UNREAD):
-        outbox.put_news(7, f"news {number}")
+        outbox.put_news(7, b"news %d" % number)
     assert outbox.waiting == bounds.MOST_UNREAD + 1
 
 
@@ -37,8 +39,8 @@ def test_a_write_that_is_given_up_before_its_first_step_is_on_record_and_leaves_
     async def story(line: Served, remote: RemoteBus) -> None:
         [client] = line.service.clients
         command = {"command": "write", "element": 1, "values": [7.0]}
-        client.take({"id": 70, "method": "request", "params": {"protocol": "hcp2", "address": 5, "command": command}})
-        client.take({"method": "cancel", "params": {"id": 70}})
+        client.take(decode_client_message(encode_request("request", 70, RequestParams("hcp2", 5, command)).decode()))
+        client.take(decode_client_message(encode_notification("cancel", CancelParams(70)).decode()))
         await until(lambda: not client.unfinished)
         assert line.audit() == [("5/write element 1 = 7", "not started")]
         assert await Hcp2Controller(line.bus, 5).read(1) == 0
@@ -116,9 +118,9 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
     taken: list[int] = []
     take = Client.take
 
-    def note(client: Client, said: dict[str, object]) -> None:
+    def note(client: Client, message: ClientMessage) -> None:
         taken.append(turn)
-        take(client, said)
+        take(client, message)
 
     monkeypatch.setattr(Client, "take", note)
 
@@ -141,7 +143,7 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
 
         monkeypatch.setattr(connection.websocket, "buffer_updated", received)
         for _ in range(100):
-            remote.link.notify("end", {"stream": 7})
+            remote.link.notify("end", StreamParams(7))
         await until(lambda: len(taken) >= 100)
         assert len(set(taken)) == len(taken)
         assert max(sizes) <= READ_AT_ONCE

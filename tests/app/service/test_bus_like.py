@@ -273,8 +273,8 @@ def test_the_owner_refuses_such_a_plan_itself(tmp_path: Path) -> None:
         async with raw(line) as client:
             for reads, period, why in (
                 ([read] * 201, 1.0, "200 reads planned"),
-                ([read], 0.0, "0.001 to 86400 s"),
-                ([read], "1", "a period"),
+                ([read], 0.0, "period: expected `float` >= 0.001"),
+                ([read], "1", "period: expected `float`, got `str`"),
                 ([write], 1.0, "only reads"),
                 ([{**read, "address": 99999}], 1.0, "hcp2"),
             ):
@@ -283,7 +283,7 @@ def test_the_owner_refuses_such_a_plan_itself(tmp_path: Path) -> None:
             said = await client.ask("plan", groups=[{"name": "one", "period": 1.0, "reads": []}] * 201)
             assert "200 groups at most" in said["error"]["message"]
             said = await client.ask("plan", groups="all")
-            assert "a list of objects" in said["error"]["message"]
+            assert "groups: expected `array`, got `str`" in said["error"]["message"]
             async with line.service.line.planner._turn:
                 await client.say(method="plan", params={}, id=2)
                 said = await client.ask("plan")

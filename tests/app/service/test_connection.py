@@ -168,7 +168,7 @@ def test_what_is_said_is_what_the_library_reads_and_the_other_way_round(length: 
         core.receive_data(bytes(wire.written))
         core.send_text(text.encode())
         give(end, bytes_of(core), lambda: 512)
-        end.send(text)
+        end.send(text.encode())
         assert ear.heard_so_far == [text]
 
     in_a_loop(story)

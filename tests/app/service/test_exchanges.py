@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from busmaster import Hcp2Controller, RemoteBus
-from busmaster.app.service.exchanges import MOST_BYTES, MOST_KEPT, RECEIVED_AT_ONCE, Listener, exchange_to_json
+from busmaster.app.service.exchanges import MOST_BYTES, MOST_KEPT, RECEIVED_AT_ONCE, Listener, encode_exchange
+from busmaster.app.service.messages import encode
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -134,8 +135,8 @@ def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
     for number in range(3):
         listener.received(1.5 + number, b"x" * MOST_BYTES, None)
     [_, passage], _ = listener.take()
-    told = json.loads(json.dumps(exchange_to_json(passage)))
-    check("unexpected", told)
+    told = json.loads(encode(encode_exchange(passage)))
+    check("UnexpectedBytes", told)
     assert told == [[[1_500_000, "node", b"x".hex() * MOST_BYTES]], 3 * MOST_BYTES]
     assert listener.take() == ([], 0)
 

@@ -271,7 +271,7 @@ class Full:
 
     full = True
 
-    def send(self, text: str, /) -> None:
+    def send(self, message: bytes, /) -> None:
         raise AssertionError("it is full")
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from busmaster import Hcp2Controller, MicroFlexDrive, Node, Point, Priority, RemoteBus, connect, errors, ext
 from busmaster.app.service import link
 from busmaster.app.service.failures import encode_error, error_of
 from busmaster.app.service.link import Link
+from busmaster.app.service.owner_messages import ErrorForm
 from busmaster.errors import (
     BusClosed,
     BusError,
@@ -31,7 +32,7 @@ from busmaster.protocols.hcp2 import StatusWord
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, served, until
 
-TAKE = Link._take
+RECEIVED = Link.received
 
 
 def test_a_handle_reads_and_writes_on_another_programs_line(tmp_path: Path) -> None:
@@ -71,7 +72,7 @@ def test_an_error_comes_back_as_the_same_class_with_the_same_fields(name: str) -
     error = kind("it went wrong", command="read element 1", attempts=3)
     error.line, error.label, error.address = "/dev/ttyUSB0", "winder", 5
     error.__cause__ = NoReply("no reply", hint="look again")
-    again = error_of(json.loads(json.dumps(encode_error(error))))
+    again = error_of(msgspec.json.decode(msgspec.json.encode(encode_error(error)), type=ErrorForm))
     assert type(again) is kind
     assert vars(again) == vars(error)
     assert str(again) == str(error)
@@ -451,7 +452,7 @@ def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
 def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
     said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Link, "_take", TAKE)  # it is not held against the schema
+    monkeypatch.setattr(Link, "received", RECEIVED)  # it is not checked by the schema
 
     async def story(line: Served, remote: RemoteBus) -> None:
         writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from busmaster import RemoteBus, connect
+from busmaster.app.service.client_messages import DemandParams
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.rights import RIGHTS, Role, table
 from busmaster.arbiter.transaction import Priority
@@ -128,7 +129,7 @@ def test_programs_of_a_role_demand_a_group_so_often(tmp_path: Path, role: Role) 
         await anext(aiter(group))
         before = group.poll.cycles
         for _ in range(5):
-            await remote.link.answer(remote.link.ask("demand", {"group": "slow"}))
+            await remote.link.answer(remote.link.ask("demand", DemandParams("slow")))
             await remote.node(hcp2.PROFILE, 5).request(READ)
             await remote.node(hcp2.PROFILE, 5).request(READ)
         assert group.poll.cycles - before == (1 if RIGHTS[role].demand_every else 5)

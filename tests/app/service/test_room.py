@@ -10,7 +10,9 @@ from typing import Any, cast
 import pytest
 
 from busmaster import Hcp2Controller, RemoteBus
+from busmaster.app.service.client_messages import CancelParams, RequestParams
 from busmaster.app.service.connection import IncomingConnection
+from busmaster.app.service.messages import decode_client_message, encode_notification, encode_request
 from busmaster.app.service.sequences import RequestLimit
 from busmaster.bus.requester import ORDINARY, Requester, RequestOptions
 from busmaster.errors import NotStarted
@@ -95,9 +97,9 @@ def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
         turn(pump)
         seen.append("turn over")
 
-    def said(connection: Any, text: str) -> None:
+    def said(connection: Any, message: bytes) -> None:
         seen.append("answer")
-        send(connection, text)
+        send(connection, message)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
@@ -114,11 +116,11 @@ def test_a_read_that_its_program_gives_up_waits_for_the_line_no_longer(tmp_path:
     async def story(line: Served, remote: RemoteBus) -> None:
         await Hcp2Controller(remote, 5).read(1)
         [client] = line.service.clients
-        read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+        read = RequestParams("hcp2", 5, {"command": "read", "element": 1})
         for number in (70, 71, 72):
-            client.take({"id": number, "method": "request", "params": read})
+            client.take(decode_client_message(encode_request("request", number, read).decode()))
         for number in (70, 71, 72):
-            client.take({"method": "cancel", "params": {"id": number}})
+            client.take(decode_client_message(encode_notification("cancel", CancelParams(number)).decode()))
         assert client.unfinished == ()
         counts = await line.bus.statistics()
         assert (counts.cancelled, counts.backlog) == (3, 0)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect
-from busmaster.app.service.messages import encoded, value_of
+from busmaster.app.service.messages import encode_json, value_of
 from busmaster.emulator.line import Line
 from busmaster.registry import find, make_device
 from tests.app.service.lines import Served, on_a_served_line, raw
@@ -22,16 +22,16 @@ from tests.patience import PATIENCE
     "value", [None, True, 1, 12.5, "a\n", (1, (2, 3)), inf, -inf, frozenset(), frozenset({0, 5, 31}), (frozenset({7}),)]
 )
 def test_a_value_comes_back_as_it_was(value: Any) -> None:
-    assert value_of(json.loads(encoded(value))) == value
+    assert value_of(json.loads(encode_json(value))) == value
 
 
 def test_what_is_no_number_comes_back_too() -> None:
-    assert str(value_of(json.loads(encoded((nan,))))) == "(nan,)"
+    assert str(value_of(json.loads(encode_json((nan,))))) == "(nan,)"
 
 
 def test_what_cannot_be_said_is_refused() -> None:
     with pytest.raises(TypeError, match="a complex cannot be sent"):
-        encoded(1j)
+        encode_json(1j)
 
 
 @pytest.mark.parametrize(
