@@ -1,6 +1,7 @@
 """A line that is owned and served by a process of its own: what others pay for asking through its socket.
 
-`python -m benchmarks.owned_line` is told the port in a line of JSON, and prints the socket's address, and the path of a
+`python -m benchmarks.owned_line` is told the port in a line of JSON (with `"library": true`, the library reads all
+frames), and prints the socket's address, and the path of a
 bare one, where whatever comes is answered, after the same read, with as many bytes as an answer has. Each further line
 is an order: {"reads": 100} has it read so often itself, one after the other, and print the seconds that each took;
 {"polls": true} has it read a poll group ten times a second, until {"polls": false}; {"saturate": 2.5} has several
@@ -18,8 +19,10 @@ import warnings
 from pathlib import Path
 from typing import Any, cast
 
+from benchmarks.library_frames import LibraryIncomingConnection
 from benchmarks.watch import Watch, watched
 from busmaster import Bus, PollGroup, SerialPort, Service
+from busmaster.app.service import client_connection
 from busmaster.bus.node import Node, Request
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
@@ -125,6 +128,8 @@ class Owner:
 
 async def serve(watch: Watch) -> int:
     order = json.loads(sys.stdin.readline())
+    if order.get("library"):
+        client_connection.IncomingConnection = LibraryIncomingConnection  # type: ignore[misc]  # for this process
     with tempfile.TemporaryDirectory() as folder:
         async with (
             Bus(SerialPort(order["port"], baudrate=57600, paced=False)) as bus,

@@ -1,7 +1,8 @@
 """What a program pays for asking through the socket of the process that owns the line, and what it costs the others.
 
 The line is idle but for one reader: the owner itself, a program that is connected to it, and one that has a bare socket
-and no words, which is the least that it can take, in turn, round by round.
+and no words, which is the least that it can take, in turn, round by round. Then two programs read two such lines in
+turn: of one of them, both ends have the library read and write all WebSocket frames, see `library_frames`.
 Then seven programs saturate it, each with one command after the other, without and with an eighth that has ten thousand
 waiting; a ninth writes urgently. Then the owner alone saturates it, and polls a group, without and with twenty programs
 that read that group; a hold is what the owner's loop does between two looks at its ports, as in `loop_stalls`.
@@ -15,17 +16,22 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from statistics import median
 from typing import Any, cast
+from unittest import mock
 
 from benchmarks.apart import Apart
 from benchmarks.harness import Claim, Options, Outcome, Table, quantile
+from benchmarks.library_frames import LibraryOutgoingConnection
 from benchmarks.owned_line import BARE_REQUEST, GROUP, PAUSE, READ, UNIT, read
 from benchmarks.served_line import ServedLine
 from busmaster import Priority, RemoteBus, connect
+from busmaster.app.service import link
 from busmaster.protocols.modbus.codec import PROFILE, WriteRegisters
 
 MOST = 0.4
 """Milliseconds that a remote read may take more than a local one."""
 WARM_UP = 20
+FRAME_READS = 5
+"""Reads of each kind in one round: rounds are short, because the machine's speed varies."""
 DELAY = 0.002
 """Seconds, always the same, that the unit takes to reply."""
 OTHERS = 7
@@ -47,6 +53,7 @@ def run(options: Options) -> Outcome:
         try:
             address, bare = owner.ask({"port": line.path})
             asyncio.run(_idle(owner, address, bare, options, outcome))
+            _compare_frames(address, options, outcome)
             asyncio.run(_crowd(address, options, outcome))
             asyncio.run(_audience(owner, address, options, outcome))
         finally:
@@ -78,6 +85,40 @@ async def _idle(owner: Apart, address: str, bare: str, options: Options, outcome
     more = (quantile(remote, 0.5) - quantile(local, 0.5)) * 1000
     outcome.claims.append(Claim("what a remote read takes more than a local one, p50, ms", more, MOST))
     outcome.series = {"local": local, "remote": remote, "by a bare socket": least}
+
+
+def _compare_frames(address: str, options: Options, outcome: Outcome) -> None:
+    with ServedLine(UNIT, delay={"low": DELAY}) as line:
+        owner = Apart("benchmarks.owned_line", paced=False)
+        try:
+            other, _ = owner.ask({"port": line.path, "library": True})
+            asyncio.run(_frames(address, other, options, outcome))
+        finally:
+            owner.close()
+
+
+async def _frames(address: str, other: str, options: Options, outcome: Outcome) -> None:
+    own: list[float] = []
+    library: list[float] = []
+    ratios: list[float] = []
+    async with AsyncExitStack() as stack:
+        nodes = [(await stack.enter_async_context(connect(address))).node(PROFILE, UNIT)]
+        with mock.patch.object(link, "OutgoingConnection", LibraryOutgoingConnection):
+            nodes.append((await stack.enter_async_context(connect(other))).node(PROFILE, UNIT))
+        for node in nodes:
+            await read(node, WARM_UP)
+        for number in range(options.pick(200, 2)):
+            taken = {node: await read(node, FRAME_READS) for node in (nodes if number % 2 else reversed(nodes))}
+            ratios.append(median(taken[nodes[1]]) / median(taken[nodes[0]]))
+            own += taken[nodes[0]]
+            library += taken[nodes[1]]
+    columns = ("frames", "reads", "p50", "p99")
+    note = f"with the library, a read takes {100 * (median(ratios) - 1):.3g} % longer (median of {len(ratios)} ratios)"
+    table = Table("A remote read on an idle line, ms", columns, notes=[note])
+    for who, took in (("of the service", own), ("of the library", library)):
+        table.row(who, len(took), quantile(took, 0.5) * 1000, quantile(took, 0.99) * 1000)
+    outcome.tables.append(table)
+    outcome.series |= {"library frames": library, "ratios of frames": ratios}
 
 
 class BareAsking(asyncio.Protocol):

@@ -1,5 +1,7 @@
-"""The one frame of WebSocket that nearly all are: a whole text. The library knows the others, and takes five times as
-long for this one, at either end of each request.
+"""Reads and writes frames that are whole texts, as nearly all are. The library handles all other frames.
+
+With the library alone, a remote read on an idle line takes 3 to 4 % longer. `python -m benchmarks service` measures
+this with the table "A remote read on an idle line".
 """
 
 from __future__ import annotations
