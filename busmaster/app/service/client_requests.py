@@ -327,7 +327,8 @@ ClientRequest: TypeAlias = Reading | Writing
 def client_request_of(params: RequestParams | WriteParams, sender: RequestSender, line: ServedLine) -> ClientRequest:
     """Return the request of a client. Raises InvalidCommand for a command that the protocol does not have."""
     if isinstance(params, WriteParams):
-        task, stops_seen, client, stop = RequestedCommand.of_point(params, sender, line), None, sender.turn, False
+        task = RequestedCommand.of_point(params, sender, line)
+        stops_seen, client, stop = None, sender.client_of(None, task.node), False
     else:
         task = RequestedCommand.of_node(params, sender)
         stops_seen = None if params.stops_seen is None else params.stops_seen + sender.stops_before(task.node)

@@ -42,6 +42,7 @@ from busmaster.app.service.messages import (
     value_of,
 )
 from busmaster.app.service.owner_messages import EventForm
+from busmaster.app.service.reply_times import timings_of
 from busmaster.errors import BacklogFull, InvalidCommand, Refused
 from tests.app.service import schema
 from tests.app.service.lines import Served, on_a_line, on_a_served_line, raw
@@ -208,6 +209,27 @@ def test_a_value_beyond_its_limit_is_refused_with_the_limit(method: str, more: d
 def test_parameters_that_are_not_an_object_are_refused(params: str) -> None:
     with pytest.raises(InvalidParams, match=r"^events: "):
         decode_request_params("events", msgspec.Raw(params.encode()))
+
+
+@pytest.mark.parametrize(
+    ("timings", "reason"),
+    [
+        ({**TIMINGS, "learned": None}, "learned excludes read, write and packet"),
+        ({"read": TIMING}, "write and packet missing"),
+        ({}, "read and write and packet missing"),
+    ],
+)
+def test_reply_times_are_complete_or_learned(timings: dict[str, Any], reason: str) -> None:
+    with pytest.raises(InvalidCommand, match=reason):
+        timings_of(decode("node", {**NODE, "timings": timings}).timings)
+    with pytest.raises(schema.ValidationError):
+        schema.check("node_params", {**NODE, "timings": timings})
+
+
+@pytest.mark.parametrize("method", [method for method in PARAMS if PARAMS[method]])
+def test_the_schema_does_not_permit_a_field_that_no_message_has(method: str) -> None:
+    with pytest.raises(schema.ValidationError):
+        schema.check(f"{method}_params", {**PARAMS[method], "colour": "red"})
 
 
 def test_the_last_of_two_equal_names_counts() -> None:
@@ -386,11 +408,12 @@ def test_a_reply_of_the_owner_is_decoded_by_the_method_of_its_request() -> None:
 
 def test_an_error_keeps_its_fields() -> None:
     refused = Refused("it is not writable", confirm=False, hint="look at its manual")
+    refused.temporary = True
     error = decode_owner_message(encode_error_reply(1, encode_error(refused)).decode()).error
     assert not isinstance(error, msgspec.UnsetType)
     again = error_of(error)
     assert isinstance(again, Refused)
-    assert (again.what, again.hint, again.confirm) == (refused.what, refused.hint, False)
+    assert (again.what, again.hint, again.confirm, again.temporary) == (refused.what, refused.hint, False, True)
     assert isinstance(error_of(encode_error(InvalidCommand("no"))), InvalidCommand)
 
 
@@ -483,6 +506,8 @@ def test_a_program_has_a_limited_number_of_requests_and_each_has_its_own_id(tmp_
                 owner.requests.begin(0, read)
             with pytest.raises(Malformed, match="request 0 is already in progress"):
                 owner.take(decode_client_message(encode_request("now", 0, NoParams()).decode()))
+            with pytest.raises(Malformed, match="request 0 is already in progress"):
+                owner.take(decode_client_message('{"jsonrpc":"2.0","id":0,"method":"now","params":[]}'))
             owner.requests.begin(bounds.MOST_REQUESTS, read)
             assert len(owner.unfinished) == bounds.MOST_REQUESTS
             reply = await client.hear()
