@@ -150,7 +150,7 @@ class Client:
 
     def notify(self, stream: int, method: str, body: Raw) -> None:
         """Send a message of a stream; it is dropped if the client does not keep up."""
-        self.outbox.put_news(stream, encode_stream_message(method, stream, self.dropped.get(stream, 0), body))
+        self.outbox.put_droppable(stream, encode_stream_message(method, stream, self.dropped.get(stream, 0), body))
 
     def notify_surely(self, stream: int, method: str, body: Raw, part: int = 0) -> None:
         """Send a message about a part of a stream, which replaces an earlier unsent one."""

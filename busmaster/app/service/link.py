@@ -110,7 +110,7 @@ class Link:
         self._connection: OutgoingConnection | None = None
         self._waiting: deque[tuple[bytes, PendingRequest | None]] = deque()
         """Messages to send when the connection is ready, each with its request."""
-        self._asked: dict[int, PendingRequest] = {}
+        self._pending: dict[int, PendingRequest] = {}
         self._count = 0
         self._over: tuple[type[BusError], str, str] | None = None
         self._is_open = False
@@ -123,7 +123,7 @@ class Link:
             await asyncio.to_thread(_where, self.address) if is_a_name(self.address) else _where(self.address)
         )
         loop = asyncio.get_running_loop()
-        self._asked[0] = hello = PendingRequest(0, "hello", loop.create_future(), False, None, None)
+        self._pending[0] = hello = PendingRequest(0, "hello", loop.create_future(), False, None, None)
         params = HelloParams(list(VERSIONS), program, self._safe_only)
         self._waiting.appendleft((encode_request("hello", 0, params), hello))
         try:
@@ -172,11 +172,11 @@ class Link:
         message = encode_request(method, number, params)
         handed = self._passes(message)  # first: the other end begins while this end creates the objects for it
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        asked = PendingRequest(number, method, future, writes, node, command, handed)
-        self._asked[number] = asked
+        pending = PendingRequest(number, method, future, writes, node, command, handed)
+        self._pending[number] = pending
         if not handed:
-            self._waiting.append((message, asked))
-        return asked
+            self._waiting.append((message, pending))
+        return pending
 
     def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
         """Raise LineDown or BusClosed with the reason if the connection is over."""
@@ -184,16 +184,16 @@ class Link:
             kind, what, hint = self._over
             raise kind(what, node=node, command=_text(command), hint=hint)
 
-    async def answer(self, asked: PendingRequest, finish_within: float | None = None) -> Any:
+    async def answer(self, pending: PendingRequest, finish_within: float | None = None) -> Any:
         """Wait for a reply. A cancellation also cancels the request at the line."""
         timer = None
         if finish_within is not None:
             loop = asyncio.get_running_loop()
-            timer = loop.call_later(finish_within + GRACE, self._overdue, asked)
+            timer = loop.call_later(finish_within + GRACE, self._overdue, pending)
         try:
-            return await asked.future
+            return await pending.future
         except asyncio.CancelledError:
-            self._drop(asked)
+            self._drop(pending)
             raise
         finally:
             if timer is not None:
@@ -228,11 +228,11 @@ class Link:
         connection = self._connection
         assert connection is not None
         while self._waiting and self._is_open and not connection.full:
-            message, asked = self._waiting.popleft()
-            if asked is not None:
-                if asked.future.done():
+            message, pending = self._waiting.popleft()
+            if pending is not None:
+                if pending.future.done():
                     continue  # cancelled before it was sent
-                asked.handed = True
+                pending.handed = True
             connection.send(message)
 
     def lost(self) -> None:
@@ -278,22 +278,22 @@ class Link:
         connection.send(message)
         return True
 
-    def _drop(self, asked: PendingRequest) -> None:
+    def _drop(self, pending: PendingRequest) -> None:
         """Stop waiting for a request, and cancel it at the line."""
-        if self._asked.pop(asked.number, None) is not None and asked.handed:
-            self.notify("cancel", CancelParams(asked.number))
+        if self._pending.pop(pending.number, None) is not None and pending.handed:
+            self.notify("cancel", CancelParams(pending.number))
 
-    def _overdue(self, asked: PendingRequest) -> None:
+    def _overdue(self, pending: PendingRequest) -> None:
         what = "the time of the request is over, and the program that owns the line did not reply"
-        asked.lost(NoReply, what, "check whether that program is running")
-        self._drop(asked)
+        pending.lost(NoReply, what, "check whether that program is running")
+        self._drop(pending)
 
     def _end(self, kind: type[BusError], what: str, hint: str) -> None:
         if self._over is None:
             self._over = kind, what, hint
-            for asked in self._asked.values():
-                asked.lost(kind, what, hint)
-            self._asked.clear()
+            for pending in self._pending.values():
+                pending.lost(kind, what, hint)
+            self._pending.clear()
             self._waiting.clear()
             self._on_lost()
 
@@ -303,19 +303,19 @@ class Link:
             if params is not None:  # one of a later version is ignored
                 self._on_notification(message.method, params)
             return
-        asked = None if message.id is None else self._asked.get(message.id)
-        if asked is None:
+        pending = None if message.id is None else self._pending.get(message.id)
+        if pending is None:
             return
         # Decoded first: if that fails, the request is still registered, and ends with the connection.
         error = None if isinstance(message.error, UnsetType) else error_of(message.error)
-        result = None if isinstance(message.result, UnsetType) else decode_result(asked.method, message.result)
-        del self._asked[asked.number]
-        if asked.future.done():
+        result = None if isinstance(message.result, UnsetType) else decode_result(pending.method, message.result)
+        del self._pending[pending.number]
+        if pending.future.done():
             return
         if error is not None:
-            asked.future.set_exception(error)
+            pending.future.set_exception(error)
         else:
-            asked.future.set_result(result)
+            pending.future.set_result(result)
 
 
 def is_a_name(address: str) -> bool:

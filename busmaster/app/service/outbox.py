@@ -39,7 +39,7 @@ class Outbox:
         self._sink = sink
         self._on_drop = on_drop
         self._messages: OrderedDict[_Message, None] = OrderedDict()  # one that is dropped is taken out from between
-        self._news: deque[_Message] = deque()
+        self._droppable: deque[_Message] = deque()
         self._latest: dict[Hashable, _Message] = {}
 
     @property
@@ -70,25 +70,25 @@ class Outbox:
         else:
             self._sink.send(encoded)
 
-    def put_news(self, key: Hashable, encoded: bytes) -> None:
+    def put_droppable(self, key: Hashable, encoded: bytes) -> None:
         """Send a notification of a stream, unless the client does not keep up."""
         if not self._messages and not self._sink.full:
             self._sink.send(encoded)
             return
-        while len(self._news) >= MOST_UNREAD:
-            oldest = self._news.popleft()
+        while len(self._droppable) >= MOST_UNREAD:
+            oldest = self._droppable.popleft()
             del self._messages[oldest]
             self._on_drop(oldest.key)
         message = _Message(encoded, key)
-        self._news.append(message)
+        self._droppable.append(message)
         self._messages[message] = None
 
     def flush(self, *, last: bool = False) -> None:
         """Send waiting messages until the connection is full; with `last` all of them, because nothing follows."""
         while self._messages and (last or not self._sink.full):
             message, _ = self._messages.popitem(last=False)
-            if self._news and self._news[0] is message:
-                self._news.popleft()
+            if self._droppable and self._droppable[0] is message:
+                self._droppable.popleft()
             elif self._latest.get(message.key) is message:
                 del self._latest[message.key]
             self._sink.send(message.encoded)

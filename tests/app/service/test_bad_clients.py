@@ -307,7 +307,7 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     outbox.put(b"first")
     way.full = True
     for number in range(bounds.MOST_UNREAD + 2):
-        outbox.put_news(7, b"news %d" % number)
+        outbox.put_droppable(7, b"news %d" % number)
     outbox.put(b"an answer")
     for number in range(3):
         outbox.put_latest("stops", b"stops %d" % number)

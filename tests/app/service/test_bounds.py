@@ -31,7 +31,7 @@ def test_news_that_were_dropped_take_no_memory() -> None:
     way.full = True
     outbox.put(b"an answer that is not read")
     for number in range(10 * bounds.MOST_UNREAD):
-        outbox.put_news(7, b"news %d" % number)
+        outbox.put_droppable(7, b"news %d" % number)
     assert outbox.waiting == bounds.MOST_UNREAD + 1
 
 
