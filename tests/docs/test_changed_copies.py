@@ -1,4 +1,4 @@
-"""The example of docs/adding-a-rule.md: its changes are made in a copy of the package, where its test passes."""
+"""The examples of the pages that change the package: the changes are made in a copy of it, where their tests pass."""
 
 from __future__ import annotations
 
@@ -10,19 +10,27 @@ import sys
 import textwrap
 from pathlib import Path
 
+import pytest
+
 from tests.docs.pages import ROOT
 
-PAGE = ROOT / "docs" / "adding-a-rule.md"
+PAGES = {
+    "adding-a-rule.md": ["tests/arbiter/bench.py"],
+    "adding-a-command.md": ["tests/app/cli/test_command_line.py", "tests/docs/command_line.py"],
+}
+"""Files besides the package that a page changes or uses."""
 BLOCK = re.compile(r"^ *```(?:py|text)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 FIRST = re.compile(r"# (?P<file>\S+?)(?:, before: (?P<anchor>.*))?\n")
 
 
-def test_the_example_works_as_the_page_shows_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", PAGES)
+def test_the_example_works_as_the_page_shows_it(page: str, tmp_path: Path) -> None:
     shutil.copytree(ROOT / "busmaster", tmp_path / "busmaster", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "tests/arbiter").mkdir(parents=True)
-    shutil.copy(ROOT / "tests/arbiter/bench.py", tmp_path / "tests/arbiter")
+    for file in PAGES[page]:
+        (tmp_path / file).parent.mkdir(parents=True)
+        shutil.copy(ROOT / file, tmp_path / file)
     added: list[Path] = []
-    for block in BLOCK.findall(PAGE.read_text()):
+    for block in BLOCK.findall((ROOT / "docs" / page).read_text()):
         code = textwrap.dedent(block)
         head = FIRST.match(code)
         assert head is not None, code
