@@ -114,3 +114,9 @@ def until_ended(
     if ending is None:
         return anyio.run(function, *arguments, backend_options={"loop_factory": loop_factory})
     return ending.run(function, *arguments, loop_factory=loop_factory)
+
+
+__all__ = [
+    "Ending",
+    "until_ended",
+]

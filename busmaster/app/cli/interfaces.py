@@ -79,3 +79,10 @@ class _Meant:
         if self._line is None:
             self._line = address
         return address
+
+
+__all__ = [
+    "following",
+    "interface_options",
+    "place_of",
+]

@@ -245,3 +245,10 @@ class Following:
     def _away(self, kind: type[BusError]) -> BusError:
         why = self.state.why if isinstance(self.state, Lost) else "its program is being connected"
         return kind(f"the program that owns the line is not there: {why}", hint="")
+
+
+__all__ = [
+    "Connected",
+    "Following",
+    "Lost",
+]

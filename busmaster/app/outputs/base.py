@@ -352,3 +352,16 @@ class OutputKind:
     keeps_audit: bool = False
     without: tuple[str, ...] = ()
     unsuitable: Callable[[Any, str, Mapping[str, str]], Unsuitable | None] = takes_all
+
+
+__all__ = [
+    "Happening",
+    "Item",
+    "Output",
+    "OutputKind",
+    "OutputLine",
+    "Unsendable",
+    "Unsuitable",
+    "check_extra",
+    "takes_all",
+]

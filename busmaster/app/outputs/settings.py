@@ -237,3 +237,9 @@ class MetricsSettings(Settings):
     def destination(self) -> str:
         """Return the address that is served."""
         return f"{self.host}:{self.port}"
+
+
+__all__ = [
+    "Settings",
+    "SpillingSettings",
+]
