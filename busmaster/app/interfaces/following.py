@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from busmaster import Quality
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.picture import Picture, Row
 from busmaster.app.service.remote import RemoteBus, connect
@@ -23,6 +24,7 @@ FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 2.0
 OLD_AFTER, LEAST_AGE = 3, 1.0
 """Periods of its group, and at least seconds, after which a value without a new cycle is not current any more."""
+CURRENT = {quality.value for quality in Quality if quality.is_current}
 
 Receive = Callable[[str, Mapping[str, Any]], None]
 
@@ -111,7 +113,7 @@ class Following:
         It is an old one if the owner is away, if the last read failed, and after a write to its place. It is also old
         if its group had no cycle for some time, because the group is paused or the owner is stopped.
         """
-        if not self.is_connected or self._remote is None or row.asked is None or row.quality not in ("good", "late"):
+        if not self.is_connected or self._remote is None or row.asked is None or row.quality not in CURRENT:
             return False
         return not self.old_groups({row.group: row.asked}, self._remote.now())
 
