@@ -570,3 +570,39 @@ def test_r9_a_sequence_that_waits_for_others_keeps_its_place_among_the_programs(
         if waits.attempts:
             break
     assert waits.attempts == 1
+
+
+def test_r9_a_sequence_that_is_left_while_its_first_request_is_on_the_wire_holds_nothing_afterwards() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    bench.ask(table.node, WRITE, client=hold)
+    bench.until_sent()
+    table.release(hold)
+    others = [bench.ask(table.there, client=client) for client in (None, table.arbiter.add_client())]
+    begun = bench.now
+    for other in others:
+        assert bench.served(other).error is None
+    assert bench.now - begun < 1.0  # and not after the 5 s for which the sequence could have held the line
+
+
+def test_r9_while_a_sequence_holds_the_line_only_its_own_requests_are_taken_out_of_turn() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    backlog = table.arbiter.dispatcher.share()
+    bench.ask(table.there, hcp2.Read(2))
+    assert backlog.take(lambda one: True) is None
+    own = bench.ask(table.node, hcp2.Read(3), client=hold)
+    assert own.phase is Phase.ON_WIRE
+
+
+def test_r7_a_sequence_that_waits_for_an_earlier_write_of_its_program_is_not_taken_out_of_turn() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    bench.ask(table.there)  # is on the wire, so that the others wait
+    bench.ask(table.node, hcp2.Write(3, (7.0,)))
+    behind = bench.ask(table.node, hcp2.Read(3), client=hold)
+    backlog = table.arbiter.dispatcher.share()
+    assert backlog.take(lambda one: one is behind) is None
+    free = bench.ask(table.there, hcp2.Read(4))
+    assert backlog.take(lambda one: one is free) is free

@@ -178,3 +178,10 @@ def test_r9_a_client_whose_role_changes_has_the_part_of_the_new_one() -> None:
     owners_part(desk, 100)
     assert desk.served.count(changed) > 80
     assert not desk.backlog._members
+
+
+def test_r9_requests_of_all_clients_to_new_nodes_have_one_128th_of_the_line() -> None:
+    backlog = Desk().arbiter.dispatcher.share()
+    client = backlog.new_nodes()
+    assert backlog.new_nodes() is client
+    assert 1 / (1 + client.owner_time) == 1 / 128
