@@ -19,7 +19,15 @@ from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import event_text, micros
 from busmaster.bounds import AUDIT_WITHIN
-from busmaster.events import AlarmChanged, BusEvent, MaxReplyDelayRaised, NodeChanged, RepliesLate, Stream
+from busmaster.events import (
+    AlarmChanged,
+    BusEvent,
+    MaxReplyDelayLowered,
+    MaxReplyDelayRaised,
+    NodeChanged,
+    RepliesLate,
+    Stream,
+)
 from busmaster.ext import Outdated
 
 WAITING = 256
@@ -263,7 +271,7 @@ async def close_all(outputs: Collection[Output]) -> None:
 def label_of(event: BusEvent) -> str:
     """Return the label of the node that an event is of, "" for one of the line."""
     match event:
-        case NodeChanged() | MaxReplyDelayRaised() | RepliesLate():
+        case NodeChanged() | MaxReplyDelayRaised() | MaxReplyDelayLowered() | RepliesLate():
             return event.node.label
         case AlarmChanged():
             return event.point.node.label

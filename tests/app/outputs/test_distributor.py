@@ -10,13 +10,25 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import MemoryPort, Snapshot
+from busmaster import Health, MemoryPort, Snapshot
 from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
+from busmaster.app.outputs.distributor import label_of
 from busmaster.app.outputs.exceptions import News
 from busmaster.bus.node import Node
+from busmaster.events import (
+    AlarmChanged,
+    BusEvent,
+    LineChange,
+    LineChanged,
+    MaxReplyDelayLowered,
+    MaxReplyDelayRaised,
+    NodeChanged,
+    PortFailed,
+    RepliesLate,
+)
 
 TEXT = """
 port = "/dev/ttyUSB0"
@@ -109,3 +121,19 @@ async def test_a_bug_that_ends_the_feed_of_the_outputs_is_reported(
     assert "outputs get no more values of fast: ZeroDivisionError: a bug; report this bug, and restart" in "".join(
         reported
     )
+
+
+@pytest.mark.asyncio
+async def test_an_event_of_a_node_has_its_label_and_one_of_the_line_has_none(tmp_path: Path) -> None:
+    line = opened(tmp_path, outputs=False)
+    async with line:
+        node, point = line.bus.nodes[0]._record, line.groups["fast"].points[0]
+        events: list[BusEvent] = [
+            NodeChanged(node, Health.UP, Health.DOWN, returning=False),
+            MaxReplyDelayRaised(node, age=0.2, max_reply_delay=0.25),
+            MaxReplyDelayLowered(node, max_reply_delay=0.15),
+            RepliesLate(node, age=0.12, window=0.1),
+            AlarmChanged(point, limit="high", bound=5.0, value=6.0, active=True),
+        ]
+        assert [label_of(event) for event in events] == ["winder"] * len(events)
+        assert label_of(LineChanged(LineChange.UP)) == label_of(PortFailed("unplugged")) == ""

@@ -400,6 +400,7 @@ def test_the_log_of_a_damaged_database_that_a_reader_has_open_goes_with_it(tmp_p
             output.offer(cycle(2, 2.0))
             until(lambda: settled(output))
             assert (tmp_path / "x.db.damaged-wal").exists()
+            assert (tmp_path / "x.db.damaged-shm").exists()
             assert query(path, "select value from samples") == [(2.0,)]
 
 
