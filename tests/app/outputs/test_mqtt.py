@@ -138,6 +138,27 @@ async def test_it_says_that_it_is_there_and_the_broker_says_so_when_it_is_not(br
 
 
 @pytest.mark.asyncio
+async def test_whoever_comes_later_is_told_as_well_whether_it_is_there(broker: Broker) -> None:
+    """The status is retained, that which the broker publishes after a lost connection too."""
+    import aiomqtt
+    from paho.mqtt.subscribeoptions import SubscribeOptions
+
+    async with listening(broker, protocol=aiomqtt.ProtocolVersion.V5) as client:
+        await client.subscribe("line/status", options=SubscribeOptions(qos=1, retainAsPublished=True))
+        async with publishing(broker) as output:
+            said = await heard(client, 1)
+            output.cut()
+            said += await heard(client, 2)
+        said += await heard(client, 1)
+    assert [(payload, retained) for _, payload, retained in said] == [
+        ("online", True),
+        ("offline", True),
+        ("online", True),
+        ("offline", True),
+    ]
+
+
+@pytest.mark.asyncio
 async def test_health_of_line_and_nodes_is_retained_and_told_when_it_changes(broker: Broker) -> None:
     bus = emulated(Hcp2Controller, 5)
     controller = Hcp2Controller(bus, 5)

@@ -506,6 +506,8 @@ async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> N
     commands.close(keep)
     assert [value for value, _ in kept] == ["on", "off", MOST_AT_ONCE, MOST_AT_ONCE + 1]
     assert "before it was its turn" in kept[-1][1]
+    async with asyncio.timeout(PATIENCE):
+        await commands.answered()  # those that were under way are not waited for
 
 
 def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
