@@ -28,12 +28,14 @@ needs_mosquitto = pytest.mark.skipif(
 class Broker:
     """Can be stopped and started again on its port: what it has promised to keep, it keeps."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, certificate: Path | None = None) -> None:
+        """`certificate`: a file with a certificate and its key, with which the connection is encrypted."""
         self.port = free_port()
         self._config = folder / "mosquitto.conf"
+        encrypted = f"certfile {certificate}\nkeyfile {certificate}\n" if certificate is not None else ""
         self._config.write_text(
             f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence true\nmax_queued_messages 0\n"
-            f"persistence_location {folder}/\nuser root\n"
+            f"persistence_location {folder}/\nuser root\n{encrypted}"
         )
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -61,8 +63,8 @@ class Broker:
 
 
 @contextmanager
-def running(folder: Path) -> Iterator[Broker]:
-    broker = Broker(folder)
+def running(folder: Path, certificate: Path | None = None) -> Iterator[Broker]:
+    broker = Broker(folder, certificate)
     broker.start()
     try:
         yield broker

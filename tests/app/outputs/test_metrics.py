@@ -357,3 +357,21 @@ async def test_what_is_no_scrape_is_refused_and_the_next_one_answered(asked: byt
             assert (await reader.read()).startswith(answered)
         writer.close()
         await asyncio.to_thread(scraped, output.port)
+
+
+@pytest.mark.asyncio
+async def test_a_reply_to_head_has_the_header_of_a_scrape_and_no_page() -> None:
+    async with served() as output:
+        replies = []
+        for method in (b"HEAD", b"GET"):
+            reader, writer = await asyncio.open_connection("127.0.0.1", output.port)
+            writer.write(method + b" /metrics HTTP/1.1\r\n\r\n")
+            replies.append((await reader.read()).partition(b"\r\n\r\n"))
+            writer.close()
+    (head, _, nothing), (whole, _, page) = replies
+    assert head.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert [line.partition(b":")[0] for line in head.splitlines()] == [
+        line.partition(b":")[0] for line in whole.splitlines()
+    ]
+    assert nothing == b""
+    assert b"busmaster_line_busy" in page

@@ -20,7 +20,7 @@ from busmaster.app.outputs.sqlite import DATED, SqliteOutput, column
 from busmaster.app.service.record import Outcome, WriteRecord
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.snapshots import Snapshot
-from busmaster.errors import NoReply
+from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.app.outputs.cycles import cycle, settled, until
 from tests.patience import PATIENCE
@@ -272,7 +272,15 @@ def test_what_is_kept_holds_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> None
     assert left_in(database) <= 20 * (2 * 60 * 20 + 10)
 
 
-@pytest.mark.parametrize(("rows", "gone"), [(100, 10), (3_000, 200)])
+@pytest.mark.parametrize("limit", [0, -1.0, float("inf"), float("nan")])
+@pytest.mark.parametrize("name", ["keep_days", "keep_mb"])
+def test_a_limit_of_nothing_or_without_an_end_is_refused(name: str, limit: float) -> None:
+    given: dict[str, Any] = {name: limit}
+    with pytest.raises(InvalidCommand, match=f"{name} must be more than 0, not {limit}"):
+        SqliteSettings(path="x.db", **given)
+
+
+@pytest.mark.parametrize(("rows", "gone"), [(1, 1), (5, 1), (100, 10), (3_000, 200)])
 def test_at_once_a_tenth_is_forgotten_and_never_more_than_a_piece(
     monkeypatch: pytest.MonkeyPatch, rows: int, gone: int
 ) -> None:
@@ -280,7 +288,7 @@ def test_at_once_a_tenth_is_forgotten_and_never_more_than_a_piece(
     database = database_of(*range(rows))
     retention.forget_oldest(database, DATED)
     assert left_in(database) == rows - gone
-    assert database.execute("select min(time) from samples").fetchone() == (gone,)
+    assert database.execute("select min(time) from samples").fetchone() == (gone if gone < rows else None,)
 
 
 @pytest.mark.slow
