@@ -371,6 +371,15 @@ def test_an_end_in_milliseconds_is_refused_since_it_would_never_come() -> None:
         read_payload(b'{"value": 1, "expires": 1767225600000}')
 
 
+def test_a_password_is_the_text_of_its_file_without_the_end_of_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "password"
+    file.write_bytes(b"a secret\r\n")
+    assert MqttSettings(password_file=str(file)).password() == "a secret"
+    file.write_bytes(b"\xff\xfe")
+    with pytest.raises(InvalidCommand, match="is not text"):
+        MqttSettings(password_file=str(file)).password()
+
+
 def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommand, match="No such file"):
         MqttOutput("mqtt", MqttSettings(password_file=str(tmp_path / "none")), BUS)
