@@ -465,6 +465,17 @@ def test_a_line_is_found_by_its_name_and_by_its_port_however_that_is_written(
     assert list(owners()) == []
 
 
+def test_a_line_is_found_though_the_entry_of_a_killed_owner_was_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    path = runtime_folder() / "slitter.sock"
+    path.with_suffix(".line").write_text("{" + 1000 * " " + "}")
+    with ServedSocket(Owner("slitter", str(tmp_path / "port"), str(path), os.getpid())) as found:
+        assert find_owner("slitter") == found.owner
+
+
 @pytest.mark.parametrize(
     "spelling",
     [
