@@ -12,9 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from busmaster import Quality
 from busmaster.app.service.messages import value_of
-from busmaster.app.service.picture import Picture, Row
+from busmaster.app.service.picture import CURRENT, Picture, Row
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.remote_overview import RemoteOverview
 from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
@@ -24,7 +23,6 @@ FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 2.0
 OLD_AFTER, LEAST_AGE = 3, 1.0
 """Periods of its group, and at least seconds, after which a value without a new cycle is not current any more."""
-CURRENT = {quality.value for quality in Quality if quality.is_current}
 
 Receive = Callable[[str, Mapping[str, Any]], None]
 

@@ -17,6 +17,7 @@ OLD_AFTER = 3
 """Periods after which the age of a value is highlighted."""
 Identity: TypeAlias = tuple[str, str, int]
 """Group and key of a point, and how many like it the group has before it."""
+CURRENT = frozenset(quality.value for quality in Quality if quality.is_current)
 
 
 @dataclass(slots=True)
@@ -72,8 +73,9 @@ class Row:
 
     def doubt(self, touches: Touches) -> None:
         """Mark a good value as stale if it was requested before the end of a write to its place."""
-        fine = self.quality in (Quality.GOOD.value, Quality.LATE.value)
-        if fine and self.asked is not None and touches.is_stale(self.protocol, self.address, self.item, self.asked):
+        if self.quality not in CURRENT or self.asked is None:
+            return
+        if touches.is_stale(self.protocol, self.address, self.item, self.asked):
             self.quality = Quality.STALE.value
 
     def go_on(self, before: Row) -> None:

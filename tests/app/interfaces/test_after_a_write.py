@@ -110,6 +110,16 @@ async def test_a_lost_line_makes_every_value_bad_and_every_node_offline_before_t
         await until(lambda: {node.health for node in of.line.picture.nodes.values()} == {"offline"})
 
 
+@pytest.mark.parametrize("quality", ["late", "overheard", "bad"])
+def test_a_late_value_is_stale_after_a_write_and_one_that_was_not_current_stays_what_it_was(quality: str) -> None:
+    picture = Picture()
+    row = {"group": "g", "key": "5/10", "node": "n", "protocol": "hcp2", "address": 5, "item": "10"}
+    picture.receive("rows", {"set": 1, "first": 0, "rows": [row]})
+    picture.receive("values", {"set": 1, "first": 0, "values": [[1.0, quality, 4.0, "", ""]]})
+    picture.receive("touched", {"protocol": "hcp2", "address": 5, "when": 5.0, "items": ["10"], "all": False})
+    assert picture.rows[0].quality == ("stale" if quality == "late" else quality)
+
+
 def test_a_value_that_was_read_before_a_write_and_comes_after_it_is_stale() -> None:
     picture = Picture()
     row = {"group": "g", "key": "5/10", "node": "n", "protocol": "hcp2", "address": 5, "item": "10"}
