@@ -38,8 +38,8 @@ def listening_error(host: str, port: int, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         return f"{host}:{port} is in use by another program; end that one, or use another port"
     # the text of create_server repeats the address
-    what = error.strerror if isinstance(error, socket.gaierror) or not error.errno else os.strerror(error.errno)
-    return f"cannot listen on {host}:{port}: {what}"
+    what = os.strerror(error.errno) if error.errno and not isinstance(error, socket.gaierror) else error.strerror
+    return f"cannot listen on {host}:{port}: {what or error}"
 
 
 def listening(listen: HostPort) -> socket.socket:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import socket
 from dataclasses import replace
@@ -12,15 +13,18 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from busmaster import Hcp2Controller, RemoteBus, bounds, connect
+from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, bounds, connect
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_connection import READ_AT_ONCE, ClientConnection, MessageOrder
 from busmaster.app.service.client_messages import CancelParams, ClientMessage, RequestParams, StreamParams
 from busmaster.app.service.folder import Owner, ServedSocket
 from busmaster.app.service.messages import decode_client_message, encode_notification, encode_request
 from busmaster.app.service.outbox import Outbox
+from busmaster.app.service.streams import SAMPLES_IN_A_TURN, GroupBroadcast
 from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.emulator.line import Line as EmulatedLine
 from busmaster.errors import InvalidCommand
+from busmaster.registry import make_device
 from tests.app.service.lines import ABSENT, Served, SlowWay, on_a_line, on_a_served_line, raw, served, until
 from tests.patience import PATIENCE
 
@@ -309,3 +313,26 @@ def test_it_runs_on_uvloop_too(tmp_path: Path) -> None:
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         runner.run(run())
+
+
+@pytest.mark.asyncio
+async def test_a_long_cycle_is_encoded_in_several_turns_of_the_loop() -> None:
+    devices = [make_device("hcp2", address) for address in (1, 2)]
+    bus = Bus(MemoryPort(EmulatedLine(Hcp2Controller.profile.line, devices, paced=False)))
+    points = [Hcp2Controller(bus, address).point(str(element)) for address in (1, 2) for element in range(1, 61)]
+    loop, turns = asyncio.get_running_loop(), 0
+
+    def turn() -> None:
+        nonlocal turns
+        turns += 1
+        loop.call_soon(turn)
+
+    async with bus:
+        group = bus.poll_group("long", period=0.05, points=points)
+        async for snapshot in group:
+            turn()
+            before = turns
+            body = await GroupBroadcast(group, lambda: None)._encode(snapshot)
+            assert turns - before == len(points) // SAMPLES_IN_A_TURN
+            assert len(json.loads(bytes(body))["samples"]) == len(points)
+            break

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import errno
 import logging
 import os
 import socket
@@ -22,6 +23,7 @@ from busmaster.app.service import peers
 from busmaster.app.service.frames import NO_MASK, text_frame
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.rights import Role
+from busmaster.app.service.tcp import listening_error
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, LineDown
 from tests.app.service.lines import Raw, Served, served, until
@@ -106,7 +108,7 @@ def test_who_may_write_a_part_of_a_node_stops_it_with_a_write_that_is_let_throug
 
 
 def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("busmaster.app.service.refusals.FREE_LOGINS", 8)  # it is not slowed down yet
+    monkeypatch.setattr("busmaster.app.service.refusals.FREE_LOGINS", 9)  # it is not slowed down yet
 
     async def story(line: Served, address: str) -> None:
         for token in ("a-token-of-nobody-at-all", SECRETS["hmi"][:-1]):
@@ -116,8 +118,10 @@ def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path, monke
             await connect(address).__aenter__()
         for authorization in ("", "Basic aG1pOmE=", f"Basic {SECRETS['hmi']}", "Bearer", "Bearer \u00fc"):
             assert await refused(address, additional_headers={"Authorization": authorization}) == 401
+        several = [("Authorization", f"Bearer {SECRETS[name]}") for name in ("hmi", "hmi")]  # which of them holds?
+        assert await refused(address, additional_headers=several) == 401
         assert line.service.clients == ()
-        assert line.service.refused == 8
+        assert line.service.refused == 9
 
     on_a_port(tmp_path, story)
 
@@ -387,3 +391,22 @@ def test_a_program_that_was_busy_while_it_connected_writes_all_the_same(
             await Hcp2Controller(remote, 5).write(1, 3)
 
     on_a_port(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (
+            OSError(errno.EADDRINUSE, "error while attempting to bind"),
+            "h:1 is in use by another program; end that one, or",
+        ),
+        (
+            OSError(errno.EACCES, "error while attempting to bind"),
+            "cannot listen on h:1: Permission denied",
+        ),
+        (socket.gaierror(-2, "Name or service not known"), "cannot listen on h:1: Name or service not known"),
+        (OSError("could not bind on any address"), "cannot listen on h:1: could not bind on any address"),
+    ],
+)
+def test_why_nothing_can_listen_is_said_whatever_the_error_has(error: OSError, text: str) -> None:
+    assert listening_error("h", 1, error).startswith(text)
