@@ -90,13 +90,16 @@ def test_requests_that_are_given_up_make_room_for_others(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path: Path) -> None:
+@pytest.mark.parametrize("limit", ["start_within", "finish_within"])
+def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path: Path, limit: str) -> None:
+    options: dict[str, Any] = {limit: 0.01}
+
     async def story(line: Served, remote: RemoteBus) -> None:
         absent = Hcp2Controller(remote, ABSENT, timings=PATIENT)
         waiting = [asyncio.ensure_future(absent.read(1)) for _ in range(2 * MOST_UNDER_WAY)]
         await until(lambda: any(len(client.unfinished) == MOST_UNDER_WAY for client in line.service.clients))
         with pytest.raises(NotStarted, match="of this program have no reply yet"):
-            await Hcp2Controller(remote, 5).write(1, 7, finish_within=0.01)
+            await Hcp2Controller(remote, 5).write(1, 7, **options)
         await given_up(waiting)
         assert await Hcp2Controller(remote, 5).read(1) == 0
 
