@@ -13,7 +13,9 @@ import pytest
 from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
 from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS
+from busmaster.app.service.sequences import shortened
 from busmaster.errors import BacklogFull
+from busmaster.ext import CommandOptions
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 
@@ -199,3 +201,10 @@ def test_a_node_that_was_named_wrongly_is_asked_once_it_is_named_rightly(tmp_pat
             assert (await client.ask("request", **READ))["result"] == 0
 
     on_a_line(tmp_path, story)
+
+
+def test_r12_the_times_of_a_request_that_has_waited_are_shorter_by_that() -> None:
+    given: CommandOptions = {"start_within": 1.0, "finish_within": 2.0, "retries": 3}
+    assert shortened(given, 0.5) == {"start_within": 0.5, "finish_within": 1.5, "retries": 3}
+    assert shortened(given, 1.5) == {"start_within": 0.0, "finish_within": 0.5, "retries": 3}
+    assert shortened({}, 1.5) == {}
