@@ -30,7 +30,7 @@ Microseconds = Annotated[int, Meta(description="Microseconds of the owner's mono
 RequestId = Annotated[
     int, Meta(description="A number of the client's own; two requests in progress must not have the same.")
 ]
-ProtocolName = Annotated[str, Meta(description="The name of a protocol, such as hcp2.")]
+ProtocolName = Annotated[str, Meta(description="The name of a protocol.")]
 Address = Annotated[int, Meta(ge=0, le=LARGEST_ADDRESS, description="The address of a node in its protocol.")]
 StreamNumber = Annotated[int, Meta(ge=0, le=LARGEST_STREAM, description="A number of the client's own.")]
 Sequence = Annotated[int, Meta(ge=0, description="A number of the client's own.")]
