@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import socket
 import ssl
@@ -90,6 +91,8 @@ async def test_a_broker_without_a_trusted_certificate_gets_nothing_and_this_is_r
         counts = output.statistics()
     assert (counts.written, counts.waiting) == (0, 1)
     assert not tls or "certificate" in counts.error
+    del output
+    gc.collect()  # here, and not in another test, which would fail
 
 
 def test_decrypted_bytes_that_are_not_read_yet_are_counted(trusted: Path) -> None:
