@@ -91,7 +91,6 @@ async def test_a_broker_without_a_trusted_certificate_gets_nothing_and_this_is_r
         counts = output.statistics()
     assert (counts.written, counts.waiting) == (0, 1)
     assert not tls or "certificate" in counts.error
-    del output
     gc.collect()  # here, and not in another test, which would fail
 
 
