@@ -29,35 +29,36 @@ STATUSES = {
     "128 + N": "Signal N ended it. `run` and `serve` end with 0 after SIGTERM.",
 }
 """Exit statuses of all commands. The help of a command states further meanings."""
-COMMANDS = (
-    "demo",
-    "read",
-    "write",
-    "do",
-    "poll",
-    "trend",
-    "scan",
-    "discover",
-    "emulate",
-    "run",
-    "serve",
-    "status",
-    "top",
-    "web",
-    "opcua",
-    "safe",
-    "check",
-    "migrate",
-    "plan",
-    "points",
-    "monitor",
-    "doctor",
-    "bench",
-    "replay",
-    "items",
-    "params",
-)
-"""One module of this package each, which defines `command`; imported only when it is used."""
+COMMANDS = {
+    "demo": "Show an emulated line of drives, polled live.",
+    "read": "Read values of one node, or of a file's points.",
+    "write": "Write values of one node, or of a file's points.",
+    "do": "Enable, disable or reset a drive.",
+    "poll": "Read values of several nodes periodically.",
+    "trend": "Sample and plot a few values as fast as the line allows.",
+    "scan": "Find the nodes that reply.",
+    "discover": "Identify the nodes on an unknown line.",
+    "emulate": "Emulate drives on a pseudo-terminal or a TCP port.",
+    "run": "Poll the groups of a file, and feed its outputs.",
+    "serve": "Run a file's line without a screen, for other programs.",
+    "status": "List the running lines of this user.",
+    "top": "Show a line of another program, live.",
+    "web": "Serve a page and a REST API for a line of another program.",
+    "opcua": "Serve a line of another program by OPC UA.",
+    "safe": "Send the safe state of a file, and verify it.",
+    "check": "Check a file without opening its port.",
+    "migrate": "Convert a file of an older version.",
+    "plan": "Calculate whether the polls of a file fit its line.",
+    "points": "Show the points of a file as a table, or import them from one.",
+    "monitor": "Listen to a line and decode its frames.",
+    "doctor": "Diagnose a port, an adapter or a line.",
+    "bench": "Measure the latency and throughput of a line.",
+    "replay": "Decode a capture again, and show differences.",
+    "items": "List the items in a protocol's documents.",
+    "params": "Save, compare and load the parameters of a node.",
+}
+"""The commands, each with its line in `busmaster --help`. The module of that name, imported when it is used, has it as
+`command`."""
 INTERFACES = "busmaster.interfaces"
 """The group of entry points by which a package brings an interface: each names a click command, whose name is that
 of the entry. docs/adding-an-interface.md shows a whole one."""
@@ -73,9 +74,17 @@ class Commands(click.Group):
         if cmd_name in COMMANDS:
             command = importlib.import_module(f"busmaster.app.cli.{cmd_name}").command
             assert isinstance(command, click.Command)
+            command.short_help = COMMANDS[cmd_name]
             return command
         found = [entry for entry in installed_interfaces() if entry.name == cmd_name]
         return loaded_interface(found[0]) if found else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands in the help, without importing those of this package: that would take most of its time."""
+        texts = dict(COMMANDS)
+        texts |= {entry.name: loaded_interface(entry).get_short_help_str() for entry in installed_interfaces()}
+        with formatter.section("Commands"):
+            formatter.write_dl(list(texts.items()))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -46,7 +46,7 @@ BAR = 40
 HEAD = ("LATENCY, ms", "COUNT", "MEAN", *FIGURES)
 
 
-@click.command(short_help="Measure the latency and throughput of a line.", cls=NodeCommand)
+@click.command(cls=NodeCommand)
 @click.argument("port", required=False)
 @protocol_option(required=False, text="One of {}.")
 @nodes_option

@@ -23,7 +23,7 @@ def print_schema(context: click.Context, option: click.Parameter, wanted: bool) 
         context.exit(OK)
 
 
-@click.command(short_help="Check a file without opening its port.")
+@click.command()
 @file_argument()
 @json_option
 @click.option(

@@ -26,7 +26,7 @@ SPEEDS = (25.0, -40.0, 60.0, 0.0, 80.0, -15.0, 40.0)
 """References in %, one drive after another; more of them than drives, so that each gets another the next time round."""
 
 
-@click.command(short_help="Show an emulated line of drives, polled live.")
+@click.command()
 @seconds_option
 @plain_option
 def command(seconds: float | None, plain: bool) -> int:

@@ -39,7 +39,7 @@ class Job:
     tried: Sequence[Step]
 
 
-@click.command(short_help="Identify the nodes on an unknown line.")
+@click.command()
 @click.argument("port")
 @click.option("--yes", is_flag=True, help="Send without a question.")
 @click.option(

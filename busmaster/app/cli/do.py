@@ -51,11 +51,8 @@ def action_lines() -> Iterator[str]:
             yield from textwrap.wrap(action.about, WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
 
 
-@click.command(
-    short_help="Enable, disable or reset a drive.",
-    cls=ActionCommand,
-    context_settings={"ignore_unknown_options": True},  # numbers below 0
-)
+# a number below 0 is an argument
+@click.command(cls=ActionCommand, context_settings={"ignore_unknown_options": True})
 @partial(connected, or_file=True, port=False)
 @click.argument("node", metavar=NODE_AT)
 @click.argument("action", metavar="ACTION")

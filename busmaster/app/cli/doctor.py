@@ -27,7 +27,7 @@ USUAL = LineSettings(9600)
 """Line settings of the port if neither a protocol nor the user defines them."""
 
 
-@click.command(short_help="Diagnose a port, an adapter or a line.")
+@click.command()
 @click.argument("port")
 @protocol_option(required=False)
 @nodes_option

@@ -28,7 +28,7 @@ LOOK_FOR_SIGNALS = 0.2
 """Seconds from one look to the next."""
 
 
-@click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
+@click.command()
 @file_argument(required=False)
 @protocol_option(required=False, text="Protocol without a file. One of {}.")
 @nodes_option

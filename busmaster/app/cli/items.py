@@ -17,7 +17,7 @@ from busmaster.registry import NodeKind, find
 HEAD = ("ITEM", "NUMBER", "UNIT", "ACCESS", "MEANING")
 
 
-@click.command(short_help="List the items in a protocol's documents.")
+@click.command()
 @click.argument("protocol", type=option_type(parse_protocol))
 @click.argument("words", nargs=-1, metavar="[WORD]...")
 @json_option

@@ -13,7 +13,7 @@ from busmaster.app.config import migration
 from busmaster.app.line.points_taking import write_beside
 
 
-@click.command(short_help="Convert a file of an older version.")
+@click.command()
 @file_argument()
 @click.option("--write", is_flag=True, help="Change the file. Without this option, the changes are only printed.")
 def command(path: str, write: bool) -> int:

@@ -35,7 +35,7 @@ BEAT = 0.05
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
-@click.command(short_help="Listen to a line and decode its frames.")
+@click.command()
 @click.argument("port", metavar="PORT|LINE.toml")
 @protocol_option(required=False)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")

@@ -18,7 +18,7 @@ FILE = click.Path(exists=True, dir_okay=False)
 FOLDER = click.Path(exists=True, file_okay=False)
 
 
-@click.command(short_help="Serve a line of another program by OPC UA.")
+@click.command()
 @interface_options(BIND)
 @click.option(
     "--allow",

@@ -74,7 +74,7 @@ class Subcommands(click.Group):
         return super().resolve_command(ctx, args)
 
 
-@click.group(short_help="Save, compare and load the parameters of a node.", cls=Subcommands)
+@click.group(cls=Subcommands)
 def command() -> None:
     """Save the parameters of a node to a file, compare files and nodes, and write a file to a node.
 

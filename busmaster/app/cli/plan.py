@@ -25,7 +25,7 @@ SOME = 8
 HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "MISSED")
 
 
-@click.command(short_help="Calculate whether the polls of a file fit its line.")
+@click.command()
 @file_argument()
 @json_option
 def command(path: str, as_json: bool) -> int:

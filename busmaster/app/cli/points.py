@@ -20,7 +20,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.ext import read_file
 
 
-@click.command(short_help="Show the points of a file as a table, or import them from one.")
+@click.command()
 @file_argument()
 @click.option("--csv", "as_csv", is_flag=True, help="Print the points as CSV.")
 @click.option(

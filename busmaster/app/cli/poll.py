@@ -28,7 +28,7 @@ KEPT = 1_001
 """Maximum number of cycles whose periods are in the summary."""
 
 
-@click.command(short_help="Read values of several nodes periodically.", cls=ItemCommand)
+@click.command(cls=ItemCommand)
 @connected
 @nodes_option
 @click.option("--items", required=True, type=option_type(parse_items), metavar="ITEM,ITEM...", help="Items to read.")

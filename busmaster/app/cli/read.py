@@ -32,7 +32,7 @@ class ItemsReadCommand(ItemCommand):
         return [*super().offers(), *read_options()]
 
 
-@click.command(short_help="Read values of one node, or of a file's points.", cls=ItemsReadCommand)
+@click.command(cls=ItemsReadCommand)
 @partial(connected, or_file=True)
 @node_option
 @click.argument("items", nargs=-1, required=True, metavar="ITEM...")

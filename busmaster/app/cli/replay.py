@@ -17,7 +17,7 @@ CHANGED = 1
 COUNTED = ("same", "changed", "unjudged")
 
 
-@click.command(short_help="Decode a capture again, and show differences.")
+@click.command()
 @click.argument("capture", type=click.Path(exists=True, dir_okay=False))
 @json_option
 def command(capture: str, as_json: bool) -> int:

@@ -36,7 +36,7 @@ CLOSE_WITHIN = 2.0
 """Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
 
 
-@click.command(short_help="Poll the groups of a file, and feed its outputs.")
+@click.command()
 @file_argument()
 @port_option
 @capture_option

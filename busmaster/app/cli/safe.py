@@ -24,7 +24,7 @@ from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import BusEvent, PortFailed, Stream
 
 
-@click.command(short_help="Send the safe state of a file, and verify it.")
+@click.command()
 @file_argument()
 @port_option
 @capture_option

@@ -27,7 +27,7 @@ STRANGERS = 16
 """Maximum number of silent nodes that are tried in another protocol."""
 
 
-@click.command(short_help="Find the nodes that reply.", cls=NodeCommand)
+@click.command(cls=NodeCommand)
 @connected
 @nodes_option
 @json_option

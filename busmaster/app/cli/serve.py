@@ -11,7 +11,7 @@ from busmaster.app.cli.lines import file_argument, port_option
 from busmaster.app.cli.run import run
 
 
-@click.command(short_help="Run a file's line without a screen, for other programs.")
+@click.command()
 @file_argument()
 @port_option
 @capture_option

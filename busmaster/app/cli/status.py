@@ -28,7 +28,7 @@ REFUSED = {
 """What the owner has counted, and how it is named."""
 
 
-@click.command(short_help="List the running lines of this user.")
+@click.command()
 @json_option
 def command(as_json: bool) -> int:
     """List the lines that programs of this user serve, and those of the system in /run/busmaster.

@@ -30,7 +30,7 @@ TERMINAL_LOOKED_AT = 1.0
 """Seconds between two looks at whether the terminal is still there."""
 
 
-@click.command(short_help="Show a line of another program, live.")
+@click.command()
 @click.argument("line", required=False, metavar="[LINE|unix:PATH|PORT]")
 @click.option("--read-only", is_flag=True, help="Reject writes from keys.")
 @click.option("--of-owner", is_flag=True, hidden=True, help="Run as the view of the program that owns the line.")

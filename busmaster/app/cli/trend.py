@@ -60,7 +60,7 @@ OTHER_SCREEN, USUAL_SCREEN = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
 MISSING = "the live plot needs plotext, which the extra named trend brings: pip install 'busmaster[trend]'"
 
 
-@click.command(short_help="Sample and plot a few values as fast as the line allows.", cls=ItemCommand)
+@click.command(cls=ItemCommand)
 @partial(connected, or_file=True)
 @click.argument("names", nargs=-1, required=True, metavar="NODE/ITEM...")
 @click.option(

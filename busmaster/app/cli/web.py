@@ -19,7 +19,7 @@ HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A
 NEEDED = ("msgspec", "starlette", "uvicorn", "websockets")
 
 
-@click.command(short_help="Serve a page and a REST API for a line of another program.")
+@click.command()
 @interface_options(BIND)
 @click.option("--token-file", metavar="FILE", help="Users who may write: a name and a token on each line.")
 @click.option(

@@ -33,7 +33,7 @@ Pairs = Sequence[Assignment]
 """The writes in their order: items, or points of a file, and their values."""
 
 
-@click.command(short_help="Write values of one node, or of a file's points.", cls=ItemCommand)
+@click.command(cls=ItemCommand)
 @partial(connected, or_file=True)
 @node_option
 @click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]|ITEM=@FILE...")
