@@ -35,6 +35,15 @@ class Verdict:
     diff: str
 
 
+def is_python(code: str) -> bool:
+    """Whether it can be compiled: an operator may put `not` before an assignment expression."""
+    try:
+        compile(code, "mutant", "exec")
+    except SyntaxError:
+        return False
+    return True
+
+
 class Copy:
     """A copy of what is committed, where files may be changed, and warm processes that run its tests."""
 
@@ -56,7 +65,7 @@ class Copy:
         path = self.folder / mutant.module
         source = path.read_text()
         mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
-        if mutated is None or mutated == source:
+        if mutated is None or mutated == source or not is_python(mutated):
             return Verdict("impossible", 0.0, "", "")
         before = path.stat()
         path.write_text(mutated)
