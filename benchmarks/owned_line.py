@@ -1,6 +1,6 @@
 """A line that is owned and served by a process of its own: what others pay for asking through its socket.
 
-`python -m benchmarks.owned_line` is told the port in a line of JSON (with `"library": true`, the library reads all
+`python -m benchmarks.owned_line` reads the port from a line of JSON (with `"library": true`, the library reads all
 frames), and prints the socket's address, and the path of a
 bare one, where whatever comes is answered, after the same read, with as many bytes as an answer has. Each further line
 is an order: {"reads": 100} has it read so often itself, one after the other, and print the seconds that each took;

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from busmaster.app.service.messages import value_of
-from busmaster.app.service.picture import CURRENT, Picture, Row
+from busmaster.app.service.picture import CURRENT, OLD_AFTER, Picture, Row
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.remote_overview import RemoteOverview
 from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
@@ -21,8 +21,9 @@ from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
 FIRST_PAUSE = 0.25
 """Seconds before it is tried again to connect; each time twice as long, up to `LONGEST_PAUSE`."""
 LONGEST_PAUSE = 2.0
-OLD_AFTER, LEAST_AGE = 3, 1.0
-"""Periods of its group, and at least seconds, after which a value without a new cycle is not current any more."""
+LEAST_AGE = 1.0
+"""Seconds without a cycle of its group, at least, after which a value is not current any more. The group may be slower:
+then it is OLD_AFTER of its periods."""
 
 Receive = Callable[[str, Mapping[str, Any]], None]
 

@@ -11,7 +11,7 @@ from busmaster import Node, Point, ext
 from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
 from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.encoding import protocol_of
-from busmaster.app.service.fields import OptionsForm
+from busmaster.app.service.fields import OptionsForm, shortened
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.peers import Peer
@@ -281,7 +281,7 @@ class Writing:
                     hint="check whether the requesting program, or the owner of the line, was stopped meanwhile",
                 )
             self._request.options = ext.checked_options(
-                self.node, _left(self._options, self._line.bus.now() - self._asked)
+                self.node, shortened(self._options, self._line.bus.now() - self._asked)
             )
             value = await ext.run(self.node, self._request)
         except BaseException as error:
@@ -341,7 +341,7 @@ def client_request_of(params: RequestParams | WriteParams, sender: RequestSender
     now = line.bus.now()
     asked = now if params.requested is None else min(now, seconds(params.requested, "requested"))
     if not command.writes:
-        options = RequestOptions.of(_left(given, now - asked), node.label)
+        options = RequestOptions.of(shortened(given, now - asked), node.label)
         options = replace(options, priority=max(options.priority, sender.rights.reads))
         return Reading(node, command, client, stops_seen, options)
     return Writing(task, given, line=line, sender=sender, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
@@ -364,16 +364,6 @@ def _check_waits(options: CommandOptions, node: Node) -> None:
             raise InvalidCommand(
                 f"{node.label}: {name} is {LONGEST_WAIT:g} s at most, not {limit:g} s: leave it out for no limit"
             )
-
-
-def _left(options: CommandOptions, age: float) -> CommandOptions:
-    """Return the options of a request, reduced by the seconds since it was made."""
-    left: dict[str, Any] = dict(options)
-    for name in ("start_within", "finish_within"):
-        limit = left.get(name)
-        if isinstance(limit, int | float):
-            left[name] = max(0.0, limit - age)
-    return cast("CommandOptions", left)
 
 
 def _encoded(point: Point[Any], value: Any) -> Command[Any]:

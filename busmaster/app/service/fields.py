@@ -7,6 +7,7 @@ from typing import Annotated, Any, TypeAlias
 from busmaster import Health, Priority, Quality
 from busmaster.app.service.typed import UNSET, Meta, Raw, Struct, UnsetType
 from busmaster.bounds import LONGEST_REPLY, LONGEST_WAIT, MOST_RETRIES
+from busmaster.ext import CommandOptions
 
 LARGEST_STREAM = 2**53
 """The largest whole number that every client has, JavaScript included."""
@@ -84,6 +85,16 @@ class OptionsForm(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults
     finish_within: WaitLimit | None = None
     retries: Annotated[int, Meta(ge=0, le=MOST_RETRIES)] | None = None
     idempotent: bool | None = None
+
+
+def shortened(options: CommandOptions, by: float) -> CommandOptions:
+    """Return the options of a request that has waited, its times reduced by that. Both ends do this."""
+    left = options.copy()
+    if (start_within := left.get("start_within")) is not None:
+        left["start_within"] = max(0.0, start_within - by)
+    if (finish_within := left.get("finish_within")) is not None:
+        left["finish_within"] = max(0.0, finish_within - by)
+    return left
 
 
 LimitedTime = Annotated[float, Meta(ge=0, description=f"Seconds; at most {LONGEST_REPLY:g}.")]

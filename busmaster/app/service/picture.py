@@ -14,7 +14,7 @@ from busmaster.app.service.touches import Touches
 KEPT_VALUES = 120
 """Of each point, for its trend."""
 OLD_AFTER = 3
-"""Periods after which the age of a value is highlighted."""
+"""Periods of its group after which a value is old."""
 Identity: TypeAlias = tuple[str, str, int]
 """Group and key of a point, and how many like it the group has before it."""
 CURRENT = frozenset(quality.value for quality in Quality if quality.is_current)

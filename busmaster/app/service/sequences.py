@@ -67,16 +67,6 @@ class RequestLimit:
             raise
 
 
-def shortened(options: CommandOptions, by: float) -> CommandOptions:
-    """Return the options of a request that has waited, its times reduced by that."""
-    left = options.copy()
-    if (start_within := left.get("start_within")) is not None:
-        left["start_within"] = max(0.0, start_within - by)
-    if (finish_within := left.get("finish_within")) is not None:
-        left["finish_within"] = max(0.0, finish_within - by)
-    return left
-
-
 class AsksInSequence(Requester, Protocol):
     """A node of a line that another program owns."""
 

@@ -12,8 +12,8 @@ import pytest
 
 from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
 from busmaster.app.service.authorisation import FRESH
+from busmaster.app.service.fields import shortened
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS
-from busmaster.app.service.sequences import shortened
 from busmaster.errors import BacklogFull
 from busmaster.ext import CommandOptions
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
