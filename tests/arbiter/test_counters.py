@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter.counters import (
+    BATCH,
     DriverErrors,
     Histogram,
     LineStatistics,
@@ -18,7 +19,7 @@ from busmaster.arbiter.counters import (
 )
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench
+from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench, up
 
 REQUEST = 8 * TAU
 Story = Callable[[Bench, NodeRecord], None]
@@ -199,3 +200,14 @@ def test_the_recent_utilisation_begins_anew_when_the_statistics_are_reset() -> N
     reset = replace(idle, busy=0.5, quiet_time=0.0)
     assert recent.note(5.0, reset) == reset.utilisation
     assert recent.note(6.0, replace(idle, busy=0.5, quiet_time=0.5)) == pytest.approx(0.5)
+
+
+def test_r12_times_that_are_not_in_buckets_yet_are_bounded() -> None:
+    bench = Bench()
+    node = up(bench)
+    for _ in range(BATCH + 10):
+        bench.served(bench.ask(node))
+    line, of_node = bench.arbiter._counters, node.counters
+    for histogram in (*line.waits, of_node.latency):
+        assert len(histogram.new) < BATCH
+    assert of_node.latency.count >= BATCH + 10

@@ -112,7 +112,7 @@ class Following:
         It is an old one if the owner is away, if the last read failed, and after a write to its place. It is also old
         if its group had no cycle for some time, because the group is paused or the owner is stopped.
         """
-        if not self.is_connected or self._remote is None or row.asked is None or row.quality not in CURRENT:
+        if self._remote is None or row.asked is None or row.quality not in CURRENT:
             return False
         return not self.old_groups({row.group: row.asked}, self._remote.now())
 
