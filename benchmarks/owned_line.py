@@ -129,7 +129,7 @@ class Owner:
 async def serve(watch: Watch) -> int:
     order = json.loads(sys.stdin.readline())
     if order.get("library"):
-        client_connection.IncomingConnection = LibraryIncomingConnection  # type: ignore[misc]  # for this process
+        client_connection.IncomingConnection = LibraryIncomingConnection  # type: ignore[attr-defined]  # for this process
     with tempfile.TemporaryDirectory() as folder:
         async with (
             Bus(SerialPort(order["port"], baudrate=57600, paced=False)) as bus,
