@@ -31,7 +31,7 @@ from busmaster.app.service.owner_messages import (
     TimelineForm,
     ValuesBody,
 )
-from busmaster.app.service.streams import READERS_IN_A_TURN, Broadcast, Place
+from busmaster.app.service.streams import Broadcast, Place
 from busmaster.app.service.typed import Raw
 from busmaster.app.service.values import event_text, value_text
 from busmaster.events import AlarmChanged
@@ -161,11 +161,8 @@ class Overview(Broadcast):
             await asyncio.sleep(INTERVAL)
 
     async def _send(self, method: str, part: int, body: bytes, places: Sequence[Place]) -> None:
-        for number, place in enumerate(places):
-            if number and number % READERS_IN_A_TURN == 0:
-                await asyncio.sleep(0)
-            if place in self.readers:
-                place[0].notify_surely(place[1], method, Raw(body), part)
+        async for reader, stream in self._in_turns(places):
+            reader.notify_surely(stream, method, Raw(body), part)
 
     # points
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
 from typing import Any, Protocol
 
 from busmaster import Bus, Point, PollGroup, Snapshot
@@ -70,11 +70,16 @@ class Broadcast:
     async def _notify(self) -> None:
         async with contextlib.aclosing(self._bodies()) as bodies:
             async for method, body in bodies:
-                for number, (reader, stream) in enumerate(list(self.readers)):
-                    if number and number % READERS_IN_A_TURN == 0:
-                        await asyncio.sleep(0)
-                    if (reader, stream) in self.readers:
-                        reader.notify(stream, method, body)
+                async for reader, stream in self._in_turns(tuple(self.readers)):
+                    reader.notify(stream, method, body)
+
+    async def _in_turns(self, places: Sequence[Place]) -> AsyncGenerator[Place, None]:
+        """Yield those of the places that have not left, a few in one turn of the line's loop."""
+        for number, place in enumerate(places):
+            if number and number % READERS_IN_A_TURN == 0:
+                await asyncio.sleep(0)
+            if place in self.readers:
+                yield place
 
     def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
         raise NotImplementedError

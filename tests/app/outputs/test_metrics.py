@@ -104,6 +104,9 @@ async def count_and_scrape() -> None:
     assert 0 < of(metrics, "line_utilisation_ratio") <= 1
     assert of(metrics, "output_dropped_total", output="sqlite") == 2
     assert of(metrics, "output_up", output="sqlite") == 0
+    # What has not happened yet is there with 0: an alert on an increase sees the first one too.
+    for role in ("read", "write", "admin", "safe", "unknown"):
+        assert of(metrics, "connections_refused_total", role=role) == 0
 
 
 def test_the_utilisation_of_the_line_is_of_the_last_seconds() -> None:

@@ -473,6 +473,12 @@ async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.Mon
     serving = asyncio.ensure_future(commands.serve(authorisation.write, authorisation.refuse, answers.put, lambda: 0))
     try:
         assert await said.get() == "7 refused commands got neither a reply nor an audit entry"
+        before = commands.unanswered
+        for _ in range(MOST_COMMANDS + 7):
+            commands.arrive(cast("Message", Arrived(b"1")))
+        new = commands.unanswered - before
+        assert new >= 7
+        assert await said.get() == f"{new} refused commands got neither a reply nor an audit entry"
     finally:
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,6 +16,8 @@ from busmaster.app.service.client_messages import CancelParams, RequestParams
 from busmaster.app.service.connection import IncomingConnection
 from busmaster.app.service.messages import decode_client_message, encode_notification, encode_request
 from busmaster.app.service.sequences import RequestLimit
+from busmaster.app.service.streams import READERS_IN_A_TURN, Broadcast
+from busmaster.app.service.typed import Raw
 from busmaster.bus.requester import ORDINARY, Requester, RequestOptions
 from busmaster.errors import NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -138,3 +142,37 @@ def test_a_request_that_could_not_be_begun_leaves_its_number_free(tmp_path: Path
             assert (await client.ask("request", **read))["result"] == 0
 
     on_a_line(tmp_path, story)
+
+
+@pytest.mark.asyncio
+async def test_many_readers_of_a_stream_get_a_message_a_few_in_each_turn_of_the_loop() -> None:
+    class Messages(Broadcast):
+        async def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
+            yield "cycle", Raw(b"{}")
+            await asyncio.Event().wait()
+
+    class Reader:
+        def __init__(self) -> None:
+            self.turn: int | None = None
+
+        def notify(self, stream: int, method: str, body: Raw) -> None:
+            self.turn = turn
+
+        def notify_surely(self, stream: int, method: str, body: Raw, part: int = 0) -> None:
+            raise AssertionError(method)
+
+    turn = 0
+    source, readers = Messages(lambda: None), [Reader() for _ in range(4 * READERS_IN_A_TURN)]
+    for reader in readers:
+        source.join(reader, 1)
+    gone = readers[-1]
+    while readers[-2].turn is None:
+        await asyncio.sleep(0)
+        turn += 1
+        if gone in [reader for reader, _ in source.readers] and readers[0].turn is not None:
+            source.leave(gone, 1)
+    turns = Counter(reader.turn for reader in readers if reader is not gone)
+    assert [*turns.values()] == [READERS_IN_A_TURN] * 3 + [READERS_IN_A_TURN - 1]
+    assert gone.turn is None, "one that has left gets no message"
+    for reader in readers[:-1]:
+        source.leave(reader, 1)
