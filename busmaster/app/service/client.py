@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from itertools import islice
@@ -98,7 +99,7 @@ class Client:
     ) -> None:
         self.peer = peer
         self.in_safe_place = in_safe_place
-        self.dropped: dict[Hashable, int] = {}
+        self.dropped = Counter[Hashable]()
         """Of each stream, how many messages the client was too slow for."""
         self.outbox = outbox
         self._line = line
@@ -150,11 +151,11 @@ class Client:
 
     def notify(self, stream: int, method: str, body: Raw) -> None:
         """Send a message of a stream; it is dropped if the client does not keep up."""
-        self.outbox.put_droppable(stream, encode_stream_message(method, stream, self.dropped.get(stream, 0), body))
+        self.outbox.put_droppable(stream, encode_stream_message(method, stream, self.dropped[stream], body))
 
     def notify_surely(self, stream: int, method: str, body: Raw, part: int = 0) -> None:
         """Send a message about a part of a stream, which replaces an earlier unsent one."""
-        message = encode_stream_message(method, stream, self.dropped.get(stream, 0), body)
+        message = encode_stream_message(method, stream, self.dropped[stream], body)
         self.outbox.put_latest((stream, method, part), message)
 
     def notify_access(self) -> None:

@@ -42,7 +42,7 @@ class RemoteGroup(Cycles):
         self._end_stream = end
         self._own = points
         self._points = points
-        self._set = -1
+        self._set: int | None = None
         self._stream: int | None = None
         self._opening: asyncio.Task[None] | None = None
 

@@ -337,7 +337,7 @@ class Service:
         in_safe_place = self._admission.admit(permission, self._clients, safe_only=params.safe_only)
 
         def drop(stream: object) -> None:
-            client.dropped[stream] = client.dropped.get(stream, 0) + 1
+            client.dropped[stream] += 1
 
         self._count += 1
         outbox = Outbox(connection.websocket, drop)

@@ -328,3 +328,14 @@ def test_what_an_emulated_device_cannot_be_is_said_with_its_place_and_nearest_na
         emulated_line(read(Source("line.toml", text)))
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_pace_and_seed_of_a_command_go_before_those_of_the_file() -> None:
+    for paced in (True, False):
+        said = str(paced).lower()
+        file = read(Source("line.toml", f"{node('hcp2', 5)}[emulator]\npaced = {said}\nseed = 7\n"))
+        assert emulated_line(file).paced is paced
+        assert emulated_line(file, paced=not paced).paced is not paced
+    first = emulated_line(file, seed=8).chance.random()
+    assert emulated_line(file, seed=8).chance.random() == first
+    assert emulated_line(file, seed=7).chance.random() == emulated_line(file).chance.random() != first

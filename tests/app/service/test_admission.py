@@ -199,6 +199,19 @@ def test_a_report_comes_at_once_and_then_once_a_minute_with_the_count() -> None:
     run_in_virtual_time(run())
 
 
+def test_what_an_interface_refuses_is_counted_from_0_on_and_logins_apart() -> None:
+    async def run() -> None:
+        refusals = Refusals()
+        refusals.begin("web", "logins")
+        refusals.begin("web", "requests")
+        assert (refusals.logins, refusals.at_interfaces) == ({"web": 0}, {("web", "requests"): 0})
+        refusals.note("web", "logins", "192.0.2.1", 3)
+        refusals.note("web", "requests", "192.0.2.1", 2)
+        assert (refusals.logins, refusals.at_interfaces) == ({"web": 3}, {("web", "requests"): 2})
+
+    run_in_virtual_time(run())
+
+
 def test_what_a_report_keeps_of_many_peers_is_bounded() -> None:
     async def run() -> None:
         reported: list[int] = []

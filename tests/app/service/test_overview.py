@@ -225,6 +225,7 @@ def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> Non
         assert (told["high"], told["low"], told["command"]) == (40, None, "read element 10")
         times = told["timeline"]
         assert times["queued"] <= times["started"] < times["first_byte"] <= times["last_byte"]
+        assert times["started"] - 0.02 < told["due"] <= times["started"]
         with pytest.raises(InvalidCommand, match="no poll group 'none'"):
             await view.details("none", "5/10")
 

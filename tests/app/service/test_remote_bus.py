@@ -224,7 +224,9 @@ def test_a_node_that_only_a_program_named_leaves_the_line_with_it(tmp_path: Path
     on_a_served_line(tmp_path, story)
 
 
-def test_a_node_with_other_timings_than_the_owners_is_refused_by_its_first_request(tmp_path: Path) -> None:
+def test_a_node_with_other_timings_than_the_owners_is_refused_by_its_first_request(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         Hcp2Controller(line.bus, 5)
         with pytest.raises(InvalidCommand, match="other timings"):
@@ -232,6 +234,7 @@ def test_a_node_with_other_timings_than_the_owners_is_refused_by_its_first_reque
         assert await Hcp2Controller(remote, 6, timings=PATIENT, retries=1).read(1) == 0
 
     on_a_served_line(tmp_path, story)
+    assert not caplog.records
 
 
 def test_a_poll_group_of_the_owner_is_read_as_there(tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch
         await asyncio.sleep(0)
         gone.cancel()
         await asyncio.gather(gone, return_exceptions=True)
+        assert not room.take()
         room.give_back()
         assert room.take()
 
