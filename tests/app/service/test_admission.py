@@ -204,10 +204,10 @@ def test_what_an_interface_refuses_is_counted_from_0_on_and_logins_apart() -> No
         refusals = Refusals()
         refusals.begin("web", "logins")
         refusals.begin("web", "requests")
-        assert (refusals.logins, refusals.at_interfaces) == ({"web": 0}, {("web", "requests"): 0})
+        assert (refusals.logins, refusals.at_interfaces) == ({"service": 0, "web": 0}, {("web", "requests"): 0})
         refusals.note("web", "logins", "192.0.2.1", 3)
         refusals.note("web", "requests", "192.0.2.1", 2)
-        assert (refusals.logins, refusals.at_interfaces) == ({"web": 3}, {("web", "requests"): 2})
+        assert (refusals.logins, refusals.at_interfaces) == ({"service": 0, "web": 3}, {("web", "requests"): 2})
 
     run_in_virtual_time(run())
 
