@@ -85,7 +85,7 @@ long to understand as a request, and no client needs so many: the connection of 
 MOST_REQUESTS = 256
 """Requests of one client that have not been answered."""
 MOST_URGENT = 16
-"""Urgent requests that are taken beyond those."""
+"""Urgent requests, and the safe state, that are taken beyond those."""
 MOST_UNDER_WAY = MOST_REQUESTS // 2
 """Requests of one client, none of them urgent, that it has sent and that are not answered: the others wait in the
 client. As many again may have been given up by it, and still be known to the owner."""

@@ -70,7 +70,7 @@ class Requests:
         """Start to send the safe state. Raises Malformed if the number belongs to a request without a reply."""
         self.check_number(number)
         try:
-            self._check_room(urgent=False)
+            self._check_room(urgent=True)  # ordinary requests that wait must not keep the safe state from the line
             sending = self._line.safe_writes.begin(params.writes, self._sender.peer)
         except REFUSED as error:
             self._refuse(number, refusal_of("safe", error))

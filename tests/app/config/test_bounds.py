@@ -13,6 +13,7 @@ from busmaster.app.config import LineFile
 from busmaster.app.config.names import expanded
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import FileError, Source
+from busmaster.app.config.table import Table
 from busmaster.app.line import ConfiguredLine
 from busmaster.errors import InvalidCommand
 from busmaster.files import read_file
@@ -25,6 +26,15 @@ address = "1-9"
 period = 1
 points = ["d1-9/1"]
 """
+
+
+def test_a_number_may_be_either_of_its_limits_and_none_beyond() -> None:
+    table = Table(Source("line.toml", "low = 2\nhigh = 5\nbelow = 1\nabove = 6\n"))
+    for read_number in (table.whole, table.seconds):
+        assert [read_number(key, least=2, most=5) for key in ("low", "high")] == [2, 5]
+        for key in ("below", "above"):
+            with pytest.raises(FileError, match=f"{key}: must be .*2 to 5, not {table.data[key]}"):
+                read_number(key, least=2, most=5)
 
 
 def parsed(text: str) -> LineFile:

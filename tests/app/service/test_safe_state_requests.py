@@ -145,6 +145,35 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
     on_a_line(tmp_path, TEXT + SAFE, story)
 
 
+def test_ordinary_requests_that_wait_do_not_keep_it_from_the_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
+    monkeypatch.setattr("busmaster.app.service.requests.MOST_URGENT", 1)
+    send = SafeStateRequests._send
+
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        go_on = asyncio.Event()
+
+        async def hold(requests: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
+            await go_on.wait()
+            return await send(requests, state, by)
+
+        monkeypatch.setattr(SafeStateRequests, "_send", hold)
+        reading = asyncio.ensure_future(Hcp2Controller(remote, 8, timings=PATIENT).read(10))  # nobody replies
+        await until(lambda: service.clients and service.clients[0].unfinished)
+        entering = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
+        await until(lambda: service.line.safe_writes.under_way)
+        with pytest.raises(BacklogFull, match="2 requests of this program have no reply yet"):
+            await remote.enter_safe_state({"winder/speed": 0})
+        go_on.set()
+        assert await entering == {"winder/speed": None}
+        reading.cancel()
+        await asyncio.gather(reading, return_exceptions=True)
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
 def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         with pytest.raises(InvalidCommand, match="has the safe state winder/speed = 0, not winder/speed = 1"):

@@ -32,14 +32,15 @@ FURTHER = (
     "tests/verification/proof",
 )
 """Those that may notice what a room's own tests do not: with them it is the suite and the proof that are asked."""
-FURTHER_OUTSIDE = ("tests/app/config", "tests/app/line", "tests/app/outputs", "tests/app/service")
+FURTHER_OUTSIDE = ("tests/app", "tests/protocols")
 """The same for rooms outside the core."""
 
 
 def asked(near: bool, rooms: Collection[str] = tuple(CORE)) -> list[str]:
     """Return the files and folders of all tests that are asked about any mutant of these rooms."""
     further = {*(FURTHER if CORE.keys() & rooms else ()), *(FURTHER_OUTSIDE if OUTSIDE.keys() & rooms else ())}
-    return sorted({path for room in rooms for path in NEAR[room]} | (set() if near else further))
+    paths = {path for room in rooms for path in NEAR[room]} | (set() if near else further)
+    return sorted(path for path in paths if not any(Path(path).is_relative_to(other) for other in paths - {path}))
 
 
 @dataclass(frozen=True, slots=True)
