@@ -7,7 +7,7 @@ import json
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -223,19 +223,16 @@ def answering(answer: bytes) -> Iterator[int]:
                 connection, _ = server.accept()
             except OSError:
                 return  # it was shut down
-            with connection:
-                connection.recv(1000)
-                connection.sendall(answer)
-                over.wait()
+            connections.enter_context(connection)  # a later try must get its answer too
+            connection.recv(1000)
+            connection.sendall(answer)
 
-    over = threading.Event()
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with ExitStack() as connections, socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=serve)
         thread.start()
         try:
             yield server.getsockname()[1]
         finally:
-            over.set()
             server.shutdown(socket.SHUT_RDWR)
             thread.join()
 

@@ -82,8 +82,9 @@ async def test_values_are_published_and_commands_are_obeyed(broker: Broker, trus
 @pytest.mark.asyncio
 @pytest.mark.parametrize("tls", [True, False])
 async def test_a_broker_without_a_trusted_certificate_gets_nothing_and_this_is_reported(
-    broker: Broker, tmp_path: Path, tls: bool
+    broker: Broker, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("busmaster.app.outputs.mqtt.TIMEOUT", 1.0)  # for which a broker waits for a handshake
     other = certificate(tmp_path / "other.pem")
     async with publishing(broker, tls=tls, ca_file=str(other) if tls else None) as output:
         output.offer(cycle(1, 12.5))
