@@ -8,6 +8,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import anyio
 import pytest
 
 from busmaster import Health, MemoryPort, Snapshot
@@ -71,10 +72,26 @@ async def test_nothing_is_lost_between_the_line_and_an_output(tmp_path: Path) ->
     """What was polled before the line was closed is written when it is closed."""
     line = opened(tmp_path)
     await run(line, 20)
+    check_written(line, tmp_path)
+
+
+@pytest.mark.asyncio
+async def test_nothing_is_lost_if_the_program_is_cancelled_and_stays_so(tmp_path: Path) -> None:
+    """As in a task group of anyio: every wait in a cancelled scope is cancelled, also one while the line is closed."""
+    line = opened(tmp_path)
+    with anyio.CancelScope() as scope:
+        async with line:
+            async for snapshot in line.groups["fast"]:
+                if snapshot.cycle >= 20:
+                    scope.cancel()
+    check_written(line, tmp_path)
+
+
+def check_written(line: ConfiguredLine, folder: Path) -> None:
     counts = {output.kind: output for output in line.outputs.statistics()}
     assert counts["sqlite"].dropped == counts["sqlite"].waiting == 0
     polled = 2 * line.groups["fast"].statistics().cycles + line.groups["slow"].statistics().cycles
-    with closing(sqlite3.connect(tmp_path / "x.db")) as database:
+    with closing(sqlite3.connect(folder / "x.db")) as database:
         [samples] = database.execute("select count(*) from samples").fetchone()
         [events] = database.execute("select count(*) from events").fetchone()
     assert samples == polled

@@ -98,6 +98,9 @@ def test_a_change_of_quality_is_always_news() -> None:
         ("a", "b", 0, True),
         (frozenset({1}), frozenset({2}), 0, True),
         (None, None, 0, False),
+        ("tripped", 3, 9, True),
+        (3, "tripped", 9, True),
+        (3, None, 9, True),
     ],
 )
 def test_values_of_any_kind_are_compared(before: Any, now: Any, deadband: float, differ: bool) -> None:

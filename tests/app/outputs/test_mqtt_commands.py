@@ -528,3 +528,25 @@ def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
 
     commands.arrive(cast("Message", Arrived(Unread(b"1"))))
     assert (commands.refused, commands.unanswered) == (MOST_COMMANDS + 1, 1)
+
+
+@pytest.mark.asyncio
+async def test_before_the_connection_ends_every_command_that_has_come_is_answered() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    authorisation = Authorisation(bus, read_only=True)
+    commands = Commands("line", authorisation, {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: 0.0)
+    for number in range(5):
+        commands.arrive(cast("Message", Arrived(str(number).encode())))
+    replies: list[object] = []
+
+    async def reply(answer: object) -> None:
+        replies.append(answer)
+
+    answered = asyncio.ensure_future(commands.answered())
+    await asyncio.sleep(0)
+    assert not answered.done(), "commands are waiting, and none has a reply"
+    serving = asyncio.ensure_future(commands.serve(authorisation.write, authorisation.refuse, reply, lambda: 0))
+    await answered
+    assert len(replies) == 5
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)

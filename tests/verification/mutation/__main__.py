@@ -17,8 +17,10 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,13 @@ def main() -> None:
     parser.add_argument(
         "--near", action="store_true", help="ask only the tests nearest to each room: quick, a lower bound"
     )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=inf,
+        metavar="SECONDS",
+        help="of the tests that are not near, ask the quickest until so many seconds: a lower bound too (no limit)",
+    )
     parser.add_argument("--report", action="store_true", help="only print what the session's file holds")
     options = parser.parse_args()
     session = options.session or ROOT / f"mutation-{options.seed}.jsonl"
@@ -66,7 +75,8 @@ def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace, r
     """Try them, some at once, each process in a copy of its own, and write each verdict as it comes."""
     with tempfile.TemporaryDirectory() as folder:
         known = measured(Path(folder), options.near, rooms)
-        with multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near, known, rooms)) as pool:
+        more = (Path(folder), options.near, options.limit, known, rooms)
+        with multiprocessing.Pool(options.jobs, start_in_a_copy, more) as pool:
             for number, (mutant, verdict) in enumerate(pool.imap_unordered(judged, mutants), 1):
                 with session.open("a") as file:
                     file.write(json.dumps(mutant.as_fields() | asdict(verdict)) + "\n")
@@ -85,20 +95,35 @@ def measured(folder: Path, near: bool, rooms: Sequence[str]) -> Path:
     return file
 
 
-COPY: list[tuple[Copy, bool, Measured]] = []
-"""The copy of this process, whether only the nearest tests are asked in it, and what is known of all tests."""
+COPY: list[Callable[[Mutant], Verdict]] = []
+"""How a mutant is tried in the copy of this process."""
 
 
-def start_in_a_copy(folder: Path, near: bool, known: Path, rooms: Sequence[str]) -> None:
+def start_in_a_copy(folder: Path, near: bool, limit: float, known: Path, rooms: Sequence[str]) -> None:
     """Make a process its copy."""
     copy = Copy(ROOT, folder / multiprocessing.current_process().name, rooms)
-    COPY.append((copy, near, Measured.read(known)))
+    excuses = excused_changes()
+
+    def excused(mutant: Mutant, diff: str) -> bool:
+        return is_excused(mutant.as_fields() | {"diff": diff}, excuses)
+
+    COPY.append(partial(copy.tried, near=near, measured=Measured.read(known), limit=limit, excused=excused))
 
 
 def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:
     """Try it in this process's copy."""
-    copy, near, known = COPY[0]
-    return mutant, copy.tried(mutant, near, known)
+    return mutant, COPY[0](mutant)
+
+
+def excused_changes() -> dict[str, str]:
+    """Return the reasons of excuses, by what they excuse."""
+    found: dict[str, str] = json.loads(EQUIVALENT.read_text()) if EQUIVALENT.exists() else {}
+    return found
+
+
+def is_excused(verdict: dict[str, Any], excuses: Mapping[str, str]) -> bool:
+    """Return whether a mutant is one of those that nobody need notice."""
+    return changed(verdict) in excuses or replaced_in(verdict) in excuses
 
 
 def read(session: Path) -> list[dict[str, Any]]:
@@ -119,12 +144,12 @@ def key_of(fields: dict[str, Any]) -> tuple[Any, ...]:
 
 def report(verdicts: Iterable[dict[str, Any]]) -> None:
     """Print each room's score, and the survivors that are not known to be equivalent."""
-    excused = json.loads(EQUIVALENT.read_text()) if EQUIVALENT.exists() else {}
+    excuses = excused_changes()
     counts: Counter[tuple[str, str]] = Counter()
     survivors = []
     for verdict in verdicts:
         outcome = verdict["outcome"]
-        if outcome == "survived" and (changed(verdict) in excused or replaced_in(verdict) in excused):
+        if outcome == "survived" and is_excused(verdict, excuses):
             outcome = "excused"
         if outcome == "survived":
             survivors.append(verdict)

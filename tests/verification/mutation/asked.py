@@ -85,6 +85,20 @@ class Measured:
         there = [test for test in tests if any(Path(test.partition("::")[0]).is_relative_to(path) for path in paths)]
         return {test: self.seconds[test] for test in sorted(there, key=self.seconds.__getitem__)}
 
+    def nearest(
+        self, tests: Collection[str], near: Iterable[str], further: Iterable[str], limit: float
+    ) -> dict[str, float]:
+        """Return those of the tests near to the room, then those further away until `limit` seconds, each quickest
+        first."""
+        found = self.quickest(tests, near)
+        beyond = 0.0
+        for test, seconds in self.quickest(set(tests) - found.keys(), further).items():
+            beyond += seconds
+            if beyond > limit:
+                break
+            found[test] = seconds
+        return found
+
 
 def changed_lines(source: str, mutated: str) -> set[int]:
     """Return the lines of the source that are other ones in what was made of it, with all of their statements."""

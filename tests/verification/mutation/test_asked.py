@@ -78,6 +78,14 @@ def test_the_tests_that_run_a_line_are_asked_the_quickest_first(tmp_path: Path) 
     assert list(known.quickest(seconds, ["tests/one"])) == ["tests/one/test_a.py::quick", "tests/one/test_a.py::slow"]
 
 
+def test_of_the_tests_further_away_the_quickest_are_asked_until_their_time_is_over() -> None:
+    seconds = {"tests/near/test_a.py::slow": 9.0, **{f"tests/far/test_b.py::{n}": float(n) for n in (3, 2, 1)}}
+    known = Measured(seconds, {})
+    nearest = [*known.nearest(seconds, ["tests/near"], ["tests/far", "tests/near"], 3.5)]
+    assert nearest == ["tests/near/test_a.py::slow", "tests/far/test_b.py::1", "tests/far/test_b.py::2"]
+    assert [*known.nearest(seconds, ["tests/near"], [], 3.5)] == ["tests/near/test_a.py::slow"]
+
+
 def test_every_room_has_its_tests_and_all_that_are_asked_exist() -> None:
     assert set(NEAR) == set(ROOMS)
     assert [path for path in (*asked(near=True), *FURTHER) if not (ROOT / path).exists()] == []

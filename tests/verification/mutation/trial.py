@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,37 +63,45 @@ class Copy:
         if process.wait() != 0:
             raise RuntimeError(f"the tests fail without a mutant:\n{self._said('measure').read_text()[-2000:]}")
 
-    def tried(self, mutant: Mutant, near: bool, measured: Measured) -> Verdict:
-        """Change the copy, ask its tests (`near`: only the room's) to the first failure, and change it back."""
+    def tried(
+        self, mutant: Mutant, near: bool, measured: Measured, limit: float, excused: Callable[[Mutant, str], bool]
+    ) -> Verdict:
+        """Change the copy, ask its tests (`near`: only the room's) to the first failure, and change it back.
+
+        Of the other tests, the quickest are asked, until `limit` seconds. A mutant that is excused is not tried.
+        """
         start = time.monotonic()
         path = self.folder / mutant.module
         source = path.read_text()
         mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
         if mutated is None or mutated == source or not is_python(mutated):
             return Verdict("impossible", 0.0, "", "")
+        diff = "\n".join(difflib.unified_diff(source.splitlines(), mutated.splitlines(), lineterm=""))
+        if excused(mutant, diff):
+            return Verdict("survived", 0.0, "", diff)
         before = path.stat()
         path.write_text(mutated)
         try:
-            test = self._noticed_by(mutant, changed_lines(source, mutated), near, measured)
+            test = self._noticed_by(mutant, changed_lines(source, mutated), near, measured, limit)
         finally:
             path.write_text(source)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # the compiled original is valid again
-        diff = difflib.unified_diff(source.splitlines(), mutated.splitlines(), lineterm="")
         seconds = round(time.monotonic() - start, 1)
-        return Verdict("killed" if test else "survived", seconds, test or "", "\n".join(diff))
+        return Verdict("killed" if test else "survived", seconds, test or "", diff)
 
-    def _noticed_by(self, mutant: Mutant, lines: set[int], near: bool, measured: Measured) -> str | None:
+    def _noticed_by(self, mutant: Mutant, lines: set[int], near: bool, measured: Measured, limit: float) -> str | None:
         """Return the test that notices what is changed now, or None."""
         paths = list(NEAR[mutant.room]) if near else asked(near, self._rooms)
         running = measured.running(mutant.module, lines)
         if "" not in running:
-            tests = measured.quickest(running, paths)
+            tests = measured.nearest(running, NEAR[mutant.room], () if near else paths, limit)
             if not tests:
                 return None
             answer = self._answer("answer", asked(near, self._rooms), module=mutant.module, tests=tests)
             if answer["status"] != UNLIKE:
                 return answer["test"] if answer["status"] else None
-        answer = self._answer("import", [], paths=paths, tests=measured.quickest(measured.seconds, paths))
+        tests = measured.nearest(measured.seconds, NEAR[mutant.room], () if near else paths, limit)
+        answer = self._answer("import", [], paths=paths, tests=tests)
         return answer["test"] or "while they are collected" if answer["status"] else None
 
     def _answer(self, what: str, collected: Iterable[str], **request: Any) -> Any:
