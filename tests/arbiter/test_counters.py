@@ -197,9 +197,17 @@ def test_the_recent_utilisation_begins_anew_when_the_statistics_are_reset() -> N
     idle = line_statistics()
     recent.note(0.0, replace(idle, busy=2.0, quiet_time=1.0))
     assert recent.note(4.0, replace(idle, busy=4.0, quiet_time=1.0)) == pytest.approx(0.5)
-    reset = replace(idle, busy=0.5, quiet_time=0.0)
+    reset = replace(idle, busy=4.5, quiet_time=0.0)
     assert recent.note(5.0, reset) == reset.utilisation
-    assert recent.note(6.0, replace(idle, busy=0.5, quiet_time=0.5)) == pytest.approx(0.5)
+    assert recent.note(6.0, replace(idle, busy=4.5, quiet_time=0.5)) == pytest.approx(0.5)
+
+
+def test_the_recent_utilisation_is_that_of_the_window_and_of_no_time_before() -> None:
+    recent, idle = RecentUtilisation(10.0), line_statistics()
+    recent.note(0.0, idle)
+    assert recent.note(10.0, replace(idle, busy=10.0)) == pytest.approx(1.0)
+    assert recent.note(20.0, replace(idle, busy=10.0)) == 0.0
+    assert recent.note(25.0, replace(idle, busy=15.0)) == pytest.approx(5 / 15), "the last snapshot from before it"
 
 
 def test_r12_times_that_are_not_in_buckets_yet_are_bounded() -> None:

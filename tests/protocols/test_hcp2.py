@@ -204,3 +204,20 @@ def test_any_single_flipped_bit_of_a_reply_is_noticed(value: float, at: int, fli
     if frame[0] == 0x15:
         return
     assert outcome(Read(7).open(1, TIMINGS), [bytes(frame)]) in (FrameError, MORE)
+
+
+def test_only_the_refusal_of_a_reference_advises_on_its_source() -> None:
+    def failure(command: Write, heard: bytes) -> Exception:
+        with pytest.raises((Refused, FrameError)) as raised:
+            command.open(7, TIMINGS).feed(heard)
+        return raised.value
+
+    usual = Refused().hint
+    for reference, source in ((Write(116, (1,)), "TORQUERESOURCE"), (Write(118, (1,)), "SPEEDRESOURCE")):
+        refusal = failure(reference, b"\x15")
+        assert isinstance(refusal, Refused)
+        assert source in (refusal.hint or "")
+        assert all(isinstance(failure(reference, bytes([byte])), FrameError) for byte in (0x00, 0x14, 0x16, 0xFF))
+    refusal = failure(Write(1, (1,)), b"\x15")
+    assert isinstance(refusal, Refused)
+    assert refusal.hint == usual

@@ -100,9 +100,16 @@ class Copy:
             answer = self._answer("answer", asked(near, self._rooms), module=mutant.module, tests=tests)
             if answer["status"] != UNLIKE:
                 return answer["test"] if answer["status"] else None
+        # The near tests first: they are collected anew for each mutant, which takes a tenth of the time of all.
+        of_room = measured.quickest(measured.seconds, NEAR[mutant.room])
         tests = measured.nearest(measured.seconds, NEAR[mutant.room], () if near else paths, limit)
-        answer = self._answer("import", [], paths=paths, tests=tests)
-        return answer["test"] or "while they are collected" if answer["status"] else None
+        further = {test: seconds for test, seconds in tests.items() if test not in of_room}
+        for collected, chosen in ((list(NEAR[mutant.room]), of_room), (paths, further)):
+            if chosen:
+                answer = self._answer("import", [], paths=collected, tests=chosen)
+                if answer["status"]:
+                    return answer["test"] or "while they are collected"
+        return None
 
     def _answer(self, what: str, collected: Iterable[str], **request: Any) -> Any:
         """Return what a warm process says to a request. It is started with what it has collected."""
