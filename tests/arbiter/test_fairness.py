@@ -9,6 +9,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
+from busmaster.arbiter.backlog import SHARE
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
@@ -256,3 +257,18 @@ def test_r13_a_queued_request_is_not_sent_while_the_line_is_unusable() -> None:
     assert queued.error is not None
     assert queued.error.what == "gone"
     assert not queued.attempts
+
+
+@pytest.mark.parametrize(("higher", "lower"), [(COMMAND, POLL), (COMMAND, BACKGROUND), (POLL, BACKGROUND)])
+def test_r9_the_slots_of_a_higher_class_count_from_when_a_lower_one_waits(higher: Priority, lower: Priority) -> None:
+    desk = Desk()
+    for _ in range(10):
+        desk.submit(higher)
+    desk.run_out()
+    desk.submit(higher)  # it is sent at once
+    desk.log.clear()
+    waiting = desk.submit(lower)
+    for _ in range(2 * SHARE):
+        desk.submit(higher)
+    desk.run_out()
+    assert desk.log.index(waiting) == SHARE

@@ -346,3 +346,16 @@ def test_r11_polls_of_a_node_never_heard_are_not_retried() -> None:
     bench.wait(0.3)
     assert record.health is DOWN
     assert poll.results[0].attempts == 1
+
+
+def test_r15_one_nak_to_a_read_that_is_not_repeated_strikes_it_not_from_those_that_clear_the_line() -> None:
+    """The NAK may be noise, and a read of a caller that has gone is not repeated."""
+    bench = Bench()
+    record = up(bench)
+    record.answered.clear()
+    read = bench.ask(record, record.profile.sync_reads[1])
+    bench.until_sent()
+    bench.sent()
+    bench.arbiter.cancel(read, bench.now)
+    bench.hear(NAK, after=0.004)
+    assert read.command in [*record.sync_reads()]
