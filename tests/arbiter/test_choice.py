@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import NoReturn
 
 import pytest
 
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.health import SILENT, Health
 from busmaster.arbiter.transaction import Poll, Priority
+from busmaster.contract.timing import Timings
 from busmaster.errors import GarbledReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, up
@@ -508,3 +510,24 @@ def test_r15_after_something_was_said_twice_answers_alike_are_not_asked_for_in_a
     bench.ask(other, hcp2.Read(3))
     bench.ask(node, hcp2.Read(4))
     assert [bench.answer(), bench.answer(), bench.answer()] == [request_of(3), request_of(4), request_of(3, 2)]
+
+
+class Unencodable(hcp2.Read):
+    """A bug of a protocol."""
+
+    def open(self, address: int, timings: Timings) -> NoReturn:
+        raise RuntimeError("not encoded")
+
+
+def test_r15_a_read_that_cannot_be_encoded_is_not_chosen_to_go_first_and_fails_when_its_turn_comes() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    bench.hear("FF")
+    first, broken, beside = bench.ask(node, write(5)), bench.ask(other, Unencodable(3)), bench.ask(other, hcp2.Read(4))
+    bench.until_sent()
+    assert bench.answer() == request_of(4, 2)
+    assert bench.answer() == WRITE_5
+    bench.wait(0.1)
+    assert (first.error, beside.value) == (None, 5.0)
+    assert "could not encode it" in str(broken.error)
