@@ -32,8 +32,15 @@ FURTHER = (
     "tests/verification/proof",
 )
 """Those that may notice what a room's own tests do not: with them it is the suite and the proof that are asked."""
-FURTHER_OUTSIDE = ("tests/app", "tests/protocols")
-"""The same for rooms outside the core."""
+FURTHER_OUTSIDE = (
+    "tests/app/authorisation",
+    "tests/app/config",
+    "tests/app/line",
+    "tests/app/outputs",
+    "tests/app/service",
+    "tests/protocols",
+)
+"""The same for rooms outside the core. Most tests of commands and interfaces run processes, whose lines are not seen."""
 
 
 def asked(near: bool, rooms: Collection[str] = tuple(CORE)) -> list[str]:
