@@ -17,6 +17,7 @@ from anyio.from_thread import start_blocking_portal
 
 from busmaster import Bus, BusLike, Endpoint, MemoryPort, MicroFlexDrive, Service, connect
 from busmaster.emulator.line import Line
+from busmaster.errors import WriteUnconfirmed
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from tests.docs.pages import ROOT
 from tests.patience import PATIENCE
@@ -39,6 +40,8 @@ def module(name: str) -> ModuleType:
     return made
 
 
+TRIES = 3
+"""On a busy machine a reply may be so late that a write is unconfirmed (R4), and no example writes again by itself."""
 NAMES = sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
 PROGRAMS = [name for name in NAMES if name not in OWN_THEIR_LINE and name not in BY_THEMSELVES]
 
@@ -82,7 +85,15 @@ def test_an_example_does_as_much_on_a_remote_bus_as_on_a_bus(
 
     printed = []
     for opened in BOTH:
-        asyncio.run(run(opened))
+        for left in reversed(range(TRIES)):
+            try:
+                asyncio.run(run(opened))
+            except WriteUnconfirmed:
+                capsys.readouterr()
+                if not left:
+                    raise
+            else:
+                break
         printed.append(capsys.readouterr().out.splitlines())
     assert len(printed[0]) == len(printed[1]) > 0
 

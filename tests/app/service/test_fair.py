@@ -112,7 +112,7 @@ def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Pa
         controller = Hcp2Controller(remote, 5)
         flood = [asyncio.ensure_future(controller.read(1)) for _ in range(MANY)]
         await until(lambda: line.service.clients[0].unfinished)
-        await controller.write(2, 3, priority=Priority.URGENT)
+        await controller.read(2, priority=Priority.URGENT)
         assert not flood[-1].done()
         await given_up(flood)
 
