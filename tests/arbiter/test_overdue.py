@@ -9,11 +9,12 @@ import pytest
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.in_sync import ANY_BYTE, LAPSE, Awaited, InSync
+from busmaster.arbiter.unexpected import LOOKS
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, BAD_CHECKSUM, FIVE, TAU, Bench, reply_of, up
+from tests.arbiter.bench import ACK, BAD_CHECKSUM, FIVE, MAX_REPLY_DELAY, TAU, Bench, reply_of, up
 
 ONE, TWO = b"\x0201", b"\x0202"
 """What replies of elements 1 and 2 begin with."""
@@ -173,3 +174,16 @@ def test_a_reply_that_begins_at_the_last_moment_is_over_by_the_documents_silence
     assert in_sync.awaited_until(last_byte=0.19) == pytest.approx(0.24)
     assert in_sync.awaited_until(last_byte=0.21) == pytest.approx(0.26)  # it began before 0.2
     assert in_sync.awaited_until(last_byte=0.29) == 0.2  # too late to be a part of it
+
+
+def test_the_line_is_read_often_for_an_overdue_reply_for_a_second_and_then_rests() -> None:
+    """However long the line has been open: times are compared, and not their ratio."""
+    bench = Bench()
+    record = up(bench)
+    bench.wait(1000.0)
+    bench.ask(record, retries=0)
+    bench.sent()
+    bench.wait(0.5)
+    assert bench.arbiter.poll_timeout() - bench.now <= MAX_REPLY_DELAY / LOOKS
+    bench.wait(1.0)
+    assert bench.arbiter.poll_timeout() == inf

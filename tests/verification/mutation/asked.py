@@ -40,7 +40,7 @@ FURTHER_OUTSIDE = (
     "tests/app/service",
     "tests/protocols",
 )
-"""The same for rooms outside the core. Most tests of commands and interfaces run processes: their lines are not seen."""
+"""The same for rooms outside the core. Most tests of commands and interfaces run processes, where no line is seen."""
 
 
 def asked(near: bool, rooms: Collection[str] = tuple(CORE)) -> list[str]:
