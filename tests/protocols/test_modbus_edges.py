@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from busmaster import InvalidCommand, Refused
-from busmaster.contract.exchange import MORE, Done, FrameError
+from busmaster.contract.exchange import MORE, OTHER_FORMAT, Done, FrameError
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from tests.protocols.modbus_frames import UNIT, frame
 
@@ -119,3 +119,13 @@ def test_a_bad_crc_is_a_whole_frame_unless_something_follows() -> None:
             ReadRegisters(7).open(UNIT, PROFILE.timings).feed(heard)
         assert failure.value.whole == whole
     assert ReadRegisters(7).open(UNIT, PROFILE.timings).feed(reply + b"\0\1") == Done((555,), rest=b"\0\1")
+
+
+def test_a_whole_reply_of_another_function_is_no_reply_in_another_format() -> None:
+    def hint(reply: bytes) -> str | None:
+        with pytest.raises(FrameError) as error:
+            ReadRegisters(7).open(UNIT, PROFILE.timings).feed(reply)
+        return error.value.hint
+
+    assert hint(frame("11 03 04 0001 0002")) == OTHER_FORMAT, "two registers in place of one"
+    assert hint(frame("11 04 02 0001")) is None
