@@ -31,8 +31,6 @@ APPLICATION: dict[str, set[str]] = {
     },
 }
 """The rooms of the application, and which others of them each may import."""
-DEMO = {"app.cli.demo_line"}
-"""The demo shows certain drives, so it imports them."""
 ON_DEMAND = {"app.line.configured_line", "app.service.remote", "app.service.service"}
 """What the root offers of the application. It is imported when it is first used."""
 
@@ -65,7 +63,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "app": {"app"},
     "config": set(),
     **{room: {room, *others, *LIBRARY_OF_THE_APPLICATION - {""}} for room, others in APPLICATION.items()},
-    **{module: {"app.cli", "protocols", *LIBRARY_OF_THE_APPLICATION - {""}} for module in DEMO},
 }
 OPEN: dict[str, set[str]] = {
     "arbiter": {
@@ -253,7 +250,7 @@ def test_the_application_imports_nothing_of_the_library_but_what_is_listed() -> 
     taken = {
         name
         for module in modules()
-        if room_of(module) in APPLICATION and module not in DEMO
+        if room_of(module) in APPLICATION
         for name in own_imports(module)
         if not name.startswith("app.")
     }

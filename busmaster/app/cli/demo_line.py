@@ -14,8 +14,7 @@ import sys
 
 from busmaster import LineSettings
 from busmaster.emulator import Delay, Line, LineServer, serve_pty
-from busmaster.protocols._comms.mint import EmulatedMint
-from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
+from busmaster.registry import make_device
 
 CONTROLLERS = range(1, 4)
 DRIVES = range(4, 9)
@@ -30,11 +29,9 @@ def make_line(seed: int = 1) -> Line:
     delay = Delay(0.001, 0.004)
     line = Line(SETTINGS, chance=random.Random(seed))
     for address in CONTROLLERS:
-        controller = EmulatedMint(address, delay=delay)
-        controller.axes[0].swing(amplitude=50.0 * address, period=4.0 + address, phase=address / 3, now=0.0)
-        line.add(controller)
+        line.add(make_device("hcp2", address, delay=delay, lively=True))
     for address in DRIVES:
-        line.add(EmulatedMicroFlex(address, delay=delay, ripple=0.02))
+        line.add(make_device("microflex", address, delay=delay, ripple=0.02))
     return line
 
 
