@@ -185,3 +185,12 @@ def test_r9_requests_of_all_clients_to_new_nodes_have_one_128th_of_the_line() ->
     client = backlog.new_nodes()
     assert backlog.new_nodes() is client
     assert 1 / (1 + client.owner_time) == 1 / 128
+
+
+def test_r9_line_time_that_the_owner_used_long_ago_is_not_counted_against_it_beside_urgent_requests() -> None:
+    desk = Desk()
+    owners_part(desk, 300)  # three seconds alone
+    for _ in range(8):
+        desk.ask(client(desk, WRITER), 500, URGENT)
+    owners_part(desk, 16)
+    assert owners_part(desk, 100) >= 0.45
