@@ -8,7 +8,7 @@ import pytest
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import SILENT, NodeRecord
-from busmaster.arbiter.in_sync import ANY_BYTE, LAPSE, Awaited, InSync
+from busmaster.arbiter.in_sync import ANY_BYTE, LAPSE, MOST_OVERDUE, Awaited, InSync
 from busmaster.arbiter.unexpected import LOOKS
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
@@ -187,3 +187,21 @@ def test_the_line_is_read_often_for_an_overdue_reply_for_a_second_and_then_rests
     assert bench.arbiter.poll_timeout() - bench.now <= MAX_REPLY_DELAY / LOOKS
     bench.wait(1.0)
     assert bench.arbiter.poll_timeout() == inf
+
+
+def test_overdue_replies_are_bounded_and_the_oldest_are_forgotten_first() -> None:
+    in_sync = InSync()
+    for number in range(MOST_OVERDUE + 5):
+        in_sync.add_overdue((b"%d" % number,), None, float(number), float(number))
+    keys = [overdue.key for overdue in in_sync.overdue_replies]
+    assert keys == [b"%d" % number for number in range(5, MOST_OVERDUE + 5)]
+
+
+def test_r15_a_byte_that_another_single_byte_follows_clears_no_overdue_reply() -> None:
+    """Neither stands alone, so both may be the middle of something else."""
+    for other, cleared in ((b"\x07", False), (b"\x02whole", True)):
+        in_sync = InSync()
+        in_sync.add_overdue((bytes.fromhex(ACK),), None, 0.0, 0.15)
+        in_sync.add_overdue((other,), None, 0.0, 0.15)
+        payer = in_sync.heard(bytes.fromhex(ACK) + other, 1.0)
+        assert (payer is not None) is cleared

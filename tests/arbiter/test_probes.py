@@ -306,6 +306,15 @@ def test_r11_a_node_whose_probe_is_overdue_is_not_kept_waiting_by_one_that_is_no
     assert probe.node is overdue
 
 
+def test_r11_one_probe_at_a_time_is_on_its_way() -> None:
+    first, second = node(), node()
+    first.health = second.health = DOWN
+    first.probe_at = second.probe_at = 6.0
+    probes = Probes(Deadlines(), [first, second], 0.0)
+    assert probes.next(7.0, usable=True, idle=False) is not None
+    assert probes.next(7.1, usable=True, idle=False) is None
+
+
 def test_r11_an_owner_may_probe_at_any_time() -> None:
     bench = Bench()
     record = dead(bench)
