@@ -205,3 +205,12 @@ def test_r15_a_byte_that_another_single_byte_follows_clears_no_overdue_reply() -
         in_sync.add_overdue((other,), None, 0.0, 0.15)
         payer = in_sync.heard(bytes.fromhex(ACK) + other, 1.0)
         assert (payer is not None) is cleared
+
+
+def test_a_node_is_no_longer_asked_for_an_overdue_reply_that_has_lapsed() -> None:
+    in_sync, record = InSync(), up(Bench())
+    in_sync.add_overdue((b"\x02\x05",), record, 0.0, 0.15)
+    [overdue] = in_sync.overdue_replies
+    overdue.until = 5.0
+    assert [*in_sync.nodes_overdue(None, 4.9)] == [record]
+    assert [*in_sync.nodes_overdue(None, 5.0)] == []

@@ -263,3 +263,11 @@ def test_a_nodes_times_move_step_by_step_and_a_packets_window_only_grows() -> No
     assert long == Timings(first.with_window(2.0), first.with_window(2.0), packet.with_window(2.0))
     late = timings.with_max_reply_delay(0.5)
     assert late == Timings(first.with_max_reply_delay(0.5), first.with_max_reply_delay(0.5), packet)
+
+
+def test_a_kind_of_nodes_and_what_listens_to_them_make_no_other_profile() -> None:
+    """A handle of another process has the profile of the protocol, and not the names that this process gives."""
+    profile = busmaster.protocols.hcp2.codec.PROFILE
+    assert replace(profile, kind="winder") == profile
+    assert replace(profile, listen=busmaster.protocols.msc.codec.StalePacketListener) == profile
+    assert replace(profile, name="other") != profile

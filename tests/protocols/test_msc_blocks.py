@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.blocks import Count, Part, place, reads, reads_back, writes
-from busmaster.protocols.msc.codec import BLOCK, BlockRead, BlockWrite, DataRead, DataWrite
+from busmaster.protocols.msc.codec import BLOCK, PROFILE, BlockRead, BlockWrite, DataRead, DataWrite, Merging
 
 
 def test_a_place_lies_its_steps_behind_the_first() -> None:
@@ -78,3 +80,12 @@ def test_progress_is_told_of_the_sum_so_far() -> None:
         count.add(values)
     assert told == [(32, 40), (33, 40), (40, 40)]
     Count(None, 40).add(32)
+
+
+def test_the_values_of_a_block_have_the_addresses_of_the_step_and_without_one_only_the_first_is_known() -> None:
+    values = tuple(range(100, 100 + BLOCK))
+    stepped = replace(PROFILE, merge=Merging(address_step=4))
+    assert BlockRead(2000).place_values(values, stepped) == {
+        ("data", 2000 + 4 * number): value for number, value in enumerate(values)
+    }
+    assert BlockRead(2000).place_values(values, PROFILE) == {("data", 2000): 100}

@@ -174,6 +174,9 @@ async def test_health_of_line_and_nodes_is_retained_and_told_when_it_changes(bro
         {"line/line": "offline", "line/health/5": "unknown"},
         {"line/line": "ready", "line/health/5": "up"},
     ]
+    async with listening(broker, "line/line", "line/health/#") as later:  # the output has ended
+        found = {topic: payload.get("health", payload.get("line")) for topic, payload, _ in await heard(later, 2)}
+    assert found == {"line/line": "offline", "line/health/5": "offline"}
 
 
 @pytest.mark.asyncio
