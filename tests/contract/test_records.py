@@ -269,5 +269,5 @@ def test_a_kind_of_nodes_and_what_listens_to_them_make_no_other_profile() -> Non
     """A handle of another process has the profile of the protocol, and not the names that this process gives."""
     profile = busmaster.protocols.hcp2.codec.PROFILE
     assert replace(profile, kind="winder") == profile
-    assert replace(profile, listen=busmaster.protocols.msc.codec.StalePacketListener) == profile
+    assert replace(profile, listen=busmaster.protocols.msc.codec.PROFILE.listen) == profile
     assert replace(profile, name="other") != profile
