@@ -214,3 +214,14 @@ def test_a_node_is_no_longer_asked_for_an_overdue_reply_that_has_lapsed() -> Non
     overdue.until = 5.0
     assert [*in_sync.nodes_overdue(None, 4.9)] == [record]
     assert [*in_sync.nodes_overdue(None, 5.0)] == []
+
+
+def test_what_was_ambiguous_is_forgotten_when_nothing_of_it_can_arrive_any_more() -> None:
+    in_sync = InSync()
+    in_sync.recent.append((b"\x02reply",))
+    in_sync.heard(b"\xff\x02reply", 1.0)
+    assert in_sync.has_ambiguity(1.0)
+    in_sync.lapse(1.1)
+    assert in_sync.alert
+    in_sync.lapse(100.0)
+    assert not in_sync.alert, "each reply would be examined for ever"

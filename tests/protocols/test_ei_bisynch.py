@@ -53,6 +53,7 @@ CASES = [
     Case(Read("TI"), 0, [reply("TI", "360.")], 360),
     Case(Read("mA"), 1, [EOT], raises=NoSuchParameter),
     Case(Read("OP"), 1, [NAK], raises=Refused),
+    Case(ReadRun(("PV",)), 1, [reply("PV", "20.")], (20,)),
     Case(ReadRun(("PV", "PV", "SL")), 1, [reply("PV", "20."), reply("PV", "21."), reply("SL", "22.")], (20, 21, 22)),
     Case(Write("SL", 450.5), 1, [ACK], request=b"\x040011\x02SL450.5\x03" + bytes((xor(b"SL450.5\x03"),))),
     Case(Write("EE", 0, hexadecimal=True), 1, [ACK]),

@@ -164,6 +164,9 @@ def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(arguments: dict[
 
 
 def test_a_run_tells_the_value_of_each_parameter() -> None:
+    assert [step.sent for step in ReadRun(1, 17, 3).open(1, PROFILE.timings).later] == [1, 1], (
+        "a byte asks for the next"
+    )
     assert ReadRun(1, 17, 3).place_values((5, 6, 7), PROFILE) == {(1, 17): 5, (1, 18): 6, (1, 19): 7}
     assert ReadRun(1, 19, 2, step=-1).place_values((5, 6), PROFILE) == {(1, 19): 5, (1, 18): 6}
 
