@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import grp
+import os
 import pwd
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,9 @@ def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Pat
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/none"\n').service.secrets()
     with pytest.raises(FileError, match="it is a FIFO, a socket or a device"):
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "/dev/null"\n').service.secrets()
+    os.mkfifo(tmp_path / "fifo")  # nobody writes into it: opening it as a file is opened would wait for ever
+    with pytest.raises(FileError, match="it is a FIFO, a socket or a device"):
+        parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/fifo"\n').service.secrets()
 
 
 def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> None:

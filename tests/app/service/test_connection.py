@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import random
+import socket
+import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,7 +17,7 @@ from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 
 from busmaster.app.service import connection
-from busmaster.app.service.connection import Connection, IncomingConnection, OutgoingConnection
+from busmaster.app.service.connection import Connection, IncomingConnection, OutgoingConnection, origin_of
 from busmaster.app.service.frames import new_key, text_frame
 from busmaster.testing import run_in_virtual_time
 
@@ -229,3 +231,17 @@ def test_one_who_asks_hears_why_it_is_refused() -> None:
         assert "503" in (end.complaint or "")
 
     in_a_loop(story)
+
+
+def test_a_peer_that_has_gone_before_it_was_accepted_has_no_origin() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        client = socket.create_connection(server.getsockname())
+        accepted, _ = server.accept()
+        with accepted:
+            assert origin_of(accepted) == "127.0.0.1"
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            client.close()  # it resets the connection
+            with pytest.raises(ConnectionResetError):
+                accepted.recv(1)
+            assert origin_of(accepted) is None
+    assert origin_of(None) is None
