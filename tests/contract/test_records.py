@@ -183,6 +183,9 @@ def test_records_say_nothing_that_nobody_told_them() -> None:
     assert (Expect(TIMING, Sizes(1, 2)).send, Done(5).rest, Done(5).send) == (b"", b"", b"")
     ending = Ending()
     assert (ending.value, ending.send, ending.rest, ending.error, ending.silent) == (None, b"", b"", None, False)
+    frame = Frame(Kind.NOISE, Direction.HOST, b"\x00")
+    assert (frame.time, frame.ended, frame.earlier, frame.delay) == (0, 0, 0, None)
+    assert not (frame.answers or frame.continues or frame.joined)
     assert TIMING.driver_release_time == 0
     assert Between(1).most == float("inf")
     item = Item("1", "1", "a thing")
