@@ -38,8 +38,8 @@ PERIODS = (0.25, 0.5, 1.0, 2.0, 0.1, 0.3, 0.7, 5.0)
 SETTINGS = LineSettings(57600)
 DELAY = 0.002
 WANTED_MS = 2.0
-HELD_BY_DESIGN = "plan"
-"""Says of itself that it holds the loop: `plan` is for a line that runs."""
+HELD_BY_DESIGN = "plan_at_once"
+"""Holds the loop, and says so: `plan` is for a line that runs."""
 COLUMNS = ("call", "hold ms", "collector included: longest ms", "by the clock: longest ms")
 
 

@@ -185,7 +185,7 @@ def test_records_say_nothing_that_nobody_told_them() -> None:
     assert (ending.value, ending.send, ending.rest, ending.error, ending.silent) == (None, b"", b"", None, False)
     frame = Frame(Kind.NOISE, Direction.HOST, b"\x00")
     assert (frame.time, frame.ended, frame.earlier, frame.delay) == (0, 0, 0, None)
-    assert not (frame.answers or frame.continues or frame.joined)
+    assert (frame.answers, frame.continues, frame.joined) == (False, False, False)
     assert TIMING.driver_release_time == 0
     assert Between(1).most == float("inf")
     item = Item("1", "1", "a thing")

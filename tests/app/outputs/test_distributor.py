@@ -6,19 +6,22 @@ import json
 import os
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import anyio
 import pytest
 
-from busmaster import Health, MemoryPort, Snapshot
+from busmaster import Bus, Hcp2Controller, Health, MemoryPort, Snapshot
 from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.outputs.distributor import label_of
+from busmaster.app.outputs.distributor import Wanted, label_of
 from busmaster.app.outputs.exceptions import News
+from busmaster.app.outputs.settings import MqttSettings
 from busmaster.bus.node import Node
+from busmaster.emulator.line import Line
 from busmaster.events import (
     AlarmChanged,
     BusEvent,
@@ -154,3 +157,16 @@ async def test_an_event_of_a_node_has_its_label_and_one_of_the_line_has_none(tmp
         ]
         assert [label_of(event) for event in events] == ["winder"] * len(events)
         assert label_of(LineChanged(LineChange.UP)) == label_of(PortFailed("unplugged")) == ""
+
+
+def test_an_output_is_another_one_if_its_settings_or_what_it_lets_others_write_differ() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    point, settings = Hcp2Controller(bus, 5).point("1"), MqttSettings()
+    wanted = Wanted(settings, {"5/1": point})
+    assert wanted.same(Wanted(MqttSettings(), {"5/1": point}))
+    assert not wanted.same(None)
+    assert not wanted.same(Wanted(MqttSettings(port=1884), {"5/1": point}))
+    assert not wanted.same(Wanted(settings, {}))
+    assert not wanted.same(Wanted(settings, {"5/1": point, "5/2": point}))
+    assert not Wanted(settings, {}).same(wanted)
+    assert not wanted.same(Wanted(settings, {"5/1": replace(point)})), "an equal point may have another scale"

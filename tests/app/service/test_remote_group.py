@@ -1,0 +1,51 @@
+"""A poll group on a line that another program owns: what a program gets of each cycle."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from busmaster import Hcp2Controller, Point, Quality, RemoteBus
+from busmaster.app.service.owner_messages import NoBody, StreamMessage
+from busmaster.app.service.remote_group import RemoteGroup
+from busmaster.errors import GarbledReply
+from tests.app.service.lines import Served, on_a_served_line
+
+
+def test_a_value_that_the_programs_own_point_cannot_decode_is_bad_and_the_others_of_the_cycle_are_good(
+    tmp_path: Path,
+) -> None:
+    def reject(value: Any) -> NoReturn:
+        raise GarbledReply("no such state")
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        good = Hcp2Controller(remote, 5).point("1")
+        bad: Point[Any] = replace(Hcp2Controller(remote, 5).point("2"), decode=reject)
+        async for snapshot in remote.poll_group("own", period=0.02, points=[good, bad]):
+            assert snapshot[good].quality is Quality.GOOD
+            assert (snapshot.samples[bad].value, snapshot.samples[bad].quality) == (None, Quality.BAD)
+            assert isinstance(snapshot.samples[bad].error, GarbledReply)
+            break
+
+    on_a_served_line(tmp_path, story)
+
+
+@pytest.mark.asyncio
+async def test_a_consumer_counts_the_cycles_that_its_program_was_too_slow_for() -> None:
+    def find(*_: object) -> NoReturn:
+        raise AssertionError("no points were sent")
+
+    opening = asyncio.ensure_future(asyncio.sleep(0))
+    group = RemoteGroup("axes", (), period=0.02, find=find, begin=lambda _: (1, opening), end=lambda _: None)
+    first = group.subscribe()
+    group.receive("points", StreamMessage(1, 3, None))
+    second = group.subscribe()
+    group.receive("points", StreamMessage(1, 5, None))
+    assert (first.dropped, second.dropped, group.dropped) == (5, 2, 5)
+    group.receive("ended", StreamMessage(1, 5, NoBody()))
+    assert group.over
+    await asyncio.gather(opening, return_exceptions=True)
