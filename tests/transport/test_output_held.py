@@ -8,7 +8,8 @@ import termios
 from collections.abc import Awaitable, Callable, Iterator
 from math import inf
 from random import Random
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -36,6 +37,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import pump as pump_module
+from busmaster.transport.alarm import Alarm
 from busmaster.transport.kernel import OpenPort
 from busmaster.transport.pump import STUCK_AFTER, Pump
 from tests.arbiter.bench import TAU
@@ -196,6 +198,15 @@ def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leavin
         ("unsent", 3, 0.3),
         ("unsent", 0, 1.0),
     ]
+
+
+def test_a_deadline_that_a_look_at_the_port_has_brought_forward_is_kept(ledger: Ledger) -> None:
+    pump, alarms = pump_on(ledger), list[float]()
+    pump._alarm = cast("Alarm", SimpleNamespace(set=alarms.append))
+    for due in (5.0, 2.0, 3.0):
+        ledger.due = due
+        pump._look_again()
+    assert alarms == [5.0, 2.0], "a later one needs no alarm: the earlier one asks again"
 
 
 def test_output_that_is_given_up_is_discarded_before_its_transport_is_aborted(ledger: Ledger) -> None:
