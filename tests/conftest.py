@@ -41,6 +41,13 @@ for number, handler in (
         signal.signal(number, handler)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return how many workers `-n auto` starts: two for each core, because many tests wait for processes."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return 2 * cores
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Leave the slow tests out where neither `-m` nor a path selects tests; CONTRIBUTING.md describes the tiers.
 

@@ -214,7 +214,8 @@ async def test_however_much_happens_in_the_folder_the_looks_keep_their_pause(
         for number in range(100):
             (tmp_path / f"{number}").touch()
             await asyncio.sleep(0.001)
-        assert 1 <= len(port.looks) <= (loop.time() - begun) / 0.05 + 1
+        # Without a pause there are as many as changes. Attempts to open the port look at it too.
+        assert 1 <= len(port.looks) <= (loop.time() - begun) / 0.05 + 6
 
 
 @pytest.mark.asyncio
