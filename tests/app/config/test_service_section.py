@@ -182,7 +182,7 @@ def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Pat
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/none"\n').service.secrets()
     with pytest.raises(FileError, match="it is a FIFO, a socket or a device"):
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "/dev/null"\n').service.secrets()
-    os.mkfifo(tmp_path / "fifo")  # nobody writes into it: opening it as a file is opened would wait for ever
+    os.mkfifo(tmp_path / "fifo")  # without a writer, a plain open would block
     with pytest.raises(FileError, match="it is a FIFO, a socket or a device"):
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/fifo"\n').service.secrets()
 

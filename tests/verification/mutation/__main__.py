@@ -122,7 +122,7 @@ def excused_changes() -> dict[str, str]:
 
 
 def is_excused(verdict: dict[str, Any], excuses: Mapping[str, str]) -> bool:
-    """Return whether a mutant is one of those that nobody need notice."""
+    """Return whether a mutant is excused: it changes nothing that a user could see, or what is only tuned."""
     return changed(verdict) in excuses or replaced_in(verdict) in excuses
 
 
