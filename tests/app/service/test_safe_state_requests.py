@@ -160,7 +160,7 @@ def test_ordinary_requests_that_wait_do_not_keep_it_from_the_line(
             return await send(requests, state, by)
 
         monkeypatch.setattr(SafeStateRequests, "_send", hold)
-        reading = asyncio.ensure_future(Hcp2Controller(remote, 8, timings=PATIENT).read(10))  # an address without a device
+        reading = asyncio.ensure_future(Hcp2Controller(remote, 8, timings=PATIENT).read(10))  # no such device
         await until(lambda: service.clients and service.clients[0].unfinished)
         entering = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
         await until(lambda: service.line.safe_writes.under_way)
