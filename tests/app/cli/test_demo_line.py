@@ -7,10 +7,11 @@ import asyncio
 import pytest
 
 from busmaster.app.cli.demo import PERIOD, devices
-from busmaster.app.cli.demo_line import AWAY_FOR, LOSES_ITS_WIRE, SETTINGS, UP_FOR, make_line
+from busmaster.app.cli.demo_line import AWAY_FOR, CONTROLLERS, LOSES_ITS_WIRE, SETTINGS, UP_FOR, make_line
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Health
 from busmaster.emulator.memory import MemoryPort
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 
@@ -46,3 +47,15 @@ def test_r11_a_node_that_dies_costs_a_second_of_cycles_and_a_node_that_is_down_n
     assert probed <= 3
     assert later <= 0.02 * 54 / PERIOD
     assert last <= 0.01 * 60 / PERIOD
+
+
+def test_the_axes_of_the_controllers_move() -> None:
+    async def moved() -> list[bool]:
+        bus = Bus(MemoryPort(make_line()), seed=1)
+        axes = [Hcp2Controller(bus, address).axis(0).position for address in CONTROLLERS]
+        async with bus:
+            before = [await axis.read() for axis in axes]
+            await asyncio.sleep(1.0)
+            return [abs(await axis.read() - one) > 1 for axis, one in zip(axes, before, strict=True)]
+
+    assert run_in_virtual_time(moved()) == [True] * len(CONTROLLERS)

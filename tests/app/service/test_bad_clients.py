@@ -25,6 +25,7 @@ from busmaster.app.service.folder import Owner, ServedSocket, find_owner, line_n
 from busmaster.app.service.messages import encode_request
 from busmaster.app.service.outbox import Outbox
 from busmaster.app.service.record import WriteRecord
+from busmaster.app.service.typed import Raw
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.protocols.modbus.handle import ModbusUnit
@@ -565,3 +566,19 @@ def test_a_bus_is_served_again_after_it_was(tmp_path: Path) -> None:
             assert not bus._line.on_groups
 
     asyncio.run(run())
+
+
+def test_a_program_learns_how_many_messages_of_a_stream_it_was_too_slow_for(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            [visitor] = line.service.clients
+            connection = line.service._clients[visitor].websocket
+            connection.full = True
+            for _ in range(bounds.MOST_UNREAD + 3):
+                visitor.notify(7, "exchanges", Raw(b'{"now": 0, "left_out": 0, "exchanges": []}'))
+            assert visitor.dropped == {7: 3}
+            connection.full = False
+            line.service._clients[visitor].writable()
+            assert (await client.hear())["params"]["stream"] == 7
+
+    on_a_line(tmp_path, story)
