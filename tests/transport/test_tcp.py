@@ -106,6 +106,31 @@ async def test_bytes_go_both_ways_without_delay_and_a_dead_server_is_found_out()
 
 
 @pytest.mark.asyncio
+async def test_more_than_one_read_takes_arrives_whole_and_each_read_keeps_its_bytes() -> None:
+    class Keeping(Recorder):
+        def __init__(self) -> None:
+            super().__init__()
+            self.reads: list[bytes] = []
+
+        def data_received(self, data: bytes) -> None:
+            self.reads.append(data)
+            super().data_received(data)
+
+    burst = bytes(range(256)) * (3 * tcp.READ_AT_ONCE // 256) + b"end"
+    async with served() as server:
+        recorder = Keeping()
+        transport = await TcpPort("127.0.0.1", server.port).open(lambda: recorder)
+        await done(server.heard.wait())
+        server.writers[0].write(burst)
+        await recorder.heard(b"end")
+        assert len(recorder.reads) > 1
+        assert b"".join(recorder.reads) == burst, "a later read does not change what an earlier one delivered"
+        server.writers[0].close()
+        await recorder.lost()
+        assert transport.is_closing()
+
+
+@pytest.mark.asyncio
 async def test_a_server_that_does_not_run_refuses() -> None:
     async with served() as server:
         pass
