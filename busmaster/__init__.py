@@ -37,7 +37,6 @@ from busmaster.errors import (
 )
 from busmaster.renames import ROOT
 from busmaster.transport.endpoints import Endpoint, endpoint
-from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -55,6 +54,7 @@ if TYPE_CHECKING:
     from busmaster.protocols.mentor.handle import MentorDrive
     from busmaster.protocols.modbus.handle import ModbusUnit
     from busmaster.protocols.msc.handle import MscController
+    from busmaster.transport.rfc2217 import Rfc2217Port
 
 __all__ = [
     "LEARNED",
@@ -122,6 +122,7 @@ ON_DEMAND = {
     "ModbusUnit": "busmaster.protocols.modbus.handle",
     "MscController": "busmaster.protocols.msc.handle",
     "RemoteBus": "busmaster.app.service.remote",
+    "Rfc2217Port": "busmaster.transport.rfc2217",
     "Service": "busmaster.app.service.service",
     "connect": "busmaster.app.service.remote",
     "open_line": "busmaster.app.line.configured_line",

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -33,7 +32,7 @@ def check_settings(profile: Profile, endpoint: Endpoint) -> None:
     if settings is None or not isinstance(endpoint, SerialPort | TcpPort):
         return
     framings = dict.fromkeys(line.framing for line in (profile.line, *profile.other_lines))
-    if isinstance(endpoint, SerialPort | Rfc2217Port) and settings.framing not in framings:
+    if type(endpoint) is not TcpPort and settings.framing not in framings:
         usual = " or ".join(framings)
         warnings.warn(
             f"{profile.name} is meant for {usual}, but {endpoint.name} is {settings.framing}",

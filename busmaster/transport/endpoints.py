@@ -13,7 +13,6 @@ from busmaster.contract.arguments import meant
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.identity import USB, Identity
-from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.rs485 import LEVELS, SWITCHES, Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -105,6 +104,8 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
         return SerialPort(path, **_with_line(path, _with_rs485(_options(query, SERIAL_OPTIONS)), defaults))
     scheme = url.partition("://")[0]
     if scheme == "rfc2217":
+        from busmaster.transport.rfc2217 import Rfc2217Port  # most lines have none: it would take 2 % of the import
+
         host, port, query = _address(url)
         return Rfc2217Port(host, port, **_with_line(url, _options(query, RFC2217_OPTIONS), defaults))
     if scheme != "socket":
