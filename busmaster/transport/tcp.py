@@ -20,7 +20,7 @@ CONNECT_DEADLINE = 5.0
 """Seconds, including name resolution."""
 
 READ_AT_ONCE = 65536
-"""Bytes. More than a line sends in a second; what was received while the process stood still takes several reads."""
+"""Bytes. More than a line sends in a second. After a standstill of the process it can take several reads."""
 
 # A server without power or network is detected within about 10 s, whether or not requests are sent.
 KEEP_ALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 10_000}
