@@ -171,6 +171,7 @@ class Arbiter:
             data = self._strip_echo(data, now)
             if not data:
                 return
+        self._step.heard = True
         if self.state is not EXCHANGE:
             self._take_unexpected(data, now)
         # A second reply while one is held: it is not known which of them is right, so neither is delivered.
@@ -189,6 +190,7 @@ class Arbiter:
         # II's EOT (docs/proof.md, 5).
         self._counters.mark(mark)
         self._unexpected.last_byte = now
+        self._step.heard = True
         self._echo.forget()
         if self.state is EXCHANGE:
             self._step.begun = True
@@ -571,10 +573,8 @@ class Arbiter:
             self._counters.resyncs += 1
             self._enter(RESYNCHRONISING, now)
         self._echo.forget()
-        # Our own bytes count as well: a two-wire adapter does not receive while it transmits.
-        last = max(self._unexpected.last_byte, self._step.out)
         # R3's first condition. A silence alone proves nothing: a drive that replies after 40 ms is silent until then.
-        silent = max(last + self._step.quiet(), self._quarantine, now)
+        silent = max(self._step.silent_at(self._unexpected.last_byte), self._quarantine, now)
         # After a learned window the line continues: the reply that may still arrive is tracked as overdue (R15).
         goes_on = begun or self._step.timing.silence is not None
         self._silent_at = silent if goes_on else max(silent, self._step.past())
@@ -642,6 +642,7 @@ class Arbiter:
         # Another master, or a node that replies to an earlier request: both corrupt the request, so no reply to it can
         # be trusted.
         if rest is None:
+            self._step.heard = True
             self._counters.collisions += 1
             self.events.append(CameUnexpected(data, collision=True))
             if self.state is EXCHANGE:

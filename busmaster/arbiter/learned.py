@@ -14,9 +14,9 @@ The window is calculated for each kind of command (its type) and for each of its
 after its ACK). It is 1.5 times the longest reply time of the last 500 to 1000 replies plus 2 ms. If the longest time
 until the first bytes were delivered is more than those 1.5 times, that time is used (an adapter may deliver a whole
 reply at once). It is at least 5 ms and at most the documented window. It is trusted after 200 replies. The second
-attempt of a read has twice that window. The silence after which a reply is over is twice the longest pause within those
-replies, and at least 17 bytes. (A smoothed mean and deviation, as in TCP, follows the usual reply too closely: of
-76,000 replies it missed 1236, the maximum none.)
+attempt of a read has twice that window. The silence after which a reply has ended incomplete is twice the longest pause
+within those replies, and at least 17 bytes. The next request then still waits for the documented silence. (A smoothed
+mean and deviation, as in TCP, follows the usual reply too closely: of 76,000 replies it missed 1236, the maximum none.)
 
 The documented times apply again for 20 replies if a node replied after three quarters of a learned window that is
 shorter than the documented one, or after that window. That is enough to distinguish a node that has become slower from
@@ -149,7 +149,11 @@ class StepTimes:
         # Twice the longest pause: a pause depends more on the adapter's scheduling than a reply time does.
         gap = min(document.inter_byte_timeout, max(LEAST_SILENCE * byte_time, 2 * self.pause.value))
         return replace(
-            document, late_after=min(document.late_after, window), window=window, inter_byte_timeout=gap, silence=gap
+            document,
+            late_after=min(document.late_after, window),
+            window=window,
+            inter_byte_timeout=gap,
+            silence=document.inter_byte_timeout,
         )
 
 

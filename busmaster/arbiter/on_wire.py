@@ -103,6 +103,7 @@ class Step:
         "byte_time",
         "end",
         "first_bytes",
+        "heard",
         "latency",
         "longest",
         "out",
@@ -115,6 +116,8 @@ class Step:
 
     def __init__(self, timing: ReplyTiming, latency: float, byte_time: float) -> None:
         self.timing = timing
+        self.heard = False
+        """Bytes were received since it was started, other than its echo."""
         self.begun = False
         self.begun_at = -inf
         """When the first byte of its reply was received."""
@@ -148,6 +151,7 @@ class Step:
         """Start a step: `sent` bytes sent, at most `longest` bytes of reply. Returns when the reply must have begun."""
         self.timing = timing
         self.longest = longest
+        self.heard = False
         self.begun = False
         self.pause = 0.0
         out = self.out
@@ -194,10 +198,19 @@ class Step:
 
     def quiet(self) -> float:
         """Return the silence, in seconds, after which no further byte of a frame can arrive."""
-        silence = self.timing.silence
-        if silence is None:
-            silence = max(QUIET, self.timing.inter_byte_timeout)
-        return silence + self.latency + self.byte_time
+        timing = self.timing
+        # The documented pause, also where a shorter one was learned: the rest of a reply could otherwise arrive in the
+        # next reply, and the two could make a frame whose checksum is right (docs/proof.md, 23).
+        pause = timing.inter_byte_timeout if timing.silence is None else timing.silence
+        return max(QUIET, pause) + self.latency + self.byte_time
+
+    def silent_at(self, last_byte: float) -> float:
+        """Return when no further byte of a frame can arrive. `last_byte`: when the last byte was received."""
+        # Our own bytes count as well: a two-wire adapter does not receive while it transmits.
+        if self.heard or self.timing.silence is None:
+            return max(last_byte, self.out) + self.quiet()
+        # What may still arrive is a whole reply, and that is tracked as overdue (R15).
+        return max(last_byte, self.out) + self.timing.inter_byte_timeout + self.latency + self.byte_time
 
     def give_up(self, later: Sequence[LaterStep]) -> None:
         """Stop waiting for the reply, which may still arrive.

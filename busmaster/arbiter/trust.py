@@ -9,7 +9,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_sync import ANY_BYTE, Awaited, InSync
 from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.on_wire import OnWire
-from busmaster.arbiter.unexpected import QUIET, UnexpectedBytes
+from busmaster.arbiter.unexpected import UnexpectedBytes
 from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two replies received, one expected"
@@ -89,7 +89,7 @@ class Trust:
         if step.timing.silence is not None:
             # The node continues with steps that need no transmission by the host (MSC: the packet after its ACK).
             over += sum(later.timing.max_reply_delay for later in exchange.later if not later.sent)
-            silence = max(QUIET, transaction.node.timings.read.inter_byte_timeout) + step.latency + step.byte_time
+            silence = step.quiet()
             # with one pause
             awaited = Awaited(transaction.command, step.timing.window, silence, step.wire_time() + silence)
         # The ACK before the packet (MSC) may have been an overdue one. This request's own ACK is then still to come,

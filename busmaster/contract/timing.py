@@ -16,9 +16,9 @@ class ReplyTiming:
     Raises `InvalidCommand` unless 0 <= late_after <= window <= max_reply_delay and inter_byte_timeout > 0,
     driver_release_time >= 0.
 
-    `silence` is set if the window is learned. After this many seconds without a byte the line continues before the
-    maximum reply delay has passed, and the reply is overdue until then (R15). None: the line waits for the maximum
-    reply delay (R3).
+    `silence` is set if the window is learned. Then the line continues before the maximum reply delay has passed, after
+    this many seconds without a byte if any was received, and the reply is overdue until then (R15). None: the line
+    waits for the maximum reply delay (R3).
     """
 
     late_after: float
@@ -33,7 +33,8 @@ class ReplyTiming:
     driver_release_time: float = 0.0
     """Time for which the node's driver holds the line after its reply."""
     silence: float | None = None
-    """With a learned window, the silence that ends a resynchronisation."""
+    """With a learned window, the silence that ends a resynchronisation if bytes were received: the documented
+    `inter_byte_timeout`, at least 20 ms."""
 
     def __new__(cls, *args: object, **named: object) -> ReplyTiming:
         """Reject the argument names from before version 0.3, and report the new ones."""

@@ -107,6 +107,36 @@ def test_r15_a_last_attempt_is_not_sent_while_an_overdue_reply_may_meet_its_own(
     assert bench.sent() != request_of(5, 2)
 
 
+@pytest.mark.parametrize("cut", [1, 3, 5])
+def test_r3_a_reply_that_pauses_longer_than_ever_is_over_before_another_node_is_asked(cut: int) -> None:
+    """Found by a campaign: the rest met the reply of the other, and both together had a right checksum."""
+    bench = Bench()
+    node, other = trained(bench), bench.node(2)
+    bench.ask(node)
+    assert bench.sent() == request_of(1)
+    bench.ask(other, hcp2.Read(2))
+    bench.hear(FIVE[: 3 * cut], after=REQUEST + TOOK)
+    heard = bench.now
+    bench.wait(TIMINGS.read.inter_byte_timeout - TAU)
+    assert bench.sent() == "", "the rest can still come"
+    bench.hear(FIVE[3 * cut :], after=0.0)
+    rest = bench.now
+    bench.until_sent()
+    assert rest - heard < TIMINGS.read.inter_byte_timeout < bench.now - rest
+    assert node.health is Health.UP
+
+
+def test_r3_nor_while_the_rest_of_what_came_unexpected_can_come() -> None:
+    bench = Bench()
+    trained(bench)
+    other = bench.node(2)
+    bench.hear(FIVE[:9])
+    heard = bench.now
+    bench.ask(other, hcp2.Read(2))
+    bench.until_sent()
+    assert bench.now - heard > TIMINGS.read.inter_byte_timeout
+
+
 # what is lost costs the learned window
 
 

@@ -127,6 +127,17 @@ async def test_the_last_values_are_retained_and_a_cycle_may_be_one_message(broke
 
 
 @pytest.mark.asyncio
+async def test_whoever_comes_later_is_not_told_an_event_as_if_it_were_new(broker: Broker) -> None:
+    async with publishing(broker) as output:
+        output.offer(Happening(BUS.wall_time(), "winder", "winder is down"))
+        output.offer(cycle(1, 1.0, 2.0))
+        await settled(output)
+        async with listening(broker, "line/#") as client:
+            told = await heard(client, 3)
+    assert {topic for topic, *_ in told} == {"line/values/5/1", "line/values/5/2", "line/status"}
+
+
+@pytest.mark.asyncio
 async def test_it_says_that_it_is_there_and_the_broker_says_so_when_it_is_not(broker: Broker) -> None:
     async with listening(broker, "line/status") as client:
         async with publishing(broker) as output:

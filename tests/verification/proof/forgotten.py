@@ -109,6 +109,8 @@ def past_steps(view: View) -> None:
     is_moved = world.setup.may(setups.HELD) or world.setup.may(setups.FROZEN)  # what has been said leaves later
     is_unsaid = bool(world.held or arbiter._wire.output.held or world.frozen)
     step.first_bytes = b""  # read only by what learns from them: see shipped.py
+    if step.timing.silence is None:
+        step.heard = False  # read only for a learned window, and `begin` sets both
     if view.past(step.taint_until):
         step.taint_until = -inf
     if arbiter.state is not EXCHANGE:
