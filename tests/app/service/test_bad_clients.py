@@ -540,6 +540,12 @@ def test_systemd_says_where_its_lines_have_their_sockets(tmp_path: Path, monkeyp
     assert runtime_folder() == tmp_path / "slitter"
 
 
+def test_nobody_else_may_look_into_the_folder_that_it_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert runtime_folder().stat().st_mode & 0o777 == 0o700
+
+
 def test_a_folder_that_others_could_enter_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

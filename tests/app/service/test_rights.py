@@ -70,16 +70,27 @@ def test_a_role_that_changes_holds_for_the_next_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("role", Role)
-@pytest.mark.parametrize("step", ["max_reply_delay", "driver_release_time", "inter_byte_timeout"])
-def test_reply_times_beyond_those_of_the_protocol_are_for_admins(tmp_path: Path, role: Role, step: str) -> None:
-    times = {"late_after": 0.01, "window": 0.01, "max_reply_delay": 0.01, "inter_byte_timeout": 0.002, step: 3.0}
+@pytest.mark.parametrize(
+    ("step", "beyond"),
+    [
+        ("max_reply_delay", 3.0),
+        ("driver_release_time", 3.0),
+        ("inter_byte_timeout", 3.0),
+        ("inter_byte_timeout", 0.03),
+        ("silence", 0.16),
+    ],
+)
+def test_reply_times_beyond_those_of_the_protocol_are_for_admins(
+    tmp_path: Path, role: Role, step: str, beyond: float
+) -> None:
+    times = {"late_after": 0.01, "window": 0.01, "max_reply_delay": 0.01, "inter_byte_timeout": 0.002, step: beyond}
 
     async def story(line: Served, remote: RemoteBus) -> None:
         node = remote.node(hcp2.PROFILE, 6, timings=Timings.uniform(ReplyTiming(**times)))
         if RIGHTS[role].own_times:
             await node.request(READ)
         else:
-            with pytest.raises(InvalidCommand, match=f"{step} of 3 s is longer than that of hcp2"):
+            with pytest.raises(InvalidCommand, match=f"{step} of {beyond:g} s is longer than that of hcp2"):
                 await node.request(READ)
             assert len(line.bus.nodes) == 1
 
