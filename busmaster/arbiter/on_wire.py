@@ -117,7 +117,7 @@ class Step:
     def __init__(self, timing: ReplyTiming, latency: float, byte_time: float) -> None:
         self.timing = timing
         self.heard = False
-        """Bytes were received since it was started, other than its echo."""
+        """Bytes may have been received since it was started, other than its echo."""
         self.begun = False
         self.begun_at = -inf
         """When the first byte of its reply was received."""
@@ -438,6 +438,7 @@ class OnWire:
             if too_long or not self._may_send_again(progress, transaction, now):
                 raise cast("Abandonable", self.exchange).abandon()
         self._deadlines.line = self.step.begin(progress.timing, len(progress.send), progress.sizes.longest, now)
+        self.step.heard = True  # its first bytes may have arrived with the last of the step before
         if progress.send:
             self.output.add(progress.send, now)
 

@@ -27,7 +27,7 @@ from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, TAU, Bench, reply_of, request_of, up
+from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, NAK, TAU, Bench, reply_of, request_of, up
 
 REQUEST = 8 * TAU
 TOOK = 0.004
@@ -283,17 +283,43 @@ def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_max_reply_
     assert asked[5][1] - (asked[4][1] + REQUEST) >= MAX_REPLY_DELAY - 1e-9
 
 
-def test_r15_a_write_waits_for_the_packet_too_that_may_come_behind_a_late_ack() -> None:
-    bench = Bench()
+MSC_REPLY = "06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
+"""MSC: the ACK and the packet of unit 1, read together."""
+
+
+def trained_msc(bench: Bench, apart: float = 0.0) -> NodeRecord:
+    """An MSC unit whose times have been learned; those of its packet only if that comes `apart` from the ACK."""
     node = bench.arbiter.add_node(msc.PROFILE, 1, bench.now, LEARNED)
-    read = msc.DataRead(2008)
     for _ in range(TRUSTED_AFTER + 1):
-        answered = bench.ask(node, read)
+        answered = bench.ask(node, msc.DataRead(2008))
         bench.until_sent()
         bench.sent()
-        bench.hear("06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", after=0.030)
+        if apart:
+            bench.hear(ACK, after=0.030)
+        bench.hear(MSC_REPLY[3:] if apart else MSC_REPLY, after=apart or 0.030)
         assert (bench.ended(answered), bench.sent()) == (1, ACK)
         bench.until_ready()
+    return node
+
+
+def test_r3_nor_while_the_rest_of_a_packet_can_come_that_began_with_its_ack() -> None:
+    bench = Bench()
+    node = trained_msc(bench, apart=0.003)
+    bench.ask(node, msc.DataRead(2008), retries=2)
+    bench.until_sent()
+    bench.sent()
+    bench.ask(bench.node(2, msc.PROFILE), msc.DataRead(2008))
+    bench.hear(MSC_REPLY[:30], after=0.030)
+    heard = bench.now
+    bench.until_sent()
+    while bench.sent() in (NAK, ACK):  # it asks for the packet again, and then gives up
+        bench.until_sent()
+    assert bench.now - heard > msc.PROFILE.timings.packet.inter_byte_timeout
+
+
+def test_r15_a_write_waits_for_the_packet_too_that_may_come_behind_a_late_ack() -> None:
+    bench = Bench()
+    node, read = trained_msc(bench), msc.DataRead(2008)
     bench.ask(node, read, retries=1)
     node.unheard = MOST_UNHEARD  # it is taken to be silent, and not asked for a check
     [lost, after, *_] = requests_before(bench, bench.ask(bench.node(2, msc.PROFILE), msc.DataWrite(2024, 5)))
