@@ -11,8 +11,6 @@ import tempfile
 import pytest
 from hypothesis import settings
 
-from tests.tiers import longest_first
-
 pytest_plugins = ["tests.transport.usb"]
 
 settings.register_profile("busmaster", deadline=None)
@@ -48,13 +46,6 @@ def pytest_xdist_auto_num_workers() -> int:
     """Return how many workers `-n auto` starts: two for each core, because many tests wait for processes."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return 2 * cores
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the longest tests first where several processes run them."""
-    if workers := getattr(config, "workerinput", {}).get("workercount", 0):
-        items[:] = longest_first(items, workers)
 
 
 def pytest_configure(config: pytest.Config) -> None:
