@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter.choice import MOST_BEFORE
+from busmaster.arbiter.counters import Mark
 from busmaster.arbiter.events import MaxReplyDelayRaised
 from busmaster.arbiter.health import SILENT, Health, NodeRecord
 from busmaster.arbiter.in_sync import MOST_UNHEARD
@@ -124,6 +125,39 @@ def test_r3_a_reply_that_pauses_longer_than_ever_is_over_before_another_node_is_
     bench.until_sent()
     assert rest - heard < TIMINGS.read.inter_byte_timeout < bench.now - rest
     assert node.health is Health.UP
+
+
+def test_r3_nor_while_the_rest_of_a_reply_with_a_damaged_byte_can_come() -> None:
+    bench = Bench()
+    node, other = trained(bench), bench.node(2)
+    bench.ask(node)
+    assert bench.sent() == request_of(1)
+    bench.ask(other, hcp2.Read(2))
+    bench.wait(REQUEST + TOOK)
+    bench.arbiter.byte_marked(Mark.DAMAGED, bench.now)
+    marked = bench.now
+    bench.until_sent()
+    assert bench.now - marked > TIMINGS.read.inter_byte_timeout
+
+
+def test_r3_nor_while_the_rest_of_what_met_our_request_can_come() -> None:
+    bench = Bench(echo=True)
+    node, other = bench.arbiter.add_node(hcp2.PROFILE, 1, bench.now, LEARNED), bench.node(2)
+    for number in range(TRUSTED_AFTER + 1):
+        read = bench.ask(node, hcp2.Read(10 + number % 2))
+        bench.until_sent()
+        bench.hear(bench.sent(), after=REQUEST)
+        bench.answer(after=TOOK)
+        assert read.error is None
+    bench.until_ready()
+    bench.ask(node)
+    bench.until_sent()
+    assert bench.sent() == request_of(1)
+    bench.ask(other, hcp2.Read(2))
+    bench.hear(FIVE[:9], after=REQUEST)
+    heard = bench.now
+    bench.until_sent()
+    assert bench.now - heard > TIMINGS.read.inter_byte_timeout
 
 
 def test_r3_nor_while_the_rest_of_what_came_unexpected_can_come() -> None:
