@@ -5,7 +5,6 @@ True is not accepted as a number, although Python treats it as 1: it is usually 
 
 from __future__ import annotations
 
-import difflib
 import operator
 from collections.abc import Callable, Iterable
 from math import inf, nan
@@ -99,6 +98,8 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name that was probably meant, or None."""
+    import difflib  # only a wrong name needs it
+
     return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import grp
+import itertools
 import os
 import re
 import stat
@@ -116,6 +117,27 @@ def serves(process: Path, device: str) -> bool:
 def _holder(pid: int, proc: Path) -> Holder:
     try:
         command = (proc / str(pid) / "comm").read_text().strip()
+        if command.startswith("python"):  # of the many programs in Python, which one
+            command = _with_arguments(command, (proc / str(pid) / "cmdline").read_bytes())
     except OSError:
         command = "another program"
     return Holder(pid, command)
+
+
+def _with_arguments(command: str, line: bytes) -> str:
+    """Return the command with its options and its program: `-m` with the module and one word, a script, or `-c`.
+
+    What follows may be long or secret.
+    """
+    shown = [command]
+    words = iter(line.decode(errors="replace").split("\0")[1:])
+    for word in words:
+        if not word:
+            break
+        shown.append(repr(word)[1:-1])
+        if not word.startswith("-") or word.endswith("c"):  # also -Ic
+            break
+        if word.endswith("m"):
+            shown += [repr(text)[1:-1] for text in itertools.islice(words, 2) if text]
+            break
+    return " ".join(shown)

@@ -37,7 +37,7 @@ from serial.rs485 import RS485Settings
 from busmaster.contract.arguments import Between
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
-from busmaster.transport import holders, identity
+from busmaster.transport import identity
 from busmaster.transport.identity import Identity, identify, is_pty, resolve
 from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
 from busmaster.transport.own_thread import in_own_thread
@@ -569,6 +569,8 @@ def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> No
 
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Return the error for a port that could not be opened, with a hint."""
+    from busmaster.transport import holders  # only a refusal needs it
+
     path, code = port.path, _code(error)
     if code in IN_USE:
         # The name of the other program saves a search: nearly always it is a second instance of the same one.

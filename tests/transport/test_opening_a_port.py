@@ -65,11 +65,12 @@ async def test_a_slow_opening_leaves_the_loop_free(pty_master: PtyMaster, slow_d
 
 @pytest.mark.asyncio
 async def test_an_opening_that_does_not_come_back_is_given_up_and_its_port_released(
-    pty_master: PtyMaster, slow_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+    pty_master: PtyMaster, slow_driver: threading.Event
 ) -> None:
-    monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
-    with pytest.raises(LineDown, match="did not open within"):
-        await opened(pty_master.path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
+        with pytest.raises(LineDown, match="did not open within"):
+            await opened(pty_master.path)
     await _is_released_in_the_end(pty_master.path, slow_driver)
 
 
@@ -385,7 +386,7 @@ def locked_elsewhere(pty_master: PtyMaster) -> Iterator[int]:
 
 @pytest.mark.asyncio
 async def test_a_second_opening_says_which_other_program_has_it(pty_master: PtyMaster, locked_elsewhere: int) -> None:
-    with pytest.raises(LineDown, match=rf"is in use by python\S* \(process {locked_elsewhere}\)"):
+    with pytest.raises(LineDown, match=rf"is in use by python\S* -ISc \(process {locked_elsewhere}\)"):
         await opened(pty_master.path)
 
 

@@ -226,7 +226,8 @@ def test_a_host_that_never_reads_loses_bytes_and_hurts_nobody(serve: Callable[[L
     flood = bytes(50_000_000)
     with serve(mint_line()) as server:
         with client_of(server) as port:
-            os.write(port, READ)
+            # It is connected, and no reply is left that the next client would get.
+            assert ask(port, WRITE, 1) == b"\x06"
             server.call(lambda line, now: server._deliver(flood))
             assert server.dropped > 0
         with client_of(server) as port:

@@ -12,7 +12,12 @@ NEEDED = ("click", "rich")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status. `arguments` are those of the process by default."""
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    try:
+        missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+        if not missing:
+            from busmaster.app.cli.app import run
+    except KeyboardInterrupt:  # importing takes a moment; afterwards `run` handles Ctrl-C
+        return INTERRUPTED
     if missing:
         print(
             f"busmaster: the command line needs {', '.join(missing)}; install the extra cli: "
@@ -20,8 +25,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return WRONG_USAGE
-    try:
-        from busmaster.app.cli.app import run
-    except KeyboardInterrupt:  # importing takes a moment; afterwards `run` handles Ctrl-C
-        return INTERRUPTED
     return run(arguments)

@@ -150,6 +150,32 @@ def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path
         assert lock_owner(str(link)) == holder
 
 
+@pytest.mark.parametrize(
+    ("command", "line", "name"),
+    [
+        ("gpsd", "gpsd -N /dev/ttyUSB0", "gpsd"),
+        ("python3", "/usr/bin/python3 -m busmaster run line.toml --token x", "python3 -m busmaster run"),
+        ("python3.11", "python -I poll.py --password x", "python3.11 -I poll.py"),
+        ("python", "python -u -c import@sys;print(1)", "python -u -c"),
+        ("python", "python -m timeit", "python -m timeit"),
+        ("python", "python", "python"),
+        ("python", "python /a\nb.py", "python /a\\nb.py"),
+        ("python", "", "python"),
+    ],
+)
+def test_of_a_program_in_python_the_module_or_script_is_named_and_no_more(
+    tmp_path: Path, pty_master: PtyMaster, command: str, line: str, name: str
+) -> None:
+    process = tmp_path / "4711"
+    (process / "fd").mkdir(parents=True)
+    (process / "fdinfo").mkdir()
+    (process / "fd/3").symlink_to(pty_master.path)
+    (process / "fdinfo/3").write_text("flags:\t0100002\n")
+    (process / "comm").write_text(f"{command}\n")
+    (process / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in line.split(" ") if word))
+    assert holders(pty_master.path, proc=tmp_path) == (Holder(4711, name),)
+
+
 def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(pty_master: PtyMaster) -> None:
     """An emulator has the port open too, so that clients may come and go."""
     with open(pty_master.path, "rb", buffering=0):
