@@ -25,7 +25,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.emulator.line import Line
-from busmaster.errors import BusError, InvalidCommand, LineDown
+from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.app.service.lines import PATIENT, Served, on_a_served_line, raw, until
@@ -85,6 +85,9 @@ def test_a_name_a_number_of_digits_and_a_cause_are_the_owners(tmp_path: Path) ->
         assert shown["5/11"].value == "1 on"
         assert shown["8/1"].value is None
         assert shown["8/1"].error.startswith(("no reply", "not responding"))
+        # A row has no room for what to do.
+        assert (await view.details("meant", "8/1"))["hint"] in (NoReply.hint, NodeDown.hint)
+        assert (await view.details("meant", "5/10"))["hint"] == ""
 
     on_a_watched_line(tmp_path, story)
 
