@@ -23,7 +23,7 @@ values."""
 MANY = 2**30
 REMEMBERED_OF_MANY = 16 * REMEMBERED
 """Likewise, where there are so `MANY` numbers. A read of MSC brings 32 at once, and what a slow poll brings is judged
-when its cycle is over."""
+when its cycle is over. A write of a program that shares the line may wait while 2048 others are sent."""
 PICKY = 24
 """Numbers of which one is chosen where some are preferred, if there are enough."""
 HEARD = 4096
@@ -108,6 +108,10 @@ class Ledger:
     _unexpected_at: float = -inf
     _orders: dict[tuple[int, object], int] = field(default_factory=dict)
 
+    @property
+    def _remembered(self) -> int:
+        return REMEMBERED if self.modulus < MANY else REMEMBERED_OF_MANY
+
     def number(self) -> int:
         """One that was not used for long."""
         return self._remember(self._next())
@@ -118,7 +122,7 @@ class Ledger:
 
     def _remember(self, number: int) -> int:
         self._old.append(number)
-        if len(self._old) > (REMEMBERED if self.modulus < MANY else REMEMBERED_OF_MANY):
+        if len(self._old) > self._remembered:
             old = self._old.popleft()
             self._answers.pop(old, None)
         return number
@@ -144,7 +148,7 @@ class Ledger:
         """
         written = self._written[number] = Written(node, elements, self._given, by)
         self._old_writes.append((number, written))
-        if len(self._old_writes) > REMEMBERED:
+        if len(self._old_writes) > self._remembered:
             old, before = self._old_writes.popleft()
             if self._written.get(old) is before:  # a short number may have been used again
                 del self._written[old]
@@ -202,8 +206,11 @@ class Ledger:
     def disguised(self, asked: float, now: float) -> bool:
         """Since the request at `asked`, an overdue reply has ended that noise had changed. Nothing can tell it from the
         reply to this request where the noise made it look like that."""
+        # The second condition: on a line without pacing a reply takes no time.
         return any(
-            frame.cause < asked < frame.end <= now and self.damaged(frame.start, frame.end) for frame in self._frames
+            frame.cause < asked < frame.end <= now
+            and (self.damaged(frame.start, frame.end) or (frame.start, frame.end) in self._damage)
+            for frame in self._frames
         )
 
     def broken(self) -> bool:

@@ -215,6 +215,26 @@ def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_faul
     assert not ledger.disguised(7.0, 11.0), "it replies to this request"
 
 
+def test_on_a_line_without_pacing_such_a_reply_takes_no_time() -> None:
+    """Seed 271162 of EI-Bisynch with learned windows."""
+    ledger = Ledger(97, 5)
+    ledger._frames.append(Frame(8.0, 11.0, 11.0))
+    assert not ledger.disguised(10.0, 11.0)
+    ledger.spoiled(11.0, 11.0)
+    assert ledger.disguised(10.0, 11.0)
+
+
+def test_a_write_of_msc_may_wait_for_minutes() -> None:
+    """Seed 271162 of MSC with learned windows: a write that waited while 2048 others were sent was nobody's."""
+    told: list[str] = []
+    ledger = Ledger(2**31 - 1, 5, problem=told.append)
+    ledger.sending(7, 1, (2016,))
+    for number in range(8, 4000):
+        ledger.sending(number, 1, (2016,))
+    ledger.take(1, 2016, 7)
+    assert told == []
+
+
 def test_an_overdue_reply_that_noise_changed_blames_nobody() -> None:
     """Seed 92000 of DC104: noise turned the reply to parameter 2 into one of parameter 3, which was requested then."""
     ledger = Ledger(97, 5)
