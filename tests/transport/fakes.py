@@ -88,6 +88,7 @@ class PtyMaster:
         self.fd, slave = os.openpty()
         self.path = os.ttyname(slave)
         self.number = int(self.path.rpartition("/")[2])
+        self._kept = -1
         os.close(slave)
         os.set_blocking(self.fd, False)
 
@@ -111,9 +112,24 @@ class PtyMaster:
         os.write(self.fd, data)
 
     def unplug(self) -> None:
+        """Hang up. The number stays taken until `forget`.
+
+        Otherwise the pty of a test in another process would get it, and what still tries this name would open that.
+        """
+        if self.fd >= 0:
+            with contextlib.suppress(OSError):  # EBUSY: only root opens a port that is in exclusive use
+                self._kept = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            os.close(self.fd)
+            self.fd = -1
+
+    def forget(self) -> None:
+        """Hang up, if that is still to be done, and give back the number."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
+        if self._kept >= 0:
+            os.close(self._kept)
+            self._kept = -1
 
 
 @contextlib.contextmanager
@@ -125,7 +141,7 @@ def plugged(link: Path | None = None) -> Iterator[PtyMaster]:
     try:
         yield pty_master
     finally:
-        pty_master.unplug()
+        pty_master.forget()
         if link is not None:
             link.unlink()
 
@@ -162,16 +178,17 @@ def plugged_high() -> Iterator[PtyMaster]:
     """A pty whose number no other process gets when it is gone: the lowest is given, and many lower ones are free."""
     ends = sorted((PtyMaster() for _ in range(SPARE_NUMBERS)), key=lambda end: end.number)
     for end in ends[:-1]:
-        end.unplug()
+        end.forget()
     try:
         yield ends[-1]
     finally:
-        ends[-1].unplug()
+        ends[-1].forget()
 
 
 @contextlib.contextmanager
 def with_the_number_of(gone: PtyMaster) -> Iterator[PtyMaster]:
     """Another pty that has the number of one that is gone; the lower ones are taken meanwhile, if they were free."""
+    gone.forget()
     lower: list[PtyMaster] = []
     deadline = time.monotonic() + PATIENCE
     while (pty_master := PtyMaster()).path != gone.path:
@@ -179,10 +196,10 @@ def with_the_number_of(gone: PtyMaster) -> Iterator[PtyMaster]:
         if pty_master.number < gone.number:
             lower.append(pty_master)
         else:  # it is still being closed
-            pty_master.unplug()
+            pty_master.forget()
             time.sleep(0.001)
     try:
         yield pty_master
     finally:
         for end in (pty_master, *lower):
-            end.unplug()
+            end.forget()

@@ -30,7 +30,7 @@ def ends() -> Iterator[list[PtyMaster]]:
     made = [PtyMaster() for _ in range(2)]
     yield made
     for end in made:
-        end.unplug()
+        end.forget()
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ def ends() -> Iterator[list[PtyMaster]]:
     made = [PtyMaster() for _ in range(4)]
     yield made
     for end in made:
-        end.unplug()
+        end.forget()
 
 
 # -- the same device only --------------------------------------------------------------------------------------------

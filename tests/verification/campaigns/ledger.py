@@ -206,10 +206,13 @@ class Ledger:
     def disguised(self, asked: float, now: float) -> bool:
         """Since the request at `asked`, an overdue reply has ended that noise had changed. Nothing can tell it from the
         reply to this request where the noise made it look like that."""
-        # The second condition: on a line without pacing a reply takes no time.
         return any(
-            frame.cause < asked < frame.end <= now
-            and (self.damaged(frame.start, frame.end) or (frame.start, frame.end) in self._damage)
+            frame.cause < asked < frame.end
+            and (
+                (frame.end <= now and self.damaged(frame.start, frame.end))
+                # Noise may have taken its last byte, and on a line without pacing it takes no time.
+                or any(start == frame.start and asked < end <= now for start, end in self._damage)
+            )
             for frame in self._frames
         )
 

@@ -215,6 +215,15 @@ def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_faul
     assert not ledger.disguised(7.0, 11.0), "it replies to this request"
 
 
+def test_noise_may_have_taken_the_last_byte_of_such_a_reply() -> None:
+    """Seed 271165 of EI-Bisynch with learned windows: it ended a byte earlier than what the device said."""
+    ledger = Ledger(97, 5)
+    ledger._frames.append(Frame(8.0, 9.0, 12.0))
+    ledger.spoiled(9.0, 11.0)
+    assert ledger.disguised(10.0, 11.0)
+    assert not ledger.disguised(10.0, 10.9), "it still lasts"
+
+
 def test_on_a_line_without_pacing_such_a_reply_takes_no_time() -> None:
     """Seed 271162 of EI-Bisynch with learned windows."""
     ledger = Ledger(97, 5)
