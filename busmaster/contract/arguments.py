@@ -98,8 +98,10 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name that was probably meant, or None."""
-    import difflib  # only a wrong name needs it
-
+    try:
+        import difflib  # only a wrong name needs it
+    except OSError:  # no free descriptor: the error is raised without a guess
+        return None
     return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 

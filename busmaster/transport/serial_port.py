@@ -569,10 +569,11 @@ def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> No
 
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Return the error for a port that could not be opened, with a hint."""
-    from busmaster.transport import holders  # only a refusal needs it
-
     path, code = port.path, _code(error)
     if code in IN_USE:
+        # Not at the start of the function: an import fails if there is no free descriptor.
+        from busmaster.transport import holders
+
         # The name of the other program saves a search: nearly always it is a second instance of the same one.
         owner = holders.lock_owner(path) or next(iter(holders.holders(path)), "another program")
         return LineDown(
@@ -585,6 +586,8 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
             hint="plug it in or start its emulator, or see `python -m serial.tools.list_ports`",
         )
     if code in (errno.EACCES, errno.EPERM):
+        from busmaster.transport import holders
+
         return LineDown(f"no permission to open {path}", hint=holders.how_to_open(path))
     if isinstance(error, ValueError):
         return LineDown(f"{path} does not take {port.baudrate} baud, {port.settings.framing}", hint="use another rate")

@@ -98,6 +98,30 @@ asyncio.run(main())
     assert "did not open within" in ended.stdout
 
 
+def test_errors_are_those_of_every_day_where_no_descriptor_is_free(pty_master: PtyMaster) -> None:
+    """Modules that only errors need are not imported then."""
+    program = """
+import asyncio, os, resource, sys
+from busmaster import BusError, SerialPort
+from busmaster.contract.arguments import guess
+
+async def main():
+    await asyncio.sleep(0)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (os.dup(0), resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+    print(repr(guess("speeed", ["speed"])))
+    try:
+        await SerialPort(sys.argv[1], baudrate=57600).open(asyncio.Protocol)
+    except BusError as error:
+        print(error.what)
+
+asyncio.run(main())
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", program, pty_master.path], capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
+    assert ended.stdout.splitlines() == ["''", f"cannot open {pty_master.path}: Too many open files"]
+
+
 @pytest.mark.asyncio
 async def test_a_cancelled_opening_releases_its_port(pty_master: PtyMaster, slow_driver: threading.Event) -> None:
     opening = asyncio.ensure_future(opened(pty_master.path))
