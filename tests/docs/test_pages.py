@@ -77,7 +77,7 @@ def test_workflows_run_the_checks_and_build_the_site_as_a_maintainer_does() -> N
     workflows = ROOT / ".github" / "workflows"
     checks = (ROOT / ".ci" / "run").read_text()
     assert "- run: .ci/run\n" in (workflows / "ci.yml").read_text()
-    [build] = re.findall(r"python -m (sphinx .*) site\"", checks)
+    [build] = re.findall(r"python -m (sphinx .*) \S*site\"", checks)
     assert f"python -m {build} site\n" in (workflows / "docs.yml").read_text()
     assert f'python -m {build} "$READTHEDOCS_OUTPUT/html"\n' in (ROOT / ".readthedocs.yaml").read_text()
 

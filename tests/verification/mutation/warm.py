@@ -210,7 +210,7 @@ def functions_by_file() -> dict[str, list[FunctionType]]:
     """Return all functions that there are in this process, by the file that they are of."""
     found: dict[str, list[FunctionType]] = {}
     for one in gc.get_objects():
-        if isinstance(one, FunctionType):
+        if type(one) is FunctionType:  # isinstance asks a weak proxy for its class, which raises if its object is gone
             found.setdefault(one.__code__.co_filename, []).append(one)
     return found
 
