@@ -68,6 +68,15 @@ def test_a_delayed_request_is_sent_at_its_time_and_others_go_first(table: Table,
     assert delayed.error is None
 
 
+def test_a_delayed_request_is_sent_by_a_timer_that_comes_late(table: Table) -> None:
+    bench = table.bench
+    delayed = bench.ask(table.slow)
+    bench.now = table.until + 0.01
+    bench.arbiter.handle_timeout(bench.now)
+    assert bench.answer() == request_of(1)
+    assert bench.ended(delayed) == 1
+
+
 def test_a_delayed_request_is_not_asked_about_again_before_its_time(table: Table) -> None:
     bench = table.bench
     bench.ask(table.slow)

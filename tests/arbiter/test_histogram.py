@@ -57,6 +57,7 @@ def test_an_empty_one_is_all_zero() -> None:
     assert histogram.buckets() == []
 
 
-def test_a_negative_time_counts_as_zero() -> None:
-    histogram = histogram_of([-1.0, 0.0])
+@pytest.mark.parametrize("negative", [-1.0, -1e-9])
+def test_a_negative_time_counts_as_zero(negative: float) -> None:
+    histogram = histogram_of([negative, 0.0])
     assert (histogram.count, histogram.total, histogram.highest, histogram.quantile(1.0)) == (2, 0.0, 0.0, 0.0)

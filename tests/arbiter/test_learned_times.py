@@ -43,6 +43,14 @@ def test_the_window_is_half_as_long_again_as_the_largest_reply_time_of_the_last_
     assert times.window == LEAST
 
 
+def test_each_time_that_becomes_longer_is_a_change_and_the_same_again_is_none() -> None:
+    times = StepTimes()
+    for _ in range(TRUSTED_AFTER):
+        times.note(0.01, 0.02, 0.001)
+    longer = [(0.011, 0.02, 0.001), (0.011, 0.021, 0.001), (0.011, 0.021, 0.002)]
+    assert [(times.note(*each), times.note(*each)) for each in longer] == [(True, False)] * 3
+
+
 def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
     times = StepTimes()
     for _ in range(TRUSTED_AFTER):

@@ -277,6 +277,10 @@ def test_a_cut_reply_ends_at_the_next_request_or_in_silence() -> None:
 def test_noise_is_one_line_and_the_frame_after_it_is_whole() -> None:
     frames = hear("hcp2", "00 FF 81 41", "07 30 32 02 30 31 05 04")
     assert said(frames) == ["unknown 4 bytes [no frame]", "host 2 read 1"]
+    assert [said(hear("hcp2", noise, "|")) for noise in ("FF", "FF FF")] == [
+        ["unknown 1 byte [no frame]"],
+        ["unknown 2 bytes [no frame]"],
+    ]
 
 
 def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply() -> None:
