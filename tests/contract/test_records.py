@@ -239,6 +239,8 @@ def test_a_framing_that_does_not_exist_is_refused(bits: int, parity: str, stop: 
 def test_reply_times_may_be_equal_and_never_out_of_order() -> None:
     assert ReplyTiming(0.0, 0.0, 0.0, 0.01).window == 0
     assert ReplyTiming(0.1, 0.1, 0.1, 0.01).max_reply_delay == 0.1
+    assert TIMING.awaited == TIMING.max_reply_delay
+    assert replace(TIMING, silence=TIMING.inter_byte_timeout).awaited == TIMING.window, "learned"
     for times in ((0.2, 0.1, 0.3), (0.1, 0.3, 0.2), (0.3, 0.2, 0.1)):
         with pytest.raises(InvalidCommand, match="late_after <= window <= max_reply_delay"):
             ReplyTiming(*times, inter_byte_timeout=0.01)

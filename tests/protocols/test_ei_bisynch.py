@@ -101,6 +101,12 @@ def made(address: int, **options: Any) -> EmulatedBisynch:
     return instrument
 
 
+def test_the_place_of_a_parameter_is_its_channel_and_its_whole_mnemonic() -> None:
+    places = {place for name in ("SP", "OP", "PV", "2SP") for place in Read(name).places}
+    assert places == {("1", "SP"), ("1", "OP"), ("1", "PV"), ("2", "SP")}
+    assert Read("1SP").places == Read("SP").places
+
+
 def test_a_listener_reads_what_is_sent() -> None:
     check_dialect(PROTOCOL, CASES)
 
