@@ -117,7 +117,7 @@ def serves(process: Path, device: str) -> bool:
 def _holder(pid: int, proc: Path) -> Holder:
     try:
         command = (proc / str(pid) / "comm").read_text().strip()
-        if command.startswith("python"):  # of the many programs in Python, which one
+        if command.startswith("python"):  # the same for every program in Python
             command = _with_arguments(command, (proc / str(pid) / "cmdline").read_bytes())
     except OSError:
         command = "another program"
@@ -135,6 +135,9 @@ def _with_arguments(command: str, line: bytes) -> str:
         if not word:
             break
         shown.append(repr(word)[1:-1])
+        if word in ("-W", "-X"):  # the next word is its value
+            shown.append(repr(next(words, ""))[1:-1])
+            continue
         if not word.startswith("-") or word.endswith("c"):  # also -Ic
             break
         if word.endswith("m"):

@@ -114,7 +114,8 @@ class PtyMaster:
     def unplug(self) -> None:
         """Hang up. The number stays taken until `forget`.
 
-        Otherwise the pty of a test in another process would get it, and what still tries this name would open that.
+        Otherwise a pty of a test in another process would get it, and a connection that still tries this name would
+        open that pty.
         """
         if self.fd >= 0:
             with contextlib.suppress(OSError):  # EBUSY: only root opens a port that is in exclusive use

@@ -98,8 +98,8 @@ asyncio.run(main())
     assert "did not open within" in ended.stdout
 
 
-def test_errors_are_those_of_every_day_where_no_descriptor_is_free(pty_master: PtyMaster) -> None:
-    """Modules that only errors need are not imported then."""
+def test_errors_are_the_usual_ones_if_no_descriptor_is_free(pty_master: PtyMaster) -> None:
+    """Modules that only errors need cannot be imported then."""
     program = """
 import asyncio, os, resource, sys
 from busmaster import BusError, SerialPort

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 import anyio
 import pytest
 
+from busmaster.app.cli import main
 from busmaster.app.cli.emulate import serve_for
 from busmaster.app.cli.ending import SIGNALS, Ending
 from busmaster.emulator.serve import TcpServer
@@ -143,3 +145,23 @@ def test_a_closed_standard_output_is_no_error_and_standard_error_never_stands_in
         quiet = busmaster("read", controllers.path, "--protocol", "hcp2", "--node", "1", "999")
         sys.stderr.close()
     assert (quiet.status, quiet.out) == (2, "")
+
+
+class Interrupts:
+    """Ctrl-C, at the import of the commands."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "busmaster.app.cli.app":
+            raise KeyboardInterrupt
+
+
+def test_ctrl_c_while_the_program_is_loaded_ends_it_with_its_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib.util, "find_spec", interrupted)
+        assert main(["--version"]) == 130
+    monkeypatch.delitem(sys.modules, "busmaster.app.cli.app", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Interrupts(), *sys.meta_path])
+    assert main(["--version"]) == 130

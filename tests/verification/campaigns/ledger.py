@@ -210,7 +210,7 @@ class Ledger:
             frame.cause < asked < frame.end
             and (
                 (frame.end <= now and self.damaged(frame.start, frame.end))
-                # Noise may have taken its last byte, and on a line without pacing it takes no time.
+                # Noise may have removed its last byte. On a line without pacing, a reply takes no time.
                 or any(start == frame.start and asked < end <= now for start, end in self._damage)
             )
             for frame in self._frames

@@ -234,14 +234,14 @@ def test_on_a_line_without_pacing_such_a_reply_takes_no_time() -> None:
 
 
 def test_a_write_of_msc_may_wait_for_minutes() -> None:
-    """Seed 271162 of MSC with learned windows: a write that waited while 2048 others were sent was nobody's."""
-    told: list[str] = []
-    ledger = Ledger(2**31 - 1, 5, problem=told.append)
+    """Seed 271162 of MSC with learned windows: the harness forgot a write that waited while 2048 others were sent."""
+    problems: list[str] = []
+    ledger = Ledger(2**31 - 1, 5, problem=problems.append)
     ledger.sending(7, 1, (2016,))
     for number in range(8, 4000):
         ledger.sending(number, 1, (2016,))
     ledger.take(1, 2016, 7)
-    assert told == []
+    assert problems == []
 
 
 def test_an_overdue_reply_that_noise_changed_blames_nobody() -> None:
