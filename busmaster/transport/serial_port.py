@@ -28,7 +28,7 @@ import time
 import warnings
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import serial
@@ -411,13 +411,15 @@ class PortTransport(_SerialTransport):
             self._protocol.connection_lost(cause)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
 class _Closing:
     """A closing that may take longer than CLOSE_DEADLINE. The device with this number is locked until it has ended."""
 
-    name: str
-    number: int
-    over: threading.Event = field(default_factory=threading.Event)
+    __slots__ = ("name", "number", "over")
+
+    def __init__(self, name: str, number: int) -> None:
+        self.name = name
+        self.number = number
+        self.over = threading.Event()
 
 
 _closings: set[_Closing] = set()

@@ -164,6 +164,17 @@ def test_r15_a_check_asks_a_node_that_answers_and_what_it_has_answered() -> None
     assert bench.sent() == request_of(200, 2)
 
 
+def test_r15_an_item_that_a_drive_has_answered_and_refuses_now_is_not_a_check_any_more() -> None:
+    bench = Bench()
+    node = up(bench)
+    node.answered.clear()
+    for element in (200, 201, 202):
+        bench.served(bench.ask(node, hcp2.Read(element)))
+    node.note_refused(hcp2.Read(201))
+    assert [*node.sync_reads()][:2] == [hcp2.Read(200), hcp2.Read(202)]
+    assert hcp2.Read(201) not in node.sync_reads()
+
+
 def test_r15_a_check_is_not_asked_of_a_node_that_is_suspended() -> None:
     bench = Bench()
     node, other = bench.node(1), up(bench, 2)

@@ -11,7 +11,7 @@ from math import inf
 import pytest
 
 from busmaster.arbiter import dispatcher
-from busmaster.arbiter.backlog import Delayed
+from busmaster.arbiter.backlog import SLACK, Delayed
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.eligibility import OK, Wait, eligibility
@@ -207,6 +207,17 @@ def test_the_places_of_ended_requests_are_released() -> None:
     assert delayed.due(1.0) == [kept]
     assert delayed.due(2.0) == []
     assert (delayed.live, deadlines.delayed) == (0, inf)
+
+
+@pytest.mark.parametrize("kept", [1, 300])
+def test_ended_delayed_requests_are_removed_however_many_others_wait(kept: int) -> None:
+    delayed, node = Delayed(Deadlines()), Bench().node()
+    for number in range(kept + 1000):
+        transaction = Transaction(node, hcp2.Read(1))
+        delayed.add(transaction, 1.0)
+        if number >= kept:
+            transaction.phase = Phase.ENDED
+    assert delayed.live <= 2 * kept + SLACK
 
 
 def test_many_delayed_requests_are_not_sorted_anew_for_each(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,3 +112,14 @@ def test_r13_a_poll_of_many_fails_in_pieces_as_one_cycle() -> None:
     assert (len(bench.cycles), poll.running) == (1, False)
     assert sum(isinstance(event, Sampled) for event in bench.events) == MANY
     assert {type(t.error) for t in poll.results} == {LineDown}
+
+
+def test_r13_what_is_asked_while_the_line_is_lost_fails_at_once_and_its_caller_is_told() -> None:
+    bench = Bench()
+    node = bench.node()
+    lose(bench)
+    read = Transaction(node, hcp2.Read(1))
+    assert bench.arbiter.submit(read, bench.now), "something is to be reported"
+    bench.listen()
+    assert bench.events[-1] is read
+    assert isinstance(read.error, LineDown)

@@ -232,6 +232,36 @@ def test_r9_behind_an_urgent_sequence_of_another_program_goes_what_waits_in_a_lo
     assert write.started < command.started < urgent.started
 
 
+@pytest.mark.parametrize(("program", "priority"), [(LineClient(), COMMAND), (None, URGENT)])
+def test_r9_behind_any_other_sequence_the_urgent_request_of_its_program_goes_first(
+    program: LineClient | None, priority: Priority
+) -> None:
+    table = Table()
+    bench = table.bench
+    bench.served(bench.ask(table.there, hcp2.Read(20), priority=URGENT, client=program))
+    hold = table.hold(program)
+    bench.ask(table.node, WRITE, priority=priority, client=hold)
+    bench.until_sent()
+    urgent = bench.ask(table.there, hcp2.Read(20), priority=URGENT, client=program)
+    command = bench.ask(table.there, hcp2.Read(21))
+    table.release(hold)
+    bench.served(command)
+    assert urgent.started < command.started
+
+
+def test_r9_within_a_sequence_urgent_requests_of_users_go_in_turn_though_their_role_has_used_its_part() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    used, first, second = (table.arbiter.add_client(owner_time=127.0, user=user) for user in ("used", "1", "2"))
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    before = bench.ask(table.there, hcp2.Read(20), priority=URGENT, client=used)
+    bench.until_sent()
+    waiting = [bench.ask(table.there, hcp2.Read(n), priority=URGENT, client=c) for n, c in ((21, first), (22, second))]
+    for urgent in (before, *waiting):
+        bench.served(urgent)
+    assert before.started < waiting[0].started < waiting[1].started
+
+
 def test_r10_polls_that_were_due_meanwhile_are_counted_as_missed() -> None:
     table = Table()
     bench = table.bench
@@ -476,6 +506,16 @@ def test_r9_what_a_program_asks_outside_its_sequence_does_not_wait_for_it() -> N
     begins = bench.ask(table.node, hcp2.Read(1), client=second)
     bench.served(bench.ask(table.node, hcp2.Read(2), client=second.client))
     assert not begins.attempts
+
+
+def test_r9_the_second_write_of_a_sequence_that_may_not_begin_waits_too_where_the_first_is_cancelled() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    first, behind = (bench.ask(table.node, WRITE, client=second) for _ in range(2))
+    table.arbiter.cancel(first, bench.now)
+    assert table.is_silent(LONGEST)
+    bench.served(behind)
+    assert second.holds
 
 
 @pytest.mark.parametrize("ends", ["released", "cancelled", "lost"])

@@ -28,7 +28,7 @@ from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, NAK, TAU, Bench, reply_of, request_of, up
+from tests.arbiter.bench import ACK, FIVE, MAX_REPLY_DELAY, NAK, TAU, Bench, lost, reply_of, request_of, up
 
 REQUEST = 8 * TAU
 TOOK = 0.004
@@ -172,6 +172,30 @@ def test_r3_nor_while_the_rest_of_what_came_unexpected_can_come() -> None:
 
 
 # what is lost costs the learned window
+
+
+def test_a_reply_within_its_window_behind_a_damaged_byte_was_not_late() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node, retries=0)
+    bench.sent()
+    bench.wait(REQUEST + TOOK / 2)
+    bench.arbiter.byte_marked(Mark.DAMAGED, bench.now)
+    bench.hear(FIVE, after=TOOK / 2)
+    bench.until_ready()
+    assert not bench.arbiter._in_sync.overdue_replies
+    assert trusted(node)
+
+
+def test_r15_an_overdue_reply_of_a_node_with_the_documents_window_tells_nothing_of_learned_times() -> None:
+    bench = Bench()
+    node = trained(bench, replies=2)
+    times = learning(node).times(node.timings)
+    lost(bench, node)
+    bench.hear(FIVE, after=3.0)
+    bench.until_ready()
+    assert not any(overdue.node for overdue in bench.arbiter._in_sync.overdue_replies)
+    assert (learning(node).times(node.timings), node.max_reply_delay) == (times, TIMINGS.read.max_reply_delay)
 
 
 def test_a_lost_reply_costs_its_learned_window_and_a_check_of_its_node() -> None:

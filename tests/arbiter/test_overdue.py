@@ -225,3 +225,10 @@ def test_what_was_ambiguous_is_forgotten_when_nothing_of_it_can_arrive_any_more(
     assert in_sync.alert
     in_sync.lapse(100.0)
     assert not in_sync.alert, "each reply would be examined for ever"
+
+
+def test_r15_a_byte_that_is_repeated_clears_the_overdue_reply_that_it_is() -> None:
+    for times in (1, 2, 3):
+        in_sync = InSync()
+        in_sync.add_overdue((bytes.fromhex(ACK),), None, 0.0, 0.15)
+        assert in_sync.heard(bytes.fromhex(ACK) * times, 1.0) is not None

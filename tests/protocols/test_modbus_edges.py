@@ -35,6 +35,7 @@ def test_an_exception_is_a_refusal_with_its_name_that_is_believed_at_once(
         ReadRegisters(7).open(UNIT, PROFILE.timings).feed(bytes.fromhex(reply))
     usual = Refused("refused").hint
     assert (refusal.value.hint, refusal.value.confirm) == (hint or usual, False)
+    assert refusal.value.temporary is (hint is not None), "only these four tell of a state that may pass"
 
 
 @pytest.mark.parametrize(

@@ -175,6 +175,29 @@ def test_what_has_left_when_a_hold_begins_is_not_asked_for_when_it_is_over(ledge
         assert ledger.notes == [*asked, ("timeout", ledger.time, False)]
 
 
+def test_during_an_exchange_the_port_is_not_asked_before_a_deadline(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    ledger.out = b"05\x05"
+    pump.turn()
+    ledger.state, ledger.due = LineState.EXCHANGE, ledger.time + 1.0
+    pump.turn()
+    ledger.notes.clear()
+    ledger.is_due, ledger.due = True, inf
+    pump._on_time()
+    assert ledger.notes == [("unsent", 0, ledger.time), ("timeout", ledger.time, False)]
+
+
+def test_a_port_that_is_gone_is_not_asked(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    pump._alarm = cast("Alarm", SimpleNamespace(set=lambda due: ledger.notes.append(("set", due))))
+    ledger.out = b"05\x05"
+    pump.turn()
+    ledger.notes.clear()
+    ledger.state, ledger.due = LineState.HOLDOFF, ledger.time + 1.0
+    pump.connection_lost(None)
+    assert ledger.notes == [("set", ledger.due)]
+
+
 def test_what_lies_unread_is_looked_for_when_a_callers_time_is_over(ledger: Ledger) -> None:
     pump = pump_on(ledger)
     assert pump._port is not None
