@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Hashable, Iterable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf
 from typing import Any, Generic, Protocol, TypeVar, Unpack
 
@@ -45,7 +45,6 @@ class HasNode(Protocol):
     def node(self) -> Requester: ...
 
 
-@dataclass(slots=True, eq=False)
 class Request(Generic[T]):
     """One request to a node, and its result once it is started.
 
@@ -54,15 +53,28 @@ class Request(Generic[T]):
     node that is DOWN, within the probe budget.
     """
 
-    command: Command[T]
-    options: RequestOptions = ORDINARY
-    touches: Command[Any] | None = None
-    stops_seen: int | None = None
-    stop: bool = False
-    client: LineClient | None = None
-    probe: bool = False
-    transaction: Transaction | None = None
-    """The arbiter's transaction, from the start of the request on."""
+    __slots__ = ("client", "command", "options", "probe", "stop", "stops_seen", "touches", "transaction")
+
+    def __init__(
+        self,
+        command: Command[T],
+        options: RequestOptions = ORDINARY,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        client: LineClient | None = None,
+        *,
+        probe: bool = False,
+    ) -> None:
+        self.command = command
+        self.options = options
+        self.touches = touches
+        self.stops_seen = stops_seen
+        self.stop = stop
+        self.client = client
+        self.probe = probe
+        self.transaction: Transaction | None = None
+        """The arbiter's transaction, from the start of the request on."""
 
     @property
     def sent(self) -> bool:
