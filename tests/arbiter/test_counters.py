@@ -136,6 +136,14 @@ def test_what_happens_is_counted_once_and_nothing_else_is(
     assert {name: count for name, count in known.items() if type(count) is int and count} == counts
 
 
+def test_resetting_the_statistics_of_a_line_resets_those_of_its_nodes() -> None:
+    bench = Bench()
+    nodes = [up(bench, address) for address in (1, 2)]
+    assert [node.counters.snapshot(0.150).ok for node in nodes] == [1, 1]
+    bench.arbiter.reset_statistics(bench.now)
+    assert [node.counters.snapshot(0.150).ok for node in nodes] == [0, 0]
+
+
 def test_quantiles_are_of_what_the_histogram_holds() -> None:
     histogram = Histogram()
     for number in range(1, 101):

@@ -220,6 +220,14 @@ def test_ended_delayed_requests_are_removed_however_many_others_wait(kept: int) 
     assert delayed.live <= 2 * kept + SLACK
 
 
+def test_nothing_is_kept_of_a_delayed_request_that_was_sent() -> None:
+    delayed, node = Delayed(Deadlines()), Bench().node()
+    for number in range(3):
+        delayed.add(Transaction(node, hcp2.Read(1)), 10.0 + number)
+    assert len(delayed.due(11.0)) == 2
+    assert len(delayed._places) == delayed.live == 1
+
+
 def test_many_delayed_requests_are_not_sorted_anew_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
     delayed, node = Delayed(Deadlines()), Bench().node()
     rebuilt: list[int] = []

@@ -80,6 +80,18 @@ def test_a_reply_that_was_slower_than_any_is_forgotten_after_two_epochs() -> Non
     assert window == LEAST
 
 
+def test_the_slowest_reply_is_remembered_for_a_whole_epoch() -> None:
+    times = StepTimes()
+    for _ in range(EPOCH):
+        times.note(0.001, 0.001, 0.0)
+    times.note(0.010, 0.010, 0.0)
+    for _ in range(2 * EPOCH - 2):
+        times.note(0.001, 0.001, 0.0)
+    assert times.window == pytest.approx(1.5 * 0.010 + 0.002)
+    times.note(0.001, 0.001, 0.0)
+    assert times.window == LEAST
+
+
 def test_no_learned_time_exceeds_the_documents() -> None:
     times = StepTimes()
     for _ in range(TRUSTED_AFTER):

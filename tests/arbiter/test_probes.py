@@ -235,6 +235,11 @@ def test_r11_after_a_return_a_fifth_of_the_line_for_thirty_seconds() -> None:
     assert not budget.take(0.2, 149.0)
 
 
+def test_r11_what_is_missing_is_awaited_for_a_millisecond_at_least() -> None:
+    budget = ProbeBudget(0.0)
+    assert budget.wait_for(0.1, 0.0) == 0.001, "the timer would run all the time"
+
+
 def test_r11_the_bucket_holds_no_more_than_its_capacity_and_a_full_one_pays_for_anything() -> None:
     budget = ProbeBudget(0.0)
     budget.idle(100.0, over=True)

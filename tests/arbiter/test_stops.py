@@ -125,3 +125,23 @@ def test_r7_stops_are_sent_themselves_if_the_one_that_was_sent_is_cancelled_befo
     assert second.phase is Phase.QUEUED
     table.bench.served(second)
     assert second.error is None
+
+
+def test_r9_an_equal_stop_that_was_sent_itself_ends_with_its_own_outcome() -> None:
+    bench = Bench()
+    node = up(bench)
+
+    def stop(client: LineClient | None) -> Transaction:
+        return bench.ask(
+            node, hcp2.Write(1, (0.0,)), priority=Priority.URGENT, stop=True, client=client, idempotent=True, retries=1
+        )
+
+    first = stop(bench.arbiter.add_client())
+    bench.sent()
+    while first.phase is not Phase.QUEUED:
+        bench.wait(0.01)
+    second = stop(None)  # the owner's, which goes first
+    for each in (second, first):
+        bench.served(each)
+    assert second.started < first.started
+    assert (first.attempts, second.attempts) == (2, 1)

@@ -442,3 +442,13 @@ def test_r9_no_request_of_a_sequence_that_may_not_begin_is_popped(push: Callable
     assert turns.live == 0
     turns.admit_sequences(None)
     assert turns.pop() is waits
+
+
+def test_r9_requests_of_a_sequence_that_may_not_begin_keep_their_order() -> None:
+    turns = Turns(Fifo(), Fifo)
+    turns.admit_sequences(SequenceRule(True, None))
+    first, second, third = (queued(Hold(NODE, LineClient(), 1.0)) for _ in range(3))
+    turns.push(second)
+    turns.push(third)
+    turns.push_front(first)
+    assert turns.aside == [first, second, third]

@@ -361,3 +361,12 @@ def test_r3_a_stall_in_the_midst_of_a_resynchronisation_raises_no_max_reply_dela
     bench.now += stall
     bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now)
     assert node.max_reply_delay == 0.150
+
+
+def test_when_a_request_will_have_left_is_known_and_follows_the_port() -> None:
+    bench = Bench()
+    bench.ask(up(bench))
+    asked = bench.now
+    assert bench.arbiter.sent_until == pytest.approx(asked + 8 * TAU)
+    bench.arbiter.transmitted(asked + 0.25)
+    assert bench.arbiter.sent_until == pytest.approx(asked + 0.25 + 8 * TAU)

@@ -20,7 +20,7 @@ from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused, VerifyFailed
 from busmaster.protocols.ei_bisynch import PROTOCOL, BisynchInstrument
 from busmaster.protocols.ei_bisynch.capture import BisynchDialect
-from busmaster.protocols.ei_bisynch.codec import PROFILE, Read, ReadRun, Write
+from busmaster.protocols.ei_bisynch.codec import PROFILE, Read, ReadRun, Write, is_sendable
 from busmaster.protocols.ei_bisynch.device import EmulatedBisynch, make_device
 from busmaster.protocols.ei_bisynch.parameters import error_text, mnemonic_of_tag
 from busmaster.testing import Case, RoundTrip, answers_of, check_dialect, check_protocol, run_in_virtual_time
@@ -74,6 +74,8 @@ def test_ei_bisynch_keeps_the_contract() -> None:
             lambda: ReadRun(("PV",) * 33),
             lambda: Write("SL", float("nan")),
             lambda: Write("SL", 10**12),
+            lambda: Write("SL", 10**400),
+            lambda: Write("SL", 1, width=13),
             lambda: Write("SW", 65536, hexadecimal=True),
             lambda: Write("SW", 1.5, hexadecimal=True),
             lambda: Write("SL", 12345.5, width=5),
@@ -350,6 +352,11 @@ def test_a_disguised_reply_is_of_another_parameter() -> None:
     assert disguised[1:3] != b"PV"
     assert disguised[-1] == xor(disguised[1:-1])
     assert instrument.disguise(ACK, Random(1)) == ACK
+
+
+@pytest.mark.parametrize("value", [10**12, 10**400, float("inf"), "1"])
+def test_what_is_no_number_or_needs_too_many_digits_cannot_be_sent(value: object) -> None:
+    assert not is_sendable(value)
 
 
 def test_an_instrument_carries_100000_traceable_values() -> None:
