@@ -518,6 +518,32 @@ def test_r9_the_second_write_of_a_sequence_that_may_not_begin_waits_too_where_th
     assert second.holds
 
 
+def test_r9_a_sequence_waits_eight_times_its_pause_at_most_whatever_others_of_its_role_ask() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    began = bench.now
+    begins = bench.ask(table.node, WRITE, client=second)
+    for element in range(200):
+        bench.ask(table.there, hcp2.Read(1 + element % 50), priority=POLL)
+    for client in [table.arbiter.add_client(owner_time=1.0) for _ in range(30)]:
+        for element in range(5):
+            bench.ask(table.there, hcp2.Read(60 + element), client=client)
+    bench.served(begins, after=0.09)
+    waited = begins.started - began
+    assert 7.5 * LONGEST * 2 < waited < 8.5 * LONGEST * 2
+
+
+def test_r9_a_sequence_begins_after_its_pause_though_the_timer_comes_late() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    begins = bench.ask(table.node, WRITE, client=second)
+    bench.now += 3 * LONGEST
+    table.arbiter.handle_timeout(bench.now)
+    bench.listen()
+    assert begins.attempts == 1
+    assert table.arbiter.poll_timeout() > bench.now
+
+
 @pytest.mark.parametrize("ends", ["released", "cancelled", "lost"])
 def test_r8_a_request_of_a_sequence_that_may_not_begin_ends_once(ends: str) -> None:
     table = Table()

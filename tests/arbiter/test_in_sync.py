@@ -369,11 +369,14 @@ def test_r15_of_two_answers_in_one_chunk_where_one_may_be_another_nodes_neither_
 
 def test_r15_an_ambiguous_answer_with_anything_behind_it_is_not_believed() -> None:
     bench = Bench()
-    read = bench.ask(overtaken(bench))
+    node = overtaken(bench)
+    node.unheard = SILENT - 1
+    read = bench.ask(node)
     bench.until_sent()
     bench.sent()
     bench.hear(reply_of(1, 55) + "FF", after=REQUEST + 0.003)
     assert (read.value, ambiguous(bench)) == (None, 1)
+    assert node.unheard == 0, "it is alive, and worth a check"
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,15 @@ def test_r15_an_overdue_reply_of_a_node_with_the_documents_window_tells_nothing_
     assert (learning(node).times(node.timings), node.max_reply_delay) == (times, TIMINGS.read.max_reply_delay)
 
 
+def test_r15_a_reply_that_is_awaited_lasts_as_long_as_its_bytes_with_one_pause() -> None:
+    bench = Bench()
+    lost(bench, trained(bench))
+    awaited = next(overdue.awaited for overdue in bench.arbiter._in_sync.overdue_replies if overdue.awaited)
+    assert awaited.silence == pytest.approx(TIMINGS.read.inter_byte_timeout + TAU)
+    longest = hcp2.Read(1).open(1, TIMINGS).sizes.longest
+    assert awaited.lasts == pytest.approx(longest * TAU + awaited.silence)
+
+
 def test_a_lost_reply_costs_its_learned_window_and_a_check_of_its_node() -> None:
     bench = Bench()
     node = trained(bench)

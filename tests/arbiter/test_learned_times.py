@@ -92,6 +92,19 @@ def test_the_slowest_reply_is_remembered_for_a_whole_epoch() -> None:
     assert times.window == LEAST
 
 
+def test_a_raised_max_reply_delay_and_a_shorter_byte_time_count_at_once() -> None:
+    node, read = Learning(), hcp2.Read(1)
+    for _ in range(TRUSTED_AFTER):
+        node.timings(read, TIMINGS, AT_FIRST)
+        node.note(read, False, 0.001, 0.001, 0.0, 2 * TAU)
+    pauses = [node.timings(read, TIMINGS, AT_FIRST).read.inter_byte_timeout]
+    node.note(read, False, 0.001, 0.001, 0.0, TAU)
+    pauses.append(node.timings(read, TIMINGS, AT_FIRST).read.inter_byte_timeout)
+    assert pauses == pytest.approx([LEAST_SILENCE * 2 * TAU, LEAST_SILENCE * TAU])
+    raised = TIMINGS.with_max_reply_delay(0.4)
+    assert node.timings(read, raised, AT_FIRST).read.max_reply_delay == raised.read.max_reply_delay
+
+
 def test_no_learned_time_exceeds_the_documents() -> None:
     times = StepTimes()
     for _ in range(TRUSTED_AFTER):

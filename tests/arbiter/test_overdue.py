@@ -232,3 +232,19 @@ def test_r15_a_byte_that_is_repeated_clears_the_overdue_reply_that_it_is() -> No
         in_sync = InSync()
         in_sync.add_overdue((bytes.fromhex(ACK),), None, 0.0, 0.15)
         assert in_sync.heard(bytes.fromhex(ACK) * times, 1.0) is not None
+
+
+def test_r15_what_was_ambiguous_until_now_says_nothing_of_what_comes_later() -> None:
+    for until, known in ((2.0, True), (1.0, False)):
+        in_sync = InSync()
+        in_sync.recent.append((TWO,))
+        in_sync._forgiven.append((TWO, until))
+        in_sync.heard(bytes.fromhex(reply_of(2, 5)), 1.5)
+        assert in_sync.has_ambiguity(1.5) is not known
+
+
+def test_r15_a_reply_that_stood_alone_ends_what_was_forgiven_of_its_key_and_of_any_key() -> None:
+    in_sync = InSync()
+    in_sync._forgiven += [(ANY_BYTE, 5.0), (ONE, 5.0), (TWO, 5.0)]
+    in_sync.stood_alone((ONE,))
+    assert in_sync._forgiven == [(TWO, 5.0)]

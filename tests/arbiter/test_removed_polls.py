@@ -6,6 +6,8 @@ import pytest
 
 from busmaster.arbiter.schedule import AT_ONCE, SLICE
 from busmaster.arbiter.transaction import Poll
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.arbiter.bench import Bench
 from tests.arbiter.test_schedule import released, running
 
 
@@ -31,3 +33,12 @@ def test_of_those_that_are_being_prepared_one_that_is_removed_takes_no_other_wit
     while schedule.unplaced():
         schedule.release(0.0)
     assert sorted(name for _, name in released(schedule, 2.0)) == sorted({"0", "1", "2"} - {str(removed)})
+
+
+def test_nothing_is_kept_of_the_writes_to_a_node_that_was_removed() -> None:
+    bench = Bench()
+    gone, stays = bench.node(1), bench.node(2)
+    for node in (gone, stays):
+        bench.served(bench.ask(node, hcp2.Write(1, (5.0,))))
+    bench.arbiter.remove_node(gone)
+    assert gone not in bench.arbiter.dispatcher.writes.queues

@@ -370,3 +370,12 @@ def test_when_a_request_will_have_left_is_known_and_follows_the_port() -> None:
     assert bench.arbiter.sent_until == pytest.approx(asked + 8 * TAU)
     bench.arbiter.transmitted(asked + 0.25)
     assert bench.arbiter.sent_until == pytest.approx(asked + 0.25 + 8 * TAU)
+
+
+def test_r2_what_has_left_earlier_than_the_baud_rate_says_makes_no_window_shorter() -> None:
+    bench = Bench()
+    bench.ask(up(bench))
+    ends = bench.arbiter.sent_until
+    bench.arbiter.unsent(3, bench.now)
+    bench.arbiter.unsent(0, bench.now + TAU)
+    assert bench.arbiter.sent_until == ends

@@ -20,7 +20,7 @@ from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused, VerifyFailed
 from busmaster.protocols.ei_bisynch import PROTOCOL, BisynchInstrument
 from busmaster.protocols.ei_bisynch.capture import BisynchDialect
-from busmaster.protocols.ei_bisynch.codec import PROFILE, Read, ReadRun, Write, is_sendable
+from busmaster.protocols.ei_bisynch.codec import PRINTABLE, PROFILE, Read, ReadRun, Write, is_sendable
 from busmaster.protocols.ei_bisynch.device import EmulatedBisynch, make_device
 from busmaster.protocols.ei_bisynch.parameters import error_text, mnemonic_of_tag
 from busmaster.testing import Case, RoundTrip, answers_of, check_dialect, check_protocol, run_in_virtual_time
@@ -357,6 +357,15 @@ def test_a_disguised_reply_is_of_another_parameter() -> None:
 @pytest.mark.parametrize("value", [10**12, 10**400, float("inf"), "1"])
 def test_what_is_no_number_or_needs_too_many_digits_cannot_be_sent(value: object) -> None:
     assert not is_sendable(value)
+
+
+def test_the_sync_reads_of_an_instrument_with_printable_checks_have_such_checks_too() -> None:
+    assert [read.name for read in PRINTABLE.sync_reads] == [read.name for read in PROFILE.sync_reads]
+    assert all(read.printable_check for read in (PRINTABLE.probe, *PRINTABLE.sync_reads))
+
+
+def test_the_longest_reply_to_a_read_has_a_mnemonic_twelve_characters_and_perhaps_a_status() -> None:
+    assert Read("PV").open(1, TIMINGS).sizes.longest == len(reply("PV", "-1234567890.") + b" ")
 
 
 def test_an_instrument_carries_100000_traceable_values() -> None:
