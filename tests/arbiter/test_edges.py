@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 
 import pytest
 
@@ -275,6 +276,19 @@ def test_r3_an_ack_that_is_taken_for_an_echo_may_be_followed_by_its_packet() -> 
     heard = bench.now
     bench.until_sent()
     assert bench.now - heard >= 1.0
+
+
+def test_the_echo_of_a_closing_ack_delays_nothing() -> None:
+    bench, node = msc_line(echo=True)
+    read = bench.ask(node, msc.DataRead(2008))
+    bench.hear(bench.sent(), after=MSC_REQUEST)
+    bench.hear(f"{ACK} {REPLY_1234}", after=0.002)
+    assert bench.sent() == ACK
+    assert read.error is None
+    bench.hear(ACK, after=MSC_TAU)
+    assert bench.arbiter.state is LineState.READY
+    assert bench.arbiter.poll_timeout() == inf
+    assert bench.ask(node, msc.DataRead(2012)).attempts == 1
 
 
 def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() -> None:

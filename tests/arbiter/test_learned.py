@@ -631,7 +631,8 @@ def test_the_line_waits_for_a_late_ack_where_it_would_be_a_command_to_another_no
         bench.until_ready()
         assert written.error is None
     assert trusted(node)
-    bench.ask(node, codec.Write(1, 17, 6))
+    write = bench.ask(node, codec.Write(1, 17, 6))
+    assert write.timings().write == profile.timings.write, "no learned window, not even a long one"
     bench.ask(other, codec.Read(1, 18))
     bench.until_sent()
     out = bench.now

@@ -51,7 +51,16 @@ def test_r9_equal_stops_of_many_clients_are_sent_once_and_each_gets_the_outcome(
     table = Table()
     stops = [table.write() for _ in range(64)]
     assert table.run(*stops) == 1
-    assert [(stop.error, table.bench.ended(stop)) for stop in stops] == [(None, 1)] * 64
+    assert [(stop.error, stop.attempts, table.bench.ended(stop)) for stop in stops] == [(None, 1, 1)] * 64
+
+
+def test_r9_equal_stops_are_sent_once_though_one_of_a_sequence_is_between_them() -> None:
+    table = Table()
+    client = table.client()
+    hold = table.bench.arbiter.exclusive(table.node, table.client(), 1.0)
+    first, _, second = stops = [table.write(client=each) for each in (client, hold, client)]
+    assert table.run(*stops) == 2
+    assert first.started == second.started
 
 
 def test_r9_equal_stops_of_one_client_are_sent_once() -> None:

@@ -201,6 +201,7 @@ def test_a_run_requests_the_same_parameter_by_nak_and_the_next_by_ack() -> None:
 
 
 def test_a_run_that_brings_another_parameter_ends() -> None:
+    assert len(ReadRun(("PV",) * 32).names) == 32
     exchange = ReadRun(("PV", "SL")).open(1, TIMINGS)
     exchange.feed(reply("PV", "1."))
     assert outcome(exchange, [reply("SP", "2.")]) is FrameError
