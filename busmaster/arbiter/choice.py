@@ -26,7 +26,6 @@ before it prepares its reply is not earlier when shifted.
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from math import inf
 from typing import Any, TypeAlias, final
 
@@ -105,11 +104,13 @@ done for every request."""
 
 
 @final
-@dataclass(frozen=True, slots=True)
 class WaitUntil:
-    """Send nothing before this time, in seconds: an overdue reply may still come."""
+    """Send nothing before this `time`, in seconds: an overdue reply may still come."""
 
-    time: float
+    __slots__ = ("time",)
+
+    def __init__(self, time: float) -> None:
+        self.time = time
 
 
 @final

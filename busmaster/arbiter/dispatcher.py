@@ -419,7 +419,7 @@ class Dispatcher:
         self._end(transaction, now)
 
     def attempt_failed(
-        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, ambiguous: bool = False
+        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, ambiguous: bool
     ) -> None:
         """Retry or fail a transaction. An `ambiguous` reply does not change the node's health (R15)."""
         if self.tapped is not None:

@@ -102,9 +102,7 @@ class Trust:
             transaction.node.unheard += not heard
             self._in_sync.add_overdue(keys, transaction.node, step.end, over, awaited)
 
-    def hear(
-        self, wire: OnWire, run: bytes, unexpected: UnexpectedBytes, now: float, ours: bool = False
-    ) -> NodeRecord | None:
+    def hear(self, wire: OnWire, run: bytes, unexpected: UnexpectedBytes, now: float, ours: bool) -> NodeRecord | None:
         """Process the bytes received before a silence. Returns the node whose overdue reply they contain, if known.
 
         If they may be `ours`, an incomplete echo, they clear nothing: the end of a request can look like a whole

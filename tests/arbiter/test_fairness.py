@@ -61,7 +61,7 @@ class Desk:
             if ok:
                 self.dispatcher.succeeded(transaction, 5.0, self.now)
             else:
-                self.dispatcher.attempt_failed(transaction, True, no_reply(), self.now)
+                self.dispatcher.attempt_failed(transaction, True, no_reply(), self.now, ambiguous=False)
                 transaction.node.health = Health.UP
                 transaction.node.failures = 0
         self.start()

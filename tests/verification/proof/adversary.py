@@ -71,7 +71,7 @@ def _bytes(world: World) -> list[Action]:
             if setup.may(setups.ECHO_FAULTS):
                 possible += [("echo", place, "wrong"), ("echo", place, "lost")]
             continue
-        if echoes or (setup.beyond and place):  # the wire keeps order; so does a channel
+        if echoes or (setup.beyond and _keeps_order(world, place)):
             continue
         if reply.kind in PACKETS:
             if any(other.begun and other.kind in PACKETS for other in world.overdue[:place]):
@@ -88,6 +88,9 @@ def _bytes(world: World) -> list[Action]:
                 continue
         if setup.whole:
             possible.append(("whole", place))
+            if reply.begun:
+                continue
+            possible += [("part", place, length) for length in setup.pauses if length < len(reply.data)]
             possible += [("byte", place, "nak")] if setup.may(setups.NAKS) and world.may_refuse(reply.request) else []
             possible += [("never", place)] if setup.beyond else []
             continue
@@ -106,6 +109,14 @@ def _bytes(world: World) -> list[Action]:
     return possible
 
 
+def _keeps_order(world: World, place: int) -> bool:
+    """Return whether this reply comes behind an earlier one. A node answers in order, and a channel keeps the order of
+    all replies; but within their maximum reply delays one node may be slower than another."""
+    reply, earlier = world.overdue[place], world.overdue[:place]
+    within = world.setup.learned is not None
+    return any(other.unit == reply.unit for other in earlier) if within else bool(earlier)
+
+
 def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[Time]]:
     """Return what the action cannot be earlier than, what it cannot be later than, and what it must be before."""
     setup, deadlines = world.setup, world.arbiter._deadlines
@@ -120,9 +131,10 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
             latest.append(world.unread_by)
     if what == "timer":
         earliest.append(getattr(deadlines, action[1]))
-    elif what in ("byte", "echo", "all", "whole"):
+    elif what in ("byte", "echo", "all", "whole", "part"):
         reply = world.overdue[action[1]]
         more = len(reply.data) - 1 if what in ("all", "whole") else 0
+        more = action[2] - 1 if what == "part" else more
         if setup.receive_latency:  # all that an adapter holds is read within the latency of its first byte
             more = 0
         earliest.append(reply.lo + more * world.byte_time)
@@ -159,6 +171,8 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         reply = world.overdue.pop(action[1])
         world.over(reply)
         world.hear(reply.data, reply.origin)
+    elif what == "part":
+        _part(world, world.overdue[action[1]], action[2])
     elif what == "stray":
         world.strays = 0
         world.hear(action[1], STRAY)
@@ -224,6 +238,14 @@ def _byte(world: World, place: int, what: object) -> None:
         world.mark()
     elif byte:
         world.hear(byte, reply.origin)
+
+
+def _part(world: World, reply: Overdue, length: int) -> None:
+    data, reply.data = reply.data[:length], reply.data[length:]
+    reply.begun = True
+    reply.lo = world.now + world.byte_time
+    reply.hi = world.now + reply.gap
+    world.hear(data, reply.origin)
 
 
 def _echo(world: World, echo: Overdue, what: str) -> None:

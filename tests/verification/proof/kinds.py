@@ -64,6 +64,27 @@ def telegram(request: bytes, value: bytes, check: Callable[[bytes], int], echo: 
     return b"\x02" + body + bytes((check(body),))
 
 
+@dataclass(frozen=True)
+class TailsAlike(Kind):
+    """Nodes whose replies begin otherwise for each element and end alike: the beginning of one and the end of another
+    make a third one with a right checksum."""
+
+    def right_value(self, command: Any, place: int) -> float:
+        return float(self.values[place] + 10 * (command.element - 1))
+
+
+def tails_alike() -> Kind:
+    kind = comms(hcp2, (b"15", b"10.8"))
+
+    def answer(request: bytes, place: int) -> bytes:
+        if request[6:7] != b"\x05":
+            return ACK
+        # Element 1 has 15 and 10.8, element 2 has 25 and 20.8.
+        return telegram(request, request[5:6] + (b"5", b"0.8")[place], xor, slice(4, 6))
+
+    return TailsAlike(kind.profile, kind.commands, answer, kind.values)
+
+
 def comms(
     codec: Any, texts: tuple[bytes, bytes], elements: tuple[int, int] = (1, 2), profile: Profile | None = None
 ) -> Kind:
@@ -166,6 +187,7 @@ def _packet(unit: int, body: bytes) -> bytes:
 
 KINDS: dict[str, Callable[[], Kind]] = {
     "hcp2": lambda: comms(hcp2, (b"15", b"10.8")),  # the checksums of element 1 are ACK and NAK
+    "hcp2, tails alike": tails_alike,
     "hcp2, other checksums": lambda: comms(hcp2, (b"11", b"17")),  # STX and EOT
     "microflex": lambda: comms(
         hcp2, (b"15", b"10.8"), (microflex.FIRMWARE.number, microflex.TEMPERATURE.number), microflex.PROFILE

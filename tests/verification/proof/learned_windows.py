@@ -6,7 +6,7 @@ it. There is no grid. As it ships, the last attempt of a read, writes and what i
 yet have the document's window, and a second of three attempts has twice as much.
 
 Whether a pause was longer than a window is told by any such window. Less than is possible is explored in these: the
-silence that ends a reply is the shortest that is learned; the document's times do not come back for a while; how late
+pause that ends a reply is the shortest that is learned; the document's times do not come back for a while; how late
 a reply is that is no later than usual (`NodeRecord.latest`) is told by the least or the longest window.
 """
 
@@ -74,7 +74,7 @@ def learned_windows(setup: Setup) -> list[StandIn]:
         (OnWire, "learn", _learns_nothing),
         (Learning, "was_late", _learns_nothing),
         (Learning, "was_away", _learns_nothing),
-        (Step, "gap_over", _goes_on if setup.kind == "msc" else _is_whole),
+        (Step, "gap_over", _goes_on if setup.kind == "msc" or setup.pauses else _is_whole),
     ]
 
 
@@ -98,10 +98,13 @@ def _any_times(least: float, longest: float, byte_time: float) -> Callable[..., 
 
     def awaited(document: ReplyTiming, patience: int) -> ReplyTiming:
         """Return the document's times with a learned silence, and but for the last attempt with any window."""
-        silence = min(document.inter_byte_timeout, LEAST_SILENCE * byte_time)
+        pause = min(document.inter_byte_timeout, LEAST_SILENCE * byte_time)
         first, last = min(patience * least, document.window), min(patience * longest, document.window)
         timing = replace(
-            document, late_after=min(document.late_after, first), inter_byte_timeout=silence, silence=silence
+            document,
+            late_after=min(document.late_after, first),
+            inter_byte_timeout=pause,
+            silence=document.inter_byte_timeout,
         )
         if first < last:
             object.__setattr__(timing, "window", AnyWindow(first, last))  # no number, as it must be
@@ -111,8 +114,8 @@ def _any_times(least: float, longest: float, byte_time: float) -> Callable[..., 
 
 
 def _goes_on(step: Step, now: float) -> float:
-    """MSC's reader waits for more behind an ACK where a packet is due. The limit for a trickle is left out: it is 248
-    bytes behind the window, and all of a reply has come by then."""
+    """MSC's reader waits for more behind an ACK where a packet is due, and any reader behind a part of a reply. The
+    limit for a trickle is left out: it is a whole reply and a pause behind the window."""
     return now + step.timing.inter_byte_timeout + step.latency + step.byte_time
 
 

@@ -124,6 +124,8 @@ class Setup:
     retransmissions: int = 1
     whole: bool = False
     """Replies come whole, in one chunk."""
+    pauses: tuple[int, ...] = ()
+    """After so many bytes such a reply may pause once, for as long as its document allows."""
     cuts: bool = False
     """What lies in an adapter or the kernel may be read in two pieces; else all of it is read at once."""
     max_reply_delay: float = 0.0
@@ -163,6 +165,7 @@ class Setup:
         if self.lost_acknowledgements:
             parts.append(f"lost ACKs {self.lost_acknowledgements}")
         parts += [f"maximum reply delay {self.max_reply_delay * 1000:g} ms"] if self.max_reply_delay else []
+        parts += ["pauses"] if self.pauses else []
         parts += ["cuts"] if self.cuts else []
         parts += ["bytewise"] if self.bytewise else []
         parts += ["damage"] if self.damage else []

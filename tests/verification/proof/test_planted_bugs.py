@@ -12,6 +12,7 @@ import pytest
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.in_sync import InSync
+from busmaster.arbiter.learned import LEAST
 from busmaster.arbiter.on_wire import OnWire, Output, Step
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
@@ -27,7 +28,7 @@ from tests.planted import (
 from tests.verification.proof.explore import Explorer
 from tests.verification.proof.history import as_test, retell, told
 from tests.verification.proof.instants import seconds, set_unit
-from tests.verification.proof.kinds import KINDS, READ, WRITE, WRITE_THERE
+from tests.verification.proof.kinds import KINDS, READ, READ_LIKE, WRITE, WRITE_THERE
 from tests.verification.proof.setups import (
     CANCELS,
     FLIPS,
@@ -51,6 +52,16 @@ LINE = Setup(commands=(READ, WRITE))
 MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
 LATE = replace(LINE, receive_latency=0.016)
 LEARNS = Setup(commands=(READ,), in_sync=True, whole=True, lapse=0.2, beyond=0.15, retries=1, learned=LEARNED)
+PAUSES = replace(
+    LEARNS,
+    kind="hcp2, tails alike",
+    commands=(READ, READ_LIKE),
+    pauses=(4,),
+    max_reply_delay=0.012,
+    beyond=0.012,
+    lapse=0.033,
+    learned=(LEAST, 0.008),
+)
 SEQUENCES = replace(LINE, commands=(READ,), longest_hold=0.3)
 TURNS = replace(LINE, commands=(READ, WRITE_THERE), second_timing=True)
 
@@ -306,6 +317,16 @@ def with_a_last_attempt_that_is_not_waited_for(patch: Any) -> None:
     patch.setattr(InSync, "over", lambda in_sync, answers: -inf)
 
 
+def with_a_silence_as_learned(patch: Any) -> None:
+    """As it was: behind a part of a reply the line went on after a pause of the learned length (docs/proof.md, 23)."""
+
+    def silent_at(step: Step, last_byte: float) -> float:
+        pause = step.timing.inter_byte_timeout + step.latency + step.byte_time
+        return max(last_byte, step.out) + pause
+
+    patch.setattr(Step, "silent_at", silent_at)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "setup", "rule"),
@@ -344,6 +365,7 @@ def with_a_last_attempt_that_is_not_waited_for(patch: Any) -> None:
         (with_what_a_sequence_leaves_behind, SEQUENCES, "R8"),
         (without_what_is_overdue, LEARNS, "R3"),
         (with_a_last_attempt_that_is_not_waited_for, LEARNS, "R3"),
+        (with_a_silence_as_learned, PAUSES, "R3"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

@@ -380,6 +380,7 @@ class World:
         earliest = end + byte_time if self.setup.paced or self.setup.echo else self.now
         reply = Overdue(answers[place], earliest, end + begins, gap)
         reply.ticket, reply.request = ticket, out
+        reply.unit = 0 if transaction is None else self.nodes.index(transaction.node)
         reply.driver_release_time = timing.driver_release_time
         self.overdue.append(reply)
 

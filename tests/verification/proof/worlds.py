@@ -10,7 +10,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from busmaster.arbiter.learned import LEAST
-from tests.verification.proof.kinds import READ, READ_THERE, READ_UNLIKE, WRITE, WRITE_THERE
+from tests.verification.proof.kinds import READ, READ_LIKE, READ_THERE, READ_UNLIKE, WRITE, WRITE_THERE
 from tests.verification.proof.setups import (
     ALL,
     BEYOND,
@@ -66,6 +66,12 @@ def _learning(kind: str, *adversary: str, commands: tuple[int, ...] = (READ,), m
     line = replace(_line(kind, *adversary, commands=commands), in_sync=True, whole=True, retries=1)
     lapse, learned = max_reply_delay * 4 / 3, (LEAST, max_reply_delay * 2 / 3)
     return replace(line, max_reply_delay=max_reply_delay, beyond=max_reply_delay, lapse=lapse, learned=learned)
+
+
+def _pausing(kind: str, commands: tuple[int, ...]) -> Setup:
+    """Such a world in which a reply may pause, and its rest may come in the reply of the next request."""
+    one = _learning(kind, commands=commands, max_reply_delay=SHORT.get(kind, 0.012))
+    return replace(one, pauses=(4,), lapse=0.033)
 
 
 def quick() -> Iterator[Setup]:
@@ -178,6 +184,9 @@ def in_sync() -> Iterator[Setup]:
         yield _late(kind, NAKS, commands=(WRITE,), retries=1)
         yield replace(_late(kind, NAKS, commands=(WRITE,)), strict=True)
         yield _learning(kind, NAKS, max_reply_delay=SHORT.get(kind, 0.012))
+    for commands in ((READ,), (READ, READ_LIKE)):
+        yield _pausing("hcp2, tails alike", commands)
+    yield _learning("mentor", commands=(READ, READ_THERE), max_reply_delay=SHORT["mentor"])
 
 
 GROUPS = {
