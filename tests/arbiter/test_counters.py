@@ -210,6 +210,13 @@ def test_the_recent_utilisation_begins_anew_when_the_statistics_are_reset() -> N
     assert recent.note(6.0, replace(idle, busy=4.5, quiet_time=0.5)) == pytest.approx(0.5)
 
 
+def test_the_recent_utilisation_is_1_at_most_though_an_exchange_counts_whole_when_it_ends() -> None:
+    recent = RecentUtilisation(10.0)
+    idle = line_statistics()
+    recent.note(0.0, replace(idle, busy=0.0, quiet_time=0.0))
+    assert recent.note(1.0, replace(idle, busy=1.0, quiet_time=0.5)) == 1.0
+
+
 def test_the_recent_utilisation_is_that_of_the_window_and_of_no_time_before() -> None:
     recent, idle = RecentUtilisation(10.0), line_statistics()
     recent.note(0.0, idle)

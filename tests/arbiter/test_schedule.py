@@ -185,6 +185,7 @@ def test_new_members_are_asked_from_the_next_cycle_on() -> None:
     set_members(poll, [new])
     assert list(poll.results) == [old]
     assert list(begin_cycle(poll, 0.5)) == [new]
+    assert poll.cycles == 2
 
 
 # phases

@@ -209,8 +209,20 @@ def test_r3_a_resynchronisation_does_not_run_out_while_the_port_holds_an_ack() -
     bench.wait(3.0)
     assert bench.sent() == ""
     bench.unsent = 0
-    bench.until_sent()
+    assert bench.until_sent() < 0.1, "the silence, and no reply is awaited"
     assert bench.sent().startswith("02 01 00 08"), "the read, when nothing lies before it in the port"
+
+
+def test_r2_while_the_bus_is_being_closed_a_window_still_counts_from_when_the_request_has_left() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.arbiter.unsent(8, bench.now)
+    bench.arbiter.close(bench.now)
+    bench.now += 5.0
+    bench.arbiter.unsent(0, bench.now)
+    assert bench.arbiter.poll_timeout() == pytest.approx(bench.now + 0.100)
+    bench.hear(FIVE, after=0.004)
+    assert read.value == 5.0
 
 
 def test_r1_a_holdoff_does_not_run_out_while_the_port_holds_a_closing_ack() -> None:

@@ -369,6 +369,13 @@ def test_the_longest_reply_to_a_read_has_a_mnemonic_twelve_characters_and_perhap
     assert Read("PV").open(1, TIMINGS).sizes.longest == len(reply("PV", "-1234567890.") + b" ")
 
 
+@pytest.mark.parametrize(("text", "value"), [("16.", 16), ("16. ", 16), (" 16", 16), ("16.5 ", 16.5), ("16.0", 16.0)])
+def test_a_number_without_decimals_is_a_whole_one_also_with_spaces_around_it(text: str, value: float) -> None:
+    done = Read("PV").open(1, TIMINGS).feed(reply("PV", text))
+    assert isinstance(done, Done)
+    assert (done.value, type(done.value)) == (value, type(value))
+
+
 def test_an_instrument_carries_100000_traceable_values() -> None:
     EmulatedBisynch(1, traceable=TraceableMemory(1, 10**5))
     with pytest.raises(InvalidCommand, match=r"10\*\*5"):
