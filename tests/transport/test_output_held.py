@@ -28,6 +28,7 @@ from busmaster import (
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import LineChange, LineChanged
+from busmaster.arbiter.tap import Attempt
 from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -72,6 +73,7 @@ class Ledger:
         self.is_due = False
         self.is_over = False
         self.due = inf
+        self.events: list[object] = []
 
     # the port
 
@@ -100,8 +102,8 @@ class Ledger:
         data, self.out = self.out, None
         return data
 
-    def poll_event(self) -> None:
-        return None
+    def poll_event(self) -> object:
+        return self.events.pop() if self.events else None
 
     def poll_timeout(self) -> float:
         return self.due
@@ -121,6 +123,11 @@ class Ledger:
 
     def handle_timeout(self, now: float, *, unread: bool) -> None:
         self.notes.append(("timeout", now, unread))
+
+    # the tap
+
+    def attempted(self, attempt: Attempt) -> None:
+        self.notes.append(("attempted", attempt))
 
     # both
 
@@ -148,6 +155,18 @@ def test_a_request_counts_as_sent_when_the_write_has_returned(ledger: Ledger) ->
     ledger.out = b"05\x05"
     pump.turn()
     assert ledger.notes == [("written", b"05\x05"), ("transmitted", 0.3), ("tapped", 0.3, b"05\x05")]
+
+
+@pytest.mark.parametrize("tapped", [True, False])
+def test_a_tap_is_told_of_each_finished_attempt(ledger: Ledger, tapped: bool) -> None:
+    pump = pump_on(ledger)
+    attempt = Attempt("hcp2", 1, hcp2.Read(1), hcp2.PROFILE.timings)
+    assert attempt.number == 1
+    ledger.events.append(attempt)
+    if not tapped:
+        pump.tap = None
+    pump.turn()
+    assert ledger.notes == [("attempted", attempt)] * tapped
 
 
 def test_what_has_not_left_is_asked_for_only_when_a_deadline_of_the_line_is_due(ledger: Ledger) -> None:
