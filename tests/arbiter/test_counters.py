@@ -234,3 +234,18 @@ def test_r12_times_that_are_not_in_buckets_yet_are_bounded() -> None:
     for histogram in (*line.waits, of_node.latency):
         assert len(histogram.new) < BATCH
     assert of_node.latency.count >= BATCH + 10
+
+
+def test_the_recent_utilisation_of_no_time_is_that_since_the_reset() -> None:
+    recent = RecentUtilisation(10.0)
+    line = replace(line_statistics(), busy=2.0, quiet_time=0.0)
+    assert [recent.note(float(now), line) for now in ("4", "4")] == [line.utilisation] * 2
+
+
+def test_the_99th_percentile_is_not_the_highest() -> None:
+    histogram = Histogram()
+    for seconds in (*[0.001] * 199, 1.0):
+        histogram.record(seconds)
+    quantiles = Quantiles.of(histogram)
+    assert quantiles.highest == 1.0
+    assert quantiles.p99 < 0.002

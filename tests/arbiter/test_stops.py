@@ -8,7 +8,7 @@ import pytest
 
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.errors import WriteUnconfirmed
+from busmaster.errors import Superseded, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import Bench, up
 
@@ -154,3 +154,28 @@ def test_r9_an_equal_stop_that_was_sent_itself_ends_with_its_own_outcome() -> No
         bench.served(each)
     assert second.started < first.started
     assert (first.attempts, second.attempts) == (2, 1)
+
+
+def test_stops_to_a_node_are_counted_so_that_a_write_prepared_before_one_is_not_sent() -> None:
+    bench = Bench()
+    node, other = bench.node(), bench.node(2)
+    for count in (1, 2):
+        bench.arbiter.note_stop(node)
+        assert (node.stops, other.stops) == (count, 0)
+
+
+def test_r7_all_queued_writes_of_a_line_can_be_superseded() -> None:
+    bench = Bench()
+    nodes = [up(bench, address) for address in (1, 2)]
+    on_wire = bench.ask(nodes[0])
+    writes = [
+        bench.ask(node, hcp2.Write(1, (5.0,)), priority=priority)
+        for node in nodes
+        for priority in (Priority.COMMAND, Priority.BACKGROUND)
+    ]
+    read = bench.ask(nodes[1])
+    bench.arbiter.dispatcher.supersede_writes(bench.now)
+    bench.listen()
+    assert [type(write.error) for write in writes] == [Superseded] * 4
+    for transaction in (on_wire, read):
+        assert bench.served(transaction).error is None

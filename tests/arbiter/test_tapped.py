@@ -22,6 +22,7 @@ from tests.arbiter.bench import (
     QUIET,
     READ_1_OF_NODE_1,
     Bench,
+    up,
 )
 from tests.contract.test_driver import Odd
 
@@ -217,3 +218,16 @@ def test_an_attempt_says_how_long_the_line_had_resynchronised() -> None:
     bench.wait(QUIET + 0.152)
     first, second = ended(bench)
     assert second.quiet_time - first.quiet_time == pytest.approx(QUIET, abs=0.01)
+
+
+def test_each_cycle_of_a_poll_is_a_transaction_of_its_own() -> None:
+    bench = Bench(tapped=True)
+    node = up(bench)
+    bench.poll(node, 0.1, 7, 8)
+    bench.wait(0.0)
+    for _ in range(6):
+        bench.until_sent()
+        bench.answer()
+    numbers = [attempt.transaction for attempt in ended(bench) if attempt.command in (hcp2.Read(7), hcp2.Read(8))]
+    assert len(numbers) == 6
+    assert len(set(numbers)) == 6

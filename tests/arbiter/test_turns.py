@@ -452,3 +452,16 @@ def test_r9_requests_of_a_sequence_that_may_not_begin_keep_their_order() -> None
     turns.push(third)
     turns.push_front(first)
     assert turns.aside == [first, second, third]
+
+
+def test_r9_the_time_after_a_sequence_is_not_charged_to_its_program() -> None:
+    desk = Desk()
+    one, other = desk.client(), desk.client()
+    hold = Hold(NODE, one, 1.0)
+    desk.backlog._hold_for(hold, COMMAND)
+    assert desk.backlog.pop(desk.now) is None
+    desk.ask(one, 3)
+    desk.ask(other, 3)
+    desk.backlog.end_hold(hold, desk.now)
+    desk.now += 10.0
+    assert desk.serve(2) == [one, other]
