@@ -281,6 +281,6 @@ def test_a_kind_of_nodes_and_what_listens_to_them_make_no_other_profile() -> Non
 def test_two_protocols_share_a_line_if_one_of_them_lists_the_other() -> None:
     other = replace(hcp2.PROFILE, name="other")
     assert not other.may_share_with(hcp2.PROFILE)
-    lists = replace(other, shares_line_with=("hcp2",))
+    lists = replace(other, shares_line_with=frozenset(("hcp2",)))
     assert lists.may_share_with(hcp2.PROFILE)
     assert hcp2.PROFILE.may_share_with(lists)
