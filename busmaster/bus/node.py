@@ -55,6 +55,9 @@ class Request(Generic[T]):
 
     __slots__ = ("client", "command", "options", "probe", "stop", "stops_seen", "touches", "transaction")
 
+    transaction: Transaction | None
+    """The arbiter's transaction, from the start of the request on."""
+
     def __init__(
         self,
         command: Command[T],
@@ -73,8 +76,7 @@ class Request(Generic[T]):
         self.stop = stop
         self.client = client
         self.probe = probe
-        self.transaction: Transaction | None = None
-        """The arbiter's transaction, from the start of the request on."""
+        self.transaction = None
 
     @property
     def sent(self) -> bool:
