@@ -14,6 +14,7 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node, Priority
+from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
 from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
 from busmaster.planning import PlannedGroup
@@ -25,6 +26,21 @@ from busmaster.transport.serial_port import SerialPort
 from tests.stories import cycles, on_a_bus
 
 # plans and bounds of the running bus
+
+
+@pytest.mark.parametrize("release", [0.0, 0.03])
+def test_the_time_for_which_a_drive_still_drives_the_line_belongs_to_the_plan(release: float) -> None:
+    times = hcp2.PROFILE.timings.read
+    timings = Timings.uniform(replace(times, driver_release_time=release))
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1, timings=timings)
+        bus.poll_group("all", period=0.5, points=[axis.point(str(element)) for element in range(1, 6)])
+        await asyncio.sleep(20.0)
+        prediction = await bus.plan()
+        assert (await bus.statistics()).utilisation == pytest.approx(prediction.utilisation, abs=0.02)
+
+    on_a_bus(story, EmulatedMint(1, delay=Delay(0.05)))
 
 
 def test_the_plan_of_a_running_bus_is_what_it_does() -> None:

@@ -107,6 +107,24 @@ def test_an_unpaced_line_that_answers_at_once_never_calls_back_from_within_a_wri
     run_in_virtual_time(ask())
 
 
+def test_a_transport_that_is_closed_as_bytes_come_hands_over_no_more() -> None:
+    async def ask() -> None:
+        transport, recorder = await opened(line())
+        heard = recorder.data_received
+
+        def close(data: bytes) -> None:
+            heard(data)
+            transport.close()
+
+        recorder.data_received = close  # type: ignore[method-assign]
+        transport.write(b"\x05")
+        await recorder.lost()
+        await asyncio.sleep(1.0)
+        assert len(recorder.received) == 1
+
+    run_in_virtual_time(ask())
+
+
 def test_it_can_be_unplugged_once_and_then_says_nothing_more() -> None:
     async def ask() -> None:
         emulated = line()

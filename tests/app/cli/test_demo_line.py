@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 
+from busmaster.app.cli import demo_line
 from busmaster.app.cli.demo import PERIOD, devices
 from busmaster.app.cli.demo_line import AWAY_FOR, CONTROLLERS, LOSES_ITS_WIRE, SETTINGS, UP_FOR, make_line
 from busmaster.bus.bus import Bus
@@ -59,3 +60,27 @@ def test_the_axes_of_the_controllers_move() -> None:
             return [abs(await axis.read() - one) > 1 for axis, one in zip(axes, before, strict=True)]
 
     assert run_in_virtual_time(moved()) == [True] * len(CONTROLLERS)
+
+
+def test_the_drive_that_loses_its_wire_gets_it_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+
+    class Server:
+        path = "a port"
+
+        def __enter__(self) -> Server:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+    def input_ended(within: float) -> bool:
+        told.append(f"{within:g} s")
+        return len(told) > 8
+
+    monkeypatch.setattr(demo_line, "serve_pty", lambda line: Server())
+    monkeypatch.setattr(demo_line, "input_ended", input_ended)
+    monkeypatch.setattr(demo_line, "unplug", lambda server, address: told.append(f"without {address}"))
+    monkeypatch.setattr(demo_line, "plug_in", lambda server: told.append("whole"))
+    demo_line.main()
+    again = [f"{UP_FOR:g} s", f"without {LOSES_ITS_WIRE}", f"{AWAY_FOR:g} s", "whole"]
+    assert told == [*again, *again, f"{UP_FOR:g} s"]

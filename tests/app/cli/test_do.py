@@ -5,18 +5,27 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from busmaster.app.cli.do import RecordedNode
+from busmaster.app.cli.read import plain_lines
+from busmaster.bus.bus import Bus
+from busmaster.bus.limits import Limit
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer
+from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.registry import kinds
 from tests.app.cli.conftest import Command, owner, serve, without_time
 from tests.handles.test_handshake import careful
 from tests.patience import PATIENCE
+from tests.stories import on_a_bus
 
 MICROFLEX = ("--protocol", "microflex", "--timeout", "1000")
 FILE = """
@@ -227,3 +236,30 @@ def test_the_owner_of_the_line_carries_it_out_and_keeps_the_record(
     enabling, disabling = audit(file)  # as the owner keeps them
     assert enabling[2:] == ("'write element 108 = 128'", "written")
     assert disabling[2:] == ("'write element 108 = 0'", "written")
+
+
+def test_each_write_of_an_action_is_checked_before_the_first_is_sent() -> None:
+    """As a node does: an action of two writes whose second is beyond its limit writes nothing."""
+    refused: list[str] = []
+    line = SimpleNamespace(authorisation=SimpleNamespace(refuse=lambda request, why: refused.append(why)))
+
+    async def story(bus: Bus) -> None:
+        controller = Hcp2Controller(bus, 1)
+        controller.node.limit(Limit(name="pull", read=hcp2.Read(11), decode=float, maximum=10.0))
+        node = RecordedNode(controller.node, line, "drive", controller, "me")  # type: ignore[arg-type]
+        node._write_request = lambda command: command  # type: ignore[method-assign, assignment, return-value]
+        node.check(hcp2.Write(10, (5.0,)), hcp2.Write(11, (5.0,)))
+        with pytest.raises(InvalidCommand):
+            node.check(hcp2.Write(10, (5.0,)), hcp2.Write(11, (50.0,)))
+
+    on_a_bus(story, EmulatedMint(1))
+    assert len(refused) == 1
+
+
+def test_each_value_of_a_run_is_printed_with_the_precision_of_its_point() -> None:
+    async def story(bus: Bus) -> None:
+        controller = Hcp2Controller(bus, 1)
+        lines = [*plain_lines(controller, "1:2", (1.2345, 2.0), 1)]
+        assert [line.split()[-1] for line in lines] == ["1.2", "2.0"]
+
+    on_a_bus(story, EmulatedMint(1))

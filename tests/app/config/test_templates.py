@@ -153,6 +153,7 @@ def test_a_template_that_there_is_not_is_an_error_with_the_nearest(template: str
         ),
         ("[points]\nspeed = {}\n", "'protocol' is missing"),
         ('protocol = "hcp3"\n', "ours.toml:1: protocol: no such protocol 'hcp3'; did you mean"),
+        ('protocol = ["hcp2", "hcp3"]\n', "ours.toml:1: protocol: no such protocol 'hcp3'; did you mean"),
         ('protocol = "hcp2"\nnodes = 1\n', "ours.toml:2: nodes: no such key"),
         ('protocol = "hcp2\n', "ours.toml:1: not valid TOML"),
     ],

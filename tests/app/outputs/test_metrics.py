@@ -378,3 +378,22 @@ async def test_a_reply_to_head_has_the_header_of_a_scrape_and_no_page() -> None:
     ]
     assert nothing == b""
     assert b"busmaster_line_busy" in page
+
+
+def has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has_ipv6(), reason="no IPv6"))]
+)
+def test_metrics_can_listen_on_addresses_of_both_families(host: str) -> None:
+    with (
+        scrapes.listening(host, 0) as listener,
+        socket.create_connection(listener.getsockname()[:2], PATIENCE) as scraper,
+    ):
+        assert scraper.getpeername()[0] == host
