@@ -9,7 +9,9 @@ import sys
 from contextlib import suppress
 
 import pytest
+from rich.console import Console
 
+from busmaster.app.cli.progress import Bar
 from busmaster.emulator.serve import TcpServer
 from tests.app.cli.conftest import ENVIRONMENT, ROOT
 from tests.patience import PATIENCE
@@ -37,6 +39,16 @@ def scan_on_a_terminal(port: str, *, results_too: bool) -> tuple[bytes, bytes]:
     out, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
     return out or b"", drawn
+
+
+def test_the_bar_counts_as_many_as_it_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Console, "is_terminal", True)
+    with Bar("reading", 10) as bar:
+        bar.advance(6)
+        bar.advance()
+    assert "7/10" in capsys.readouterr().err
 
 
 @pytest.mark.slow

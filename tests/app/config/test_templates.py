@@ -164,6 +164,12 @@ def test_what_is_wrong_in_a_template_is_said_with_its_own_line(text: str, what: 
         line(tmp_path, 'template = "ours.toml"\n')
 
 
+def test_a_template_that_is_a_folder_is_an_error_with_the_line_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(FileError, match=r"line.toml:5: .*folder.toml cannot be read: Is a directory"):
+        line(tmp_path, 'template = "folder.toml"\n')
+
+
 def test_what_does_not_go_with_the_template_is_said_with_the_nodes_line(tmp_path: Path) -> None:
     (tmp_path / "ours.toml").write_text(OURS)
     with pytest.raises(FileError, match=r"line.toml:7: nodes.w.points.mode.*bits or labels, not both"):
