@@ -12,7 +12,7 @@ from tests.patience import PATIENCE
 
 
 def test_the_result_of_the_work_is_that_of_its_future() -> None:
-    future = in_own_thread(lambda: threading.current_thread(), "a name")
+    future = in_own_thread(threading.current_thread, "a name")
     thread = future.result(PATIENCE)
     assert (thread.name, thread.daemon) == ("a name", True)
 
