@@ -167,6 +167,20 @@ def test_a_node_overrides_its_protocol_and_the_protocol_its_document() -> None:
     assert (second.write.late_after, second.write.window, second.write.max_reply_delay) == (0.08, 0.3, 0.4)
 
 
+@pytest.mark.parametrize(
+    ("timing", "could"),
+    [("", True), ("timing = { window = 0.2 }", True), ('timing = "learned"', False)],
+)
+def test_reply_times_could_be_learned_of_a_node_unless_they_are_also_if_it_has_times_of_its_own(
+    timing: str, could: bool
+) -> None:
+    assert parse(HEAD + NODE + timing).nodes["winder"].could_learn is could
+
+
+def test_reply_times_of_hcp_cannot_be_learned_because_its_requests_have_no_checksum() -> None:
+    assert not parse(HEAD + NODE.replace("hcp2", "hcp")).nodes["winder"].could_learn
+
+
 def test_a_node_without_a_word_on_timing_has_its_protocols() -> None:
     assert parse(HEAD + NODE).nodes["winder"].timings is None
     assert Node.of(line(HEAD + NODE).nodes["winder"]).timings == hcp2.PROFILE.timings
