@@ -428,3 +428,12 @@ def test_delays_are_read_as_milliseconds(text: str, delay: Delay) -> None:
 def test_a_delay_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(InvalidCommand, match="reply delay"):
         Delay.parse(text)
+
+
+def test_a_transmission_that_joins_a_collision_is_heard_though_the_host_has_read_from_it_before() -> None:
+    collision = Collision(SETTINGS, 0.0, Random(1))
+    collision.add(0.0, b"\x55", None)
+    ear = Ear()
+    assert [byte for _, byte in collision.heard(ear)] == [0x55]
+    collision.add(10 * TAU, b"\x2a", None)
+    assert [byte for _, byte in collision.heard(ear)] == [0x55, 0x2A]

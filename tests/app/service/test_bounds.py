@@ -14,6 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, bounds, connect
+from busmaster.app.service import plans
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_connection import READ_AT_ONCE, ClientConnection, MessageOrder
 from busmaster.app.service.client_messages import CancelParams, ClientMessage, RequestParams, StreamParams
@@ -24,9 +25,13 @@ from busmaster.app.service.streams import SAMPLES_IN_A_TURN, GroupBroadcast
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line as EmulatedLine
 from busmaster.errors import InvalidCommand
+from busmaster.planning import PlannedGroup
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.app.service.lines import ABSENT, Served, SlowWay, on_a_line, on_a_served_line, raw, served, until
 from tests.patience import PATIENCE
+from tests.stories import on_a_bus
 
 
 def test_news_that_were_dropped_take_no_memory() -> None:
@@ -336,3 +341,19 @@ async def test_a_long_cycle_is_encoded_in_several_turns_of_the_loop() -> None:
             assert turns - before == len(points) // SAMPLES_IN_A_TURN
             assert len(json.loads(bytes(body))["samples"]) == len(points)
             break
+
+
+def test_a_plan_for_a_client_counts_the_groups_of_the_line_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plans, "MOST_PLANNED_GROUPS", 2)
+
+    async def story(bus: Bus) -> None:
+        controller = Hcp2Controller(bus, 1)
+        planner = plans.Planner(bus)
+        more = [PlannedGroup(name, 1.0, [(bus.nodes[0].planned(), hcp2.Read(1))]) for name in ("a", "b")]
+        await planner.plan(more)
+        bus.poll_group("own", period=1.0, points=[controller.point("1")])
+        await planner.plan(more[:1])
+        with pytest.raises(InvalidCommand, match="2 groups at most, and not 3"):
+            await planner.plan(more)
+
+    on_a_bus(story, EmulatedMint(1))
