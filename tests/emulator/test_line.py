@@ -437,3 +437,10 @@ def test_a_transmission_that_joins_a_collision_is_heard_though_the_host_has_read
     assert [byte for _, byte in collision.heard(ear)] == [0x55]
     collision.add(10 * TAU, b"\x2a", None)
     assert [byte for _, byte in collision.heard(ear)] == [0x55, 0x2A]
+
+
+def test_bytes_that_the_host_has_not_received_yet_are_kept_when_more_arrive() -> None:
+    line = line_of(mint())
+    line._arrive(b"ab", 0.1)
+    line._arrive(b"c", 0.2)
+    assert line.receive(1.0) == b"abc"

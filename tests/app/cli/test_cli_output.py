@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import enum
+import errno
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from busmaster.app.cli.app import complain, show_warning
-from busmaster.app.cli.output import emit, json_line, json_value, note, number_text, value_text
+from busmaster.app.cli.output import SteadyOutput, emit, json_line, json_value, note, number_text, value_text
 
 
 class Status(enum.IntFlag):
@@ -106,3 +108,29 @@ def test_a_standard_error_that_nobody_reads_any_more_ends_nothing() -> None:
     finally:
         os.close(writer)
     assert run.stdout == "it goes on\n"
+
+
+def test_a_line_that_was_cut_off_stays_apart_from_later_ones_though_attempts_in_between_write_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    takes = [3, 0, 100]
+    file = (tmp_path / "out").open("wb")
+
+    def write(_: int, data: bytes) -> int:
+        space = takes[0]
+        if not space:
+            takes.pop(0)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        takes[0] = space - len(data[:space]) if space < 100 else space
+        file.write(data[:space])
+        return len(data[:space])
+
+    monkeypatch.setattr(os, "write", write)
+    reported: list[str] = []
+    output = SteadyOutput(lambda what, level: reported.append(what))
+    for line in ("first", "second", "third"):
+        output.print([line])
+    file.close()
+    assert (tmp_path / "out").read_bytes() == b"fir\nthird\n"
+    assert output.lost == 2
+    assert len(reported) == 2

@@ -21,6 +21,8 @@ from pathlib import Path
 import pytest
 import serial
 
+from busmaster.app.cli.arguments import Connection
+from busmaster.app.cli.doctor import patient_of
 from busmaster.app.diagnostics import adapters, diagnosis, examination
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
@@ -542,3 +544,8 @@ def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
     assert LineSettings(9600, 7, "E") not in candidates
     framings = [candidate.framing for candidate in candidates]
     assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)
+
+
+@pytest.mark.parametrize(("nodes", "named"), [(None, False), ((), True), ((3, 4), True)])
+def test_nodes_are_named_only_if_the_user_has_named_them(nodes: tuple[int, ...] | None, named: bool) -> None:
+    assert patient_of(Connection("/dev/ttyUSB0", "hcp2"), nodes).named is named

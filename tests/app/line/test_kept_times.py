@@ -221,3 +221,16 @@ def test_it_is_enough_that_one_node_learns(text: str, kept: Path) -> None:
     one = text.replace('timing = "learned"\n', "").replace("address = 2", 'address = 2\ntiming = "learned"')
     assert run_for(one, LONG) == {"drive"}
     assert set(json.loads(kept.read_text())["nodes"]) == {"drive"}
+
+
+def test_an_error_of_the_file_that_comes_back_is_reported_again() -> None:
+    async def story() -> list[str]:
+        reported: list[str] = []
+        line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
+        kept = kept_times.KeptTimes(line.bus, reported.append)
+        for trouble in ("disk full", "disk full", "", "disk full", "read-only"):
+            kept._trouble = trouble
+            kept._report_trouble()
+        return reported
+
+    assert asyncio.run(story()) == ["disk full", "disk full", "read-only"]
