@@ -70,6 +70,18 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, thr
 
 
 @pytest.mark.slow
+def test_the_owner_of_a_line_that_is_read_only_takes_no_writes_of_programs(
+    busmaster: Command, file: Path, three_controllers: TcpServer
+) -> None:
+    with owner("serve", str(file), "--read-only") as (_, address):
+        ran = busmaster("write", address, *HCP2, "--node", "2", "1=123.456")
+        assert ran.status != 0
+        assert "read-only" in ran.err
+        ran = busmaster("read", address, *HCP2, "--node", "2", "1")
+        assert (ran.status, ran.out) == (0, "1 0\n")
+
+
+@pytest.mark.slow
 def test_points_of_a_file_are_read_by_name_and_in_their_unit_with_and_without_an_owner(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:

@@ -262,6 +262,8 @@ def test_an_invalid_envelope_is_malformed(text: str | bytes, reason: str) -> Non
     with pytest.raises(Malformed, match=reason) as refusal:
         decode_client_message(text)
     assert (refusal.value.code == PARSE_ERROR) == (reason == "not valid JSON")
+    # JSON-RPC 2.0: parse error, invalid request
+    assert encode_error(refusal.value).code == (-32700 if reason == "not valid JSON" else -32600)
 
 
 def test_an_envelope_may_have_a_large_number_and_further_fields() -> None:
