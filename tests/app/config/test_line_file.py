@@ -177,6 +177,13 @@ def test_reply_times_could_be_learned_of_a_node_unless_they_are_also_if_it_has_t
     assert parse(HEAD + NODE + timing).nodes["winder"].could_learn is could
 
 
+def test_a_time_is_at_most_the_longest_that_the_reference_names() -> None:
+    timing = "timing = {{ window = 0.1, max_reply_delay = {} }}"
+    assert parse(HEAD + NODE + timing.format(10)).nodes["winder"].timings is not None
+    with pytest.raises(FileError, match="max_reply_delay: must be at most 10, in seconds"):
+        parse(HEAD + NODE + timing.format(10.001))
+
+
 def test_reply_times_of_hcp_cannot_be_learned_because_its_requests_have_no_checksum() -> None:
     assert not parse(HEAD + NODE.replace("hcp2", "hcp")).nodes["winder"].could_learn
 

@@ -664,6 +664,17 @@ def eventually(request: Callable[[], Any], wanted: Callable[[Any], bool], allowe
 
 
 @pytest.mark.slow
+def test_a_client_that_asks_nothing_for_the_time_of_the_option_is_disconnected(file: Path) -> None:
+    with (
+        owner("serve", str(file)),
+        interface(str(file), "--map", str(file.parent / "map.toml"), "--idle", "1") as opened,
+    ):
+        with socket.create_connection(("127.0.0.1", opened.port), PATIENCE) as idle:
+            assert idle.recv(1) == b""
+        opened.await_text("no request for 1 s")
+
+
+@pytest.mark.slow
 def test_points_are_read_and_written_as_the_map_says(file: Path) -> None:
     options = ("--map", str(file.parent / "map.toml"), "--allow", "oven/*", "--allow", "kiln/*")
     with owner("serve", str(file)), interface(str(file), *options) as opened, client_of(opened) as client:
