@@ -11,6 +11,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -79,6 +80,22 @@ def test_the_owner_of_a_line_that_is_read_only_takes_no_writes_of_programs(
         assert "read-only" in ran.err
         ran = busmaster("read", address, *HCP2, "--node", "2", "1")
         assert (ran.status, ran.out) == (0, "1 0\n")
+
+
+@pytest.mark.slow
+def test_run_too_takes_no_writes_of_programs_if_it_is_read_only(
+    busmaster: Command, file: Path, three_controllers: TcpServer
+) -> None:
+    with started("run", str(file), "--plain", "--read-only") as process:
+        end = time.monotonic() + PATIENCE
+        while (found := find_owner(three_controllers.path)) is None:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        ran = busmaster("write", found.address, *HCP2, "--node", "2", "1=123.456")
+        assert ran.status != 0
+        assert "read-only" in ran.err
+        process.terminate()
+        assert process.wait(PATIENCE) == 0
 
 
 @pytest.mark.slow
