@@ -9,7 +9,7 @@ import pytest
 
 from busmaster import InvalidCommand, Refused
 from busmaster.contract.exchange import MORE, OTHER_FORMAT, Done, FrameError
-from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
+from busmaster.protocols.modbus.codec import PROFILE, MergedRead, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from tests.protocols.modbus_frames import UNIT, frame
 
 
@@ -130,3 +130,9 @@ def test_a_whole_reply_of_another_function_is_no_reply_in_another_format() -> No
 
     assert hint(frame("11 03 04 0001 0002")) == OTHER_FORMAT, "two registers in place of one"
     assert hint(frame("11 04 02 0001")) is None
+
+
+@pytest.mark.parametrize("spans", [(), ((),), ((1,),), ((1, 1), (2, 1, 3))])
+def test_a_merged_read_of_no_spans_is_refused(spans: Any) -> None:
+    with pytest.raises(InvalidCommand, match="merged read"):
+        MergedRead("holding", spans)

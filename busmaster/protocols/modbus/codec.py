@@ -276,6 +276,8 @@ class MergedRead:
         kind = ReadBits if self.table in ReadBits.tables else ReadRegisters
         if not self.spans:
             raise InvalidCommand("a merged read has one span or more")
+        if any(len(span) != 2 for span in self.spans):
+            raise InvalidCommand("a span of a merged read is its first item and their number")
         first = reached = min(self.spans)[0]
         for start, count in sorted(self.spans):
             # no ReadRegisters of each: a group of 500 points is merged in one step of the event loop
