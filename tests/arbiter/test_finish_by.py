@@ -9,7 +9,7 @@ import pytest
 
 from busmaster.arbiter.deadlines import SLACK, Deadlines, Expiries
 from busmaster.arbiter.events import Overdue
-from busmaster.arbiter.health import Health
+from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import TOO_LATE, Phase, Priority, Transaction, too_late
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
@@ -339,3 +339,18 @@ def test_whatever_happens_each_caller_is_told_once_in_time_and_truly(seed: int) 
             assert was_sent
         kinds.add(type(error))
     assert {NotStarted, WriteUnconfirmed, type(None)} <= kinds
+
+
+def test_r12_requests_with_a_deadline_that_have_ended_leave_no_memory_behind() -> None:
+    expiries = Expiries(Deadlines())
+    node = NodeRecord(hcp2.PROFILE, 1, hcp2.PROFILE.timings, 2)
+    crowd = [Transaction(node, hcp2.Read(1), finish_by=1e6) for _ in range(5 * SLACK)]
+    for waiting, transaction in enumerate(crowd):
+        expiries.expect(transaction, waiting)
+    for transaction in crowd:
+        transaction.phase = Phase.ENDED
+    for _ in range(5 * SLACK):
+        transaction = Transaction(node, hcp2.Read(1), finish_by=1e6)
+        expiries.expect(transaction, waiting=0)
+        transaction.phase = Phase.ENDED
+        assert len(expiries._heap) <= SLACK + 2  # each request has two entries

@@ -692,3 +692,50 @@ def test_r7_a_sequence_that_waits_for_an_earlier_write_of_its_program_is_not_tak
     assert backlog.take(lambda one: one is behind) is None
     free = bench.ask(table.there, hcp2.Read(4))
     assert backlog.take(lambda one: one is free) is free
+
+
+def test_r9_a_sequence_after_a_pause_begins_at_once_if_the_one_before_it_kept_nobody_waiting() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    bench.served(bench.ask(table.node, WRITE, client=second))
+    bench.wait(LONGEST)
+    assert second.over
+    third = table.hold(second.client)
+    bench.ask(table.node, WRITE, client=third)
+    assert bench.until_sent() < 0.01
+
+
+def test_r9_a_sequence_that_waited_for_another_begins_when_that_is_over_if_nobody_else_waited() -> None:
+    table = Table()
+    bench = table.bench
+    first, second = (table.hold(table.arbiter.add_client(owner_time=1.0)) for _ in range(2))
+    bench.served(bench.ask(table.node, WRITE, client=first))
+    behind = bench.ask(table.node, WRITE, client=second)
+    assert not behind.attempts
+    table.release(first)
+    assert behind.attempts == 1
+
+
+def test_r9_each_request_of_a_sequence_is_counted_once_when_it_begins() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.ask(table.there)
+    writes = [bench.ask(table.node, hcp2.Write(element, (5.0,)), client=hold) for element in (1, 2, 3)]
+    for write in writes:
+        bench.served(write)
+    assert hold.holds
+    assert table.arbiter.dispatcher.backlog.waiting(COMMAND) == 0
+
+
+def test_r7_requests_of_a_sequence_that_waits_while_others_begin_and_end_keep_their_order() -> None:
+    table = Table()
+    bench, second = table.bench, paused(table)
+    reads = [bench.ask(table.node, hcp2.Read(element), client=second) for element in (1, 2, 3, 4)]
+    for _ in range(2):
+        own = table.hold()
+        bench.served(bench.ask(table.node, WRITE, client=own))
+        table.release(own)
+    assert not any(read.attempts for read in reads)
+    for read in reads:
+        bench.served(read)
+    assert sorted(reads, key=lambda read: read.started) == reads

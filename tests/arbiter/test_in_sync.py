@@ -707,3 +707,15 @@ def test_r15_after_a_duplicate_replies_of_the_last_half_second_are_ambiguous_and
     assert not in_sync.is_ambiguous((keys[2],), 1.75)
     assert in_sync.is_ambiguous((keys[0],), 1.75)
     assert not in_sync.is_ambiguous((keys[0],), 2.0)
+
+
+@pytest.mark.parametrize("kind", ["_ambiguous", "_forgiven"])
+def test_r15_replies_are_examined_as_long_as_an_overdue_one_may_be_mistaken_for_them(kind: str) -> None:
+    in_sync = InSync()
+    in_sync.add_overdue((b"\x01",), None, 0.0, 0.15)
+    in_sync.overdue_replies = []
+    setattr(in_sync, kind, [(b"\x01", 10.0)])
+    in_sync.lapse(9.9)
+    assert in_sync.alert
+    in_sync.lapse(10.0)
+    assert not in_sync.alert

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -21,9 +23,12 @@ from busmaster.arbiter.learned import (
     Learning,
 )
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.contract.exchange import Command
 from busmaster.contract.learning import LEARNED, Learned
+from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, NoReply, WriteUnconfirmed
 from busmaster.protocols.ct_ansi import codec as ct_ansi
+from busmaster.protocols.ei_bisynch import codec as ei_bisynch
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
@@ -616,24 +621,33 @@ def test_r3_an_overdue_reply_near_its_max_reply_delay_raises_it_though_the_line_
     assert [event.node for event in raised] == [node]
 
 
-@pytest.mark.parametrize("codec", [mentor, ct_ansi], ids=["mentor", "ct-ansi"])
-def test_the_line_waits_for_a_late_ack_where_it_would_be_a_command_to_another_node(codec: Any) -> None:
-    """A drive that has just replied says the next parameter when it hears an ACK, whoever says that."""
+@pytest.mark.parametrize(
+    ("profile", "write", "read"),
+    [
+        (mentor.PROFILE, partial(mentor.Write, 1, 17), mentor.Read(1, 18)),
+        (ct_ansi.PROFILE, partial(ct_ansi.Write, 1, 17), ct_ansi.Read(1, 18)),
+        (ei_bisynch.PROFILE, partial(ei_bisynch.Write, "SL"), ei_bisynch.Read("PV")),
+    ],
+    ids=["mentor", "ct-ansi", "ei-bisynch"],
+)
+def test_the_line_waits_for_a_late_ack_where_it_would_be_a_command_to_another_node(
+    profile: Profile, write: Callable[[int], Command[Any]], read: Command[Any]
+) -> None:
+    """A drive that has just replied sends its next parameter when it receives an ACK, from any sender."""
     bench = Bench()
-    profile = codec.PROFILE
     node = bench.arbiter.add_node(profile, 14, bench.now, LEARNED)
     other = bench.arbiter.add_node(profile, 25, bench.now)
     learning(node).begin_with([LearnedTimes("Write", False, 0.004, 0.004, 0.0, 0.020, True)])
     for _ in range(TRUSTED_AGAIN_AFTER + 1):
-        written = bench.ask(node, codec.Write(1, 17, 5))
+        written = bench.ask(node, write(5))
         bench.until_sent()
         bench.hear(ACK, after=REQUEST + TOOK)
         bench.until_ready()
         assert written.error is None
     assert trusted(node)
-    write = bench.ask(node, codec.Write(1, 17, 6))
-    assert write.timings().write == profile.timings.write, "no learned window, not even a long one"
-    bench.ask(other, codec.Read(1, 18))
+    late = bench.ask(node, write(6))
+    assert late.timings().write == profile.timings.write, "no learned window, not even a long one"
+    bench.ask(other, read)
     bench.until_sent()
     out = bench.now
     bench.sent()

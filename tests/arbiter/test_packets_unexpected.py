@@ -267,3 +267,12 @@ def test_r15_an_ack_behind_a_packet_that_was_held_takes_it_away() -> None:
     line, second = asked_twice_alike()
     line.hear(ACK, after=0.003)
     assert isinstance(second.error, GarbledReply)
+
+
+def test_bytes_that_begin_no_packet_get_no_ack_on_an_idle_line() -> None:
+    line = bench()
+    line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.hear("00 55")
+    line.wait(1.0)
+    assert line.sent() == ""

@@ -376,3 +376,22 @@ def test_r3_a_line_that_comes_up_waits_for_the_slowest_of_its_nodes() -> None:
     bench.arbiter.line_up(bench.now)
     bench.ask(first)
     assert bench.until_sent() >= 0.4
+
+
+def test_a_tolerant_profile_skips_the_noise_in_front_of_a_reply() -> None:
+    bench = Bench()
+    node = bench.node(profile=replace(hcp2.PROFILE, noise_tolerant=True))
+    read = bench.ask(node)
+    bench.sent()
+    bench.hear("FF FE 02 30 31 35 03 37", after=REQUEST + 0.004)
+    assert (read.value, read.attempts) == (5.0, 1)
+    assert bench.arbiter.statistics(bench.now).noise_bytes == 2
+
+
+def test_r13_a_line_that_is_reported_lost_twice_is_lost_once() -> None:
+    bench = Bench()
+    for _ in range(2):
+        bench.arbiter.line_down("unplugged", bench.now)
+        bench.listen()
+    assert bench.arbiter.statistics(bench.now).losses == 1
+    assert [event.change for event in bench.events if isinstance(event, LineChanged)] == [LineChange.DOWN]

@@ -494,3 +494,22 @@ def test_a_cycle_has_begun_when_its_first_request_went_out() -> None:
     bench.until_sent()
     assert bench.now > begun
     assert poll.started == begun
+
+
+def test_r10_a_phase_that_was_chosen_counts_from_the_first_poll_of_the_line() -> None:
+    """The phases of all groups can then be compared."""
+    bench = Bench()
+    node = up(bench)
+    first = bench.poll(node, 0.5, 1)
+    bench.wait(1.37)
+    second = Poll("second", 0.4)
+    set_members(second, [Transaction(node, hcp2.Read(2))], Priority.POLL)
+    bench.arbiter.add_poll(second, bench.now)
+    while not bench.cycles or bench.cycles[-1] is not second:
+        bench.until_sent()
+        bench.answer()
+    assert second.phase is not None
+    assert first.phase == 0.0
+    periods = (second.due - first.due - second.phase) / 0.1  # of both
+    assert periods == pytest.approx(round(periods))
+    assert 0.0 <= second.phase < 0.4

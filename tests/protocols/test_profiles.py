@@ -247,3 +247,13 @@ def test_further_settings_of_a_line_are_further_ones_each_named_once(kind: NodeK
     every = [kind.profile.line, *kind.profile.other_lines]
     assert len(set(every)) == len(every)
     assert not (kind.profile.fixed_rate and kind.profile.other_lines)
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=kinds())
+def test_reply_windows_can_be_learned_unless_read_requests_have_no_checksum(kind: NodeKind) -> None:
+    profile = kind.profile
+    if profile.name == "hcp":
+        with pytest.raises(InvalidCommand, match="hcp: reply windows cannot be learned"):
+            profile.check_learnable()
+    else:
+        profile.check_learnable()
