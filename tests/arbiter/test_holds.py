@@ -730,7 +730,7 @@ def test_r9_each_request_of_a_sequence_is_counted_once_when_it_begins() -> None:
 def test_r7_requests_of_a_sequence_that_waits_while_others_begin_and_end_keep_their_order() -> None:
     table = Table()
     bench, second = table.bench, paused(table)
-    reads = [bench.ask(table.node, hcp2.Read(element), client=second) for element in (1, 2, 3, 4)]
+    reads = [bench.ask(table.node, hcp2.Read(element), client=second) for element in range(1, 8)]
     for _ in range(2):
         own = table.hold()
         bench.served(bench.ask(table.node, WRITE, client=own))
