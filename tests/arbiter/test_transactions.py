@@ -514,3 +514,12 @@ def test_while_the_line_is_down_a_request_fails_with_the_latest_reason_and_what_
     bench.arbiter.line_up(bench.now)
     bench.arbiter.line_down("unplugged", bench.now)
     assert error() == f"node 1: the line is down: unplugged (read element 1); {usual}".removesuffix("; ")
+
+
+def test_the_timeline_of_a_request_that_was_never_sent_has_no_times_of_the_line() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node)
+    waiting = bench.ask(node, hcp2.Read(2))
+    timeline = waiting.timeline()
+    assert (timeline.started, timeline.first_byte, timeline.last_byte) == (None, None, None)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, InvalidCommand, MemoryPort, ModbusUnit, Refused, VerifyFailed
-from busmaster.contract.exchange import Done
+from busmaster.contract.exchange import Done, FrameError
 from busmaster.emulator.line import Line
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus
@@ -314,3 +314,17 @@ def test_only_floats_are_not_rounded_when_they_are_scaled() -> None:
     assert is_whole("holding:1")
     assert is_whole("holding:1:int32:swapped")
     assert not is_whole("holding:1:float64")
+
+
+def test_of_several_values_that_no_coil_can_have_the_first_is_named() -> None:
+    with pytest.raises(InvalidCommand, match="a coil is written 1 or 0, not 7"):
+        WriteCoils(0, (True, 7, 9))  # type: ignore[arg-type]
+
+
+def test_a_reply_without_its_end_is_reported_with_its_length() -> None:
+    exchange = ReadRegisters(0, 2).open(UNIT, PROFILE.timings)
+    exchange.feed(frame("11 03 04 0001 0002")[:5])
+    with pytest.raises(FrameError, match="reply cut short after 5 bytes"):
+        exchange.expired(True)
+    with pytest.raises(FrameError, match="no reply"):
+        ReadRegisters(0, 2).open(UNIT, PROFILE.timings).expired(False)

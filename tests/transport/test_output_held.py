@@ -27,8 +27,10 @@ from busmaster import (
 )
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineState
-from busmaster.arbiter.events import LineChange, LineChanged
+from busmaster.arbiter.events import LineChange, LineChanged, Overdue
+from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.tap import Attempt
+from busmaster.arbiter.transaction import Transaction
 from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -240,6 +242,28 @@ def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leavin
         ("unsent", 3, 0.3),
         ("unsent", 0, 1.0),
     ]
+
+
+def test_a_port_that_takes_bytes_again_is_not_queried_after_each_write(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    pump.pause_writing()
+    pump.resume_writing()
+    ledger.notes.clear()
+    ledger.out = b"05\x05"
+    pump.turn()
+    assert [note[0] for note in ledger.notes] == ["written", "transmitted", "tapped"]
+
+
+@pytest.mark.asyncio
+async def test_a_caller_that_is_cancelled_as_its_time_ends_gets_no_second_error(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    node = NodeRecord(hcp2.PROFILE, 1, hcp2.PROFILE.timings, 2)
+    cancelled = asyncio.get_running_loop().create_future()
+    cancelled.cancel()
+    for waiter in (cancelled, None):
+        ledger.events.append(Overdue(Transaction(node, hcp2.Read(1), tag=waiter), NoReply("no reply")))
+    pump.turn()
+    assert ledger.events == []
 
 
 def test_a_deadline_that_a_look_at_the_port_has_brought_forward_is_kept(ledger: Ledger) -> None:
