@@ -727,14 +727,16 @@ def test_r9_each_request_of_a_sequence_is_counted_once_when_it_begins() -> None:
     assert table.arbiter.dispatcher.backlog.waiting(COMMAND) == 0
 
 
-def test_r7_requests_of_a_sequence_that_waits_while_others_begin_and_end_keep_their_order() -> None:
+@pytest.mark.parametrize("requested", ["before the other begins", "while the other holds the line"])
+def test_r7_requests_of_a_sequence_that_waits_while_another_begins_and_ends_keep_their_order(requested: str) -> None:
     table = Table()
-    bench, second = table.bench, paused(table)
-    reads = [bench.ask(table.node, hcp2.Read(element), client=second) for element in range(1, 8)]
-    for _ in range(2):
-        own = table.hold()
+    bench, second, own = table.bench, paused(table), table.hold()
+    reads: list[Transaction] = []
+    for moment in ("before the other begins", "while the other holds the line"):
+        if requested == moment:
+            reads = [bench.ask(table.node, hcp2.Read(element), client=second) for element in range(1, 6)]
         bench.served(bench.ask(table.node, WRITE, client=own))
-        table.release(own)
+    table.release(own)
     assert not any(read.attempts for read in reads)
     for read in reads:
         bench.served(read)

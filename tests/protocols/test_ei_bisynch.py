@@ -76,6 +76,7 @@ def test_ei_bisynch_keeps_the_contract() -> None:
             lambda: Write("SL", 10**12),
             lambda: Write("SL", 10**400),
             lambda: Write("SL", 1, width=13),
+            lambda: Write("SL", 1, width=-1),
             lambda: Write("SW", 65536, hexadecimal=True),
             lambda: Write("SW", 1.5, hexadecimal=True),
             lambda: Write("SL", 12345.5, width=5),
@@ -194,6 +195,7 @@ def test_32_is_added_to_a_low_checksum_where_the_instrument_does_so() -> None:
 
 def test_a_run_requests_the_same_parameter_by_nak_and_the_next_by_ack() -> None:
     exchange = ReadRun(("PV", "PV", "SL")).open(1, TIMINGS)
+    assert [(step.sizes, step.sent) for step in exchange.later] == [(exchange.sizes, 1)] * 2
     assert exchange.feed(reply("PV", "1.")) == Expect(TIMINGS.read, exchange.sizes, NAK)
     assert exchange.feed(b"") is MORE
     assert exchange.feed(reply("PV", "2.")) == Expect(TIMINGS.read, exchange.sizes, ACK)

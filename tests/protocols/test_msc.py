@@ -240,6 +240,8 @@ def test_neighbouring_values_become_one_block() -> None:
 def test_a_value_between_the_steps_or_beyond_the_block_stays_alone() -> None:
     assert merge([DataRead(2000), DataRead(2002)], address_step=4) == []
     assert merge([DataRead(2000), DataRead(2128)], address_step=4) == []
+    (odd,) = merge([DataRead(2001), DataRead(2005), DataRead(2006)], address_step=4)
+    assert odd.serves == (0, 1)
     two = merge([DataRead(0), DataRead(1), DataRead(32), DataRead(33)], address_step=1)
     assert [batch.serves for batch in two] == [(0, 1), (2, 3)]
 
