@@ -741,3 +741,34 @@ def test_r7_requests_of_a_sequence_that_waits_while_another_begins_and_ends_keep
     for read in reads:
         bench.served(read)
     assert sorted(reads, key=lambda read: read.started) == reads
+
+
+def test_a_sequence_ends_though_its_timer_comes_late() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    other = bench.ask(table.there)
+    bench.now += LONGEST + 0.3  # the process was suspended
+    bench.arbiter.handle_timeout(bench.now)
+    assert hold.over
+    assert bench.served(other).error is None
+
+
+def test_r9_an_urgent_request_during_a_sequence_delays_the_next_one_by_its_own_time_only() -> None:
+    """The time of the sequence itself counts twice."""
+    waited = []
+    for takes in (0.004, 0.104):
+        table = Table()
+        bench, program = table.bench, table.arbiter.add_client(owner_time=1.0)
+        first, second = table.hold(program), table.hold(table.arbiter.add_client(owner_time=1.0))
+        write, began = bench.ask(table.node, WRITE, client=first), bench.now
+        polled = bench.ask(table.there, hcp2.Read(20), priority=POLL)
+        bench.served(write)
+        bench.served(bench.ask(table.there, hcp2.Read(2), priority=URGENT, client=program), after=takes)
+        bench.to(began + 0.4)
+        table.release(first)
+        begins = bench.ask(table.node, WRITE, client=second)
+        bench.served(polled)
+        bench.served(begins)
+        waited.append(begins.started - began)
+    assert waited[1] - waited[0] == pytest.approx(-0.1, abs=1e-6)

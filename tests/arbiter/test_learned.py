@@ -606,8 +606,9 @@ def test_a_node_that_has_failed_is_awaited_for_as_long_as_the_document_says() ->
     assert bench.now - asked < REQUEST + MAX_REPLY_DELAY + 0.001, "nothing is left to wait for"
 
 
-def test_r3_an_overdue_reply_near_its_max_reply_delay_raises_it_though_the_line_had_gone_on() -> None:
-    bench = Bench()
+@pytest.mark.parametrize("latency", [0.0, 0.005])
+def test_r3_an_overdue_reply_near_its_max_reply_delay_raises_it_though_the_line_had_gone_on(latency: float) -> None:
+    bench = Bench(latency=latency)
     node, other = trained(bench, 1), up(bench, 2)
     asked = bench.ask(node)
     bench.sent()
@@ -616,9 +617,11 @@ def test_r3_an_overdue_reply_near_its_max_reply_delay_raises_it_though_the_line_
     while bench.now < out + 0.12:
         bench.served(bench.ask(other, hcp2.Read(6 + int(bench.now * 1000) % 2)), after=REQUEST + TOOK)
     bench.hear(reply_of(1, 5), after=0.005)
+    received = bench.now
     bench.until_ready()
     raised = [event for event in bench.events if isinstance(event, MaxReplyDelayRaised)]
     assert [event.node for event in raised] == [node]
+    assert raised[0].age == pytest.approx(received - out - 5 * TAU - latency)  # five bytes follow the first
 
 
 @pytest.mark.parametrize(
