@@ -123,3 +123,14 @@ def test_r13_what_is_asked_while_the_line_is_lost_fails_at_once_and_its_caller_i
     bench.listen()
     assert bench.events[-1] is read
     assert isinstance(read.error, LineDown)
+
+
+def test_r13_a_line_is_failing_until_its_last_request_has_failed() -> None:
+    bench = Bench()
+    node = bench.node()
+    for _ in range(1 + AT_ONCE + 1):  # the first is on the wire and fails at once
+        bench.ask(node)
+    lose(bench)
+    assert bench.arbiter.failing
+    bench.arbiter.handle_timeout(bench.now)
+    assert not bench.arbiter.failing
