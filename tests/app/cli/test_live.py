@@ -173,6 +173,56 @@ async def test_a_click_selects_the_row_under_it_wherever_the_table_is_scrolled_t
             assert screen.table.selected.name.split() == second[:3]
 
 
+@pytest.mark.asyncio
+async def test_keys_move_the_selection_by_a_row_a_page_or_to_an_end() -> None:
+    async with drawn(tell(Picture(), *(row(number) for number in range(1, 41))), (60, 20)) as (screen, _, pilot):
+
+        async def selected(*keys: str) -> int:
+            await pilot.press(*keys)
+            await pilot.pause()
+            found = screen.table.selected
+            assert found is not None
+            words = found.name.split()
+            assert words[:3] in [shown[:3] for shown in table(screen)], "it is in sight"
+            return int(words[1])
+
+        page = screen.table.size.height - 1
+        assert page > 3
+        assert await selected("up") == 1
+        assert await selected("down", "down") == 3
+        assert await selected("up") == 2
+        assert await selected("pagedown") == 2 + page
+        assert await selected("pageup") == 2
+        assert await selected("pageup") == 1
+        assert await selected("end") == 40
+        assert await selected("down") == 40
+        assert await selected("pageup") == 40 - page
+        assert await selected("home") == 1
+
+
+@pytest.mark.asyncio
+async def test_the_row_in_its_place_is_selected_where_the_selected_one_is_gone() -> None:
+    picture = tell(Picture(), *(row(number) for number in range(1, 31)))
+    async with drawn(picture, (60, 20)) as (screen, _, pilot):
+
+        async def after(number: int, *numbers: int) -> str:
+            tell(picture, *(row(one) for one in numbers), set=number)
+            screen.take_picture()
+            await pilot.pause()
+            found = screen.table.selected
+            return "" if found is None else found.name.split()[1]
+
+        await pilot.press(*["down"] * 4)
+        assert await after(2, *(number for number in range(1, 31) if number != 5)) == "6"
+        assert await after(3, 20, *range(1, 11)) == "6"  # it has moved
+        assert [words[1] for words in table(screen)] == ["20", *map(str, range(1, 11))]
+        assert await after(4, 1, 2, 3) == "3"
+        assert await after(5) == ""
+        assert table(screen) == []
+        await pilot.press("down", "pagedown")
+        assert await after(6, 7, 8, 9) == "7"
+
+
 @pytest.mark.slow
 @pytest.mark.asyncio
 async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:

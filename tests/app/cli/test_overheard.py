@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import random
+import time
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import anyio
+import anyio.lowlevel
 import pytest
 
-from busmaster.app.cli.overheard import HeardGroup, Overheard
-from busmaster.app.config import emulated_line
+from busmaster.app.cli.overheard import HeardGroup, Overheard, feed, only_protocol, silent
+from busmaster.app.config import emulated_line, load
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.arbiter.tap import Attempt
+from busmaster.bus.polling import Snapshot
 from busmaster.capture.decode import Decoder
 from busmaster.emulator.memory import MemoryPort
+from busmaster.errors import InvalidCommand
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -24,6 +32,7 @@ from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import find
 from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.patience import PATIENCE
 
 FILE = """
 port = "/dev/ttyUSB0"
@@ -209,3 +218,132 @@ def test_one_telegram_tells_all_its_points(
     kind: str, options: str, a: str, b: str, master: Master, values: dict[str, Any]
 ) -> None:
     assert heard(kind, options, a, b, master) == values
+
+
+# the file of a listener
+
+
+def test_a_listener_takes_no_commands_from_any_output(tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(
+        FILE.format(kind="hcp2", options="address = 5", a="10", b="11")
+        + '[outputs.mqtt]\nallow_commands = ["drive/b"]\n[outputs.sqlite]\npath = "x.sqlite"\n'
+    )
+    file = load(path)
+    outputs = silent(file).outputs
+    assert outputs["mqtt"].allow_commands == ()  # type: ignore[attr-defined]
+    assert outputs["sqlite"] == file.outputs["sqlite"]
+    assert file.outputs["mqtt"].allow_commands  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "protocol"),
+    [(["hcp2"], "hcp2"), (["microflex", "microflex"], "microflex"), (["hcp2", "microflex"], "hcp2")],
+)
+def test_a_listener_reads_the_one_protocol_of_the_file(kinds: list[str], protocol: str) -> None:
+    nodes = {str(number): SimpleNamespace(protocol=kind) for number, kind in enumerate(kinds)}
+    assert only_protocol(SimpleNamespace(nodes=nodes)) == protocol  # type: ignore[arg-type]
+
+
+def test_a_listener_reads_no_file_with_two_protocols() -> None:
+    nodes = {str(number): SimpleNamespace(protocol=kind) for number, kind in enumerate(("mentor", "hcp2"))}
+    with pytest.raises(InvalidCommand, match="one protocol per line, and the file has hcp2, mentor"):
+        only_protocol(SimpleNamespace(nodes=nodes))  # type: ignore[arg-type]
+
+
+FED = """
+port = "/dev/ttyUSB0"
+[nodes.drive]
+protocol = "hcp2"
+address = 5
+points = { a = { item = "10", high = 5 }, b = { item = "11" } }
+[groups.fast]
+period = 0.02
+points = ["drive/a"]
+[groups.slow]
+period = 0.05
+points = ["drive/b", "drive/a"]
+[groups.slowest]
+period = 3600
+points = ["drive/b"]
+[outputs.jsonl]
+path = "FOLDER/line.jsonl"
+"""
+
+
+def test_each_group_is_fed_at_its_period_and_what_is_left_at_the_end_is_written_too(tmp_path: Path) -> None:
+    (tmp_path / "line.toml").write_text(FED.replace("FOLDER", str(tmp_path)))
+    line = ConfiguredLine(load(tmp_path / "line.toml"))
+    points = [point for name in line.file.groups for point in line.members(name)]
+    overheard = Overheard(find("hcp2").protocol, points, time.monotonic)
+    shown: list[Snapshot] = []
+    alarms: list[Any] = []
+
+    async def listen() -> None:
+        async for event in line.bus.events():
+            alarms.append(event)  # noqa: PERF401  it is cancelled
+
+    async def story() -> None:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(listen)
+            await anyio.lowlevel.checkpoint()
+            tasks.start_soon(feed, line, overheard, shown.append)
+            with anyio.fail_after(PATIENCE):
+                while len(overheard.groups) < 3:  # noqa: ASYNC110
+                    await anyio.sleep(0.001)
+                for value in (4.0, 9.0):
+                    overheard._deliver({points[0]: value, points[1]: value + 1}, time.monotonic())
+                    count = len(shown)
+                    while {one.group for one in shown[count:]} != {"fast", "slow"}:  # noqa: ASYNC110
+                        await anyio.sleep(0.001)
+            tasks.cancel_scope.cancel()
+
+    anyio.run(story)
+    fast = [one for one in shown if one.group == "fast"]
+    assert [[sample.value for sample in one.samples.values()] for one in fast] == [[4.0], [9.0]]
+    assert [one.cycle for one in fast] == [1, 2]
+    slow = [one for one in shown if one.group == "slow"]
+    assert [sample.value for one in slow for sample in one.samples.values()] == [4.0, 5.0, 9.0, 10.0]
+    assert [type(event).__name__ for event in alarms] == ["AlarmChanged"]
+    kept = [json.loads(text) for text in (tmp_path / "line.jsonl").read_text().splitlines()]
+    # the last group's only period is the one in which it ended
+    assert {one["group"] for one in kept if "group" in one} == {"fast", "slow", "slowest"}
+
+
+def group_of_two() -> tuple[HeardGroup, list[Any]]:
+    line = ConfiguredLine(
+        read(Source("line.toml", FILE.format(kind="hcp2", options="address = 5", a="10", b="11"))), outputs=False
+    )
+    points = line.members("all")
+    return HeardGroup("all", 10.0, points, 100.0), list(points)
+
+
+def sample_at(finished: float, value: float) -> Any:
+    return SimpleNamespace(finished=finished, value=value)
+
+
+def test_a_group_keeps_to_its_grid_and_counts_only_periods_with_values() -> None:
+    group, [a, b] = group_of_two()
+    streams = [group.subscribe(10) for _ in range(2)]
+    assert group.due == 110.0
+    assert group.turn(110.5, 0.0) is None
+    assert group.due == 120.0
+    group.take(a, sample_at(111.0, 1))
+    group.take(a, sample_at(115.0, 2))
+    group.take(b, sample_at(113.0, 3))
+    first = group.turn(121.0, 7.0)
+    assert first is not None
+    assert (first.cycle, first.due, first.started, first.finished) == (1, 120.0, 113.0, 121.0)
+    assert [sample.value for sample in first.samples.values()] == [2, 3]
+    assert group.turn(158.0, 0.0) is None  # after a standstill
+    assert group.due == 150.0
+    group.take(b, sample_at(159.0, 4))
+    second = group.turn(160.0, 0.0)
+    assert second is not None
+    assert (second.cycle, len(second.samples)) == (2, 1)
+    group.close()
+
+    async def received(stream: Any) -> list[int]:
+        return [snapshot.cycle async for snapshot in stream]
+
+    assert [anyio.run(received, stream) for stream in streams] == [[1, 2], [1, 2]]

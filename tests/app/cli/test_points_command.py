@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from busmaster.app.cli import points
 from tests.app.cli.conftest import ENVIRONMENT, Command
 from tests.patience import PATIENCE
 
@@ -70,6 +73,85 @@ def test_a_terminal_narrower_than_the_table_shows_the_points_one_below_the_other
         os.close(terminal)
     assert lines[:3] == ["w/position (axis0.position)", "    unit °C, factor 0.001", "w/status (11)"]
     assert max(map(len, lines)) <= 50
+
+
+@pytest.fixture
+def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standard output is a terminal of 60 columns."""
+    monkeypatch.setenv("COLUMNS", "60")
+    terminal = SimpleNamespace(isatty=lambda: True, flush=lambda: None, buffer=io.BytesIO())
+    monkeypatch.setattr("busmaster.app.cli.points.sys", SimpleNamespace(stdout=terminal))
+
+
+@pytest.mark.usefixtures("narrow")
+def test_points_that_are_wider_than_the_terminal_are_lists_with_the_item_where_it_is_another_name(
+    busmaster: Command, path: Path
+) -> None:
+    shown = busmaster("points", str(path))
+    assert shown.lines[:3] == ["w/position (axis0.position)", "    unit °C, factor 0.001", "w/status (11)"]
+    assert "d6-7/temperature" in shown.lines
+    assert max(map(len, shown.lines)) <= 60
+
+
+@pytest.mark.usefixtures("narrow")
+def test_points_that_fit_into_the_terminal_are_a_table(busmaster: Command, path: Path) -> None:
+    path.write_text('port = "/dev/ttyUSB0"\n[nodes.w]\nprotocol = "hcp2"\naddress = 5\npoints.a = { item = "1" }\n')
+    assert [line.split() for line in busmaster("points", str(path)).lines] == [
+        ["NODE", "POINT", "ITEM"],
+        ["w", "a", "1"],
+    ]
+
+
+@pytest.mark.usefixtures("narrow")
+def test_csv_on_a_terminal_is_printed_once_and_moves_no_cursor(busmaster: Command, path: Path) -> None:
+    path.write_text(LINE.replace('unit = "°C"', 'unit = "\\u001b[31m"'))
+    shown = busmaster("points", str(path), "--csv")
+    assert "\x1b" not in shown.out
+    assert r"\u001b[31m" in shown.out
+    assert sum(line.startswith("w,position,") for line in shown.lines) == 1
+
+
+def test_csv_is_printed_to_the_letter_and_taken_from_standard_input(
+    busmaster: Command, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = busmaster("points", str(path), "--csv")
+    assert (out.status, out.err) == (0, "")
+    assert out.out.count("w,position,") == 1
+    table = out.out.replace("0.001", "0.01")
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(table.encode())))
+    shown = busmaster("points", str(path), "--from", "-")
+    assert (shown.status, shown.lines) == (0, ["w/position: factor 0.001 -> 0.01"])
+    assert shown.err == f"busmaster: {path}: 1 point changed\n"
+    before = path.stat()
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(table.encode())))
+    shown = busmaster("points", str(path), "--from", "-")
+    assert (shown.out, shown.err) == ("", f"busmaster: {path}: no points changed\n")
+    assert path.stat().st_ino == before.st_ino
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"node,point,factor\nw,status,x\n")))
+    shown = busmaster("points", str(path), "--from", "-")
+    assert shown.status == 2
+    assert shown.err.startswith("busmaster: standard input: row 2, column factor: ")
+
+
+@pytest.mark.parametrize(("length", "status"), [(100, 0), (101, 2)])
+def test_a_table_on_standard_input_may_be_as_long_as_a_file(
+    busmaster: Command, path: Path, monkeypatch: pytest.MonkeyPatch, length: int, status: int
+) -> None:
+    monkeypatch.setattr(points, "LONGEST_FILE", 100)
+    table = b"node,point,factor\nw,position,2\n"
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(table.ljust(length, b"\n"))))
+    shown = busmaster("points", str(path), "--from", "-")
+    assert shown.status == status, shown.err
+    assert ("standard input has more than 100 bytes" in shown.err) == (status == 2)
+
+
+def test_all_points_that_limit_a_point_are_named(busmaster: Command, path: Path) -> None:
+    names = "".join(f'{name} = {{ item = "20", maximum = {limit} }}\n' for name, limit in (("b", 5), ("c", 6)))
+    path.write_text(
+        f'{LINE}[nodes.v]\nprotocol = "hcp2"\naddress = 9\n[nodes.v.points]\na = {{ item = "20" }}\n{names}'
+    )
+    row = next(line for line in busmaster("points", str(path)).lines if line.split()[:2] == ["v", "a"])
+    assert row.endswith(" b, c")
 
 
 def test_a_file_without_points_says_so(busmaster: Command, path: Path) -> None:

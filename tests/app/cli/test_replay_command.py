@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from busmaster.app.cli import main
+from busmaster.app.cli.replay import changed_text
 from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
 from busmaster.contract.frames import Direction
 
@@ -59,3 +62,32 @@ def test_a_file_that_is_no_capture_is_wrong_usage(tmp_path: Path, capsys: pytest
     other.write_text("")
     assert main(["replay", str(other)]) == 2
     assert "the file is empty" in capsys.readouterr().err
+
+
+def test_a_capture_that_was_cut_off_is_replayed_up_to_that_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Path(capture(tmp_path, Outcome.OK, Outcome.OK))
+    path.write_bytes(path.read_bytes()[:-20])
+    assert main(["replay", str(path)]) == 0
+    said = capsys.readouterr()
+    assert said.out == "2 exchanges: 1 the same, 0 changed, 1 not judged\n"
+    assert said.err.startswith(f"busmaster: {path}: ")
+    assert said.err.endswith(", after packet 3; only the packets before are replayed\n")
+
+
+def test_one_changed_exchange_among_many_is_status_1_and_exchanges_are_judged_in_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = capture(tmp_path, Outcome.OK, Outcome.OK, Outcome.REFUSED, Outcome.NONE)
+    assert main(["replay", path, "--json"]) == 1
+    *exchanges, counts = map(json.loads, capsys.readouterr().out.splitlines())
+    assert [one["judged"] for one in exchanges] == [True, True, True, False]
+    assert counts == {"exchanges": 4, "same": 2, "changed": 1, "unjudged": 1}
+
+
+def test_the_line_of_a_change_has_its_time_in_microseconds_and_no_node_where_there_is_none() -> None:
+    one: Any = SimpleNamespace(packet=7, micros=1_500_001, node=None, command="read 1", recorded="ok: 1", now="refused")
+    assert changed_text(one) == "packet 7, 1970-01-01T00:00:01.500001Z, read 1: was ok: 1, is refused"
+    one.node = 0
+    assert changed_text(one).endswith(", node 0: read 1: was ok: 1, is refused")

@@ -8,11 +8,13 @@ import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx2 as httpx
 import pytest
 
+from busmaster.app.outputs.history import HistoryFile
 from tests.app.cli.conftest import Command, owner, started
 from tests.patience import PATIENCE
 
@@ -82,6 +84,77 @@ def test_sigterm_ends_it_while_a_page_looks(file: Path) -> None:
             assert page.recv(100).startswith(b"HTTP/1.1 101")
             interface.send_signal(signal.SIGTERM)
             assert interface.wait(PATIENCE) == 128 + signal.SIGTERM
+
+
+@pytest.fixture
+def served_with(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the page is served with, instead of serving it."""
+    found: dict[str, Any] = {}
+
+    async def serve(followed: Any, listen: Any, secrets: Any, hosts: Any, ready: Any, *rest: Any) -> None:
+        found.update(read_only=followed.read_only, listen=listen, secrets=secrets, hosts=hosts, history=rest[1])
+        ready("http://here")
+
+    def following(line: str | None, *, read_only: bool) -> Any:
+        found["line"] = line
+        return SimpleNamespace(read_only=read_only)
+
+    monkeypatch.setattr("busmaster.app.interfaces.web.serve", serve)
+    monkeypatch.setattr("busmaster.app.cli.web.following", following)
+    return found
+
+
+def test_without_options_the_page_is_for_this_machine_and_may_write(
+    busmaster: Command, served_with: dict[str, Any]
+) -> None:
+    ran = busmaster("web")
+    assert (ran.status, ran.err) == (0, "busmaster: the page is at http://here\n")
+    assert served_with == {
+        "line": None,
+        "read_only": False,
+        "listen": ("127.0.0.1", 8420),
+        "secrets": {},
+        "hosts": (),
+        "history": None,
+    }
+
+
+def test_each_option_of_the_page_has_its_effect(
+    busmaster: Command, served_with: dict[str, Any], tmp_path: Path
+) -> None:
+    tokens, history = tmp_path / "tokens", tmp_path / "line.sqlite"
+    tokens.write_text("hmi 0123456789abcdef\nscada fedcba9876543210\n")
+    tokens.chmod(0o600)
+    options = ("--bind", "[::1]:9000", "--read-only", "--token-file", str(tokens), "--history", str(history))
+    ran = busmaster("web", "slitter", *options, "--host", "plant.example", "--host", "other.example")
+    assert ran.status == 0
+    assert f"--history: there is no file {history} yet" in ran.err
+    assert served_with["line"] == "slitter"
+    assert served_with["read_only"] is True
+    assert served_with["listen"] == ("::1", 9000)
+    assert set(served_with["secrets"]) == {"hmi", "scada"}
+    assert served_with["hosts"] == ("plant.example", "other.example")
+    assert isinstance(served_with["history"], HistoryFile)
+    history.touch()
+    assert "there is no file" not in busmaster("web", "slitter", "--history", str(history)).err
+
+
+@pytest.mark.parametrize("names", [("plant:8420",), ("plant.example", "http://plant"), ("-plant",), ("",)])
+def test_each_host_has_to_be_a_name(busmaster: Command, served_with: dict[str, Any], names: tuple[str, ...]) -> None:
+    options = [word for name in names for word in ("--host", name)]
+    ran = busmaster("web", "slitter", *options)
+    assert (ran.status, served_with) == (2, {})
+    assert f"--host: {names[-1]!r} is not a host name; write it like plant.example" in ran.err
+
+
+@pytest.mark.parametrize("missing", ["msgspec", "starlette", "uvicorn", "websockets"])
+def test_a_missing_package_of_the_page_is_reported(
+    busmaster: Command, served_with: dict[str, Any], monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    monkeypatch.setattr("busmaster.app.cli.web.find_spec", lambda name: None if name == missing else name)
+    ran = busmaster("web", "slitter")
+    assert (ran.status, served_with) == (2, {})
+    assert "pip install 'busmaster[web]'" in ran.err
 
 
 def test_what_is_mistyped_is_one_line(busmaster: Command, tmp_path: Path) -> None:

@@ -1,0 +1,106 @@
+"""`busmaster scan`: what it makes of each reply, and which silent nodes it tries in other protocols."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import anyio
+import pytest
+
+from busmaster import Priority
+from busmaster.app.cli import scan
+from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
+
+
+class Node:
+    """A node that replies so to one request after another."""
+
+    def __init__(self, *replies: Any) -> None:
+        self.replies = list(replies)
+        self.asked: list[dict[str, Any]] = []
+        self.profile = SimpleNamespace(probe="read element 1")
+
+    async def request(self, command: Any, **options: Any) -> Any:
+        self.asked.append({"command": command, **options})
+        reply = self.replies.pop(0)
+        if isinstance(reply, Exception):
+            raise reply
+        return reply
+
+
+def error(kind: type[Any]) -> Any:
+    return kind("it was so", hint="do this")
+
+
+@pytest.mark.parametrize(
+    ("replies", "found"),
+    [
+        ((5,), (5, "read element 1: 5")),
+        ((error(NoReply),), None),
+        ((error(NodeDown),), None),
+        ((error(Refused),), (None, "replies; refuses to read element 1")),
+        ((error(GarbledReply), 7), (7, "read element 1: 7")),
+        ((error(GarbledReply), error(NoReply)), None),
+        ((error(GarbledReply), error(Refused)), (None, "replies; refuses to read element 1")),
+        ((error(GarbledReply), error(GarbledReply)), (None, "read element 1: it was so; do this")),
+    ],
+)
+def test_each_kind_of_reply_is_reported(replies: tuple[Any, ...], found: tuple[Any, str] | None) -> None:
+    node: Any = Node(*replies)
+    assert anyio.run(scan.ask, node) == found
+    assert node.replies == []
+    # one attempt, behind the requests of other programs: a missing node takes its whole reply window
+    assert all(
+        one == {"command": "read element 1", "retries": 0, "priority": Priority.BACKGROUND} for one in node.asked
+    )
+
+
+class Protocol:
+    """A protocol for some addresses, which may share a line or not."""
+
+    def __init__(self, name: str, addresses: range, *, shares: bool) -> None:
+        self.profile = SimpleNamespace(
+            name=name,
+            title=name.upper(),
+            addresses=addresses,
+            may_share_with=lambda other: shares,
+            label=lambda address: f"node {address}",
+        )
+        self.kinds = (SimpleNamespace(name=f"{name}-drive"), SimpleNamespace(name="another"))
+
+
+def others(
+    monkeypatch: pytest.MonkeyPatch, silent: list[int], replying: int
+) -> tuple[list[tuple[str, int]], list[str]]:
+    """Which nodes are tried in which protocol, and what is reported."""
+    own = Protocol("own", range(256), shares=True)
+    offered = [own, Protocol("far", range(256), shares=False), Protocol("near", range(100), shares=True)]
+    tried: list[tuple[str, int]] = []
+
+    async def ask(node: tuple[str, int]) -> Any:
+        tried.append(node)
+        return (0, "it replies") if node[1] == replying else None
+
+    monkeypatch.setattr(scan, "protocols", lambda: offered)
+    monkeypatch.setattr(scan, "ask", ask)
+    bus: Any = SimpleNamespace(node=lambda profile, address: (profile.name, address))
+
+    async def run() -> list[str]:
+        return [line async for line in scan.in_other_protocols(bus, own.profile, silent)]  # type: ignore[arg-type]
+
+    return tried, anyio.run(run)
+
+
+def test_silent_nodes_are_tried_in_the_protocols_that_may_share_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, lines = others(monkeypatch, [1, 2, 200], replying=2)
+    assert tried == [("near", 1), ("near", 2)]
+    assert lines == ["node 2 replies in NEAR; use --protocol near-drive"]
+
+
+def test_only_some_silent_nodes_are_tried_and_only_those_that_the_protocol_can_have(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    silent = [*range(200, 220), *range(30)]
+    tried, _ = others(monkeypatch, silent, replying=-1)
+    assert tried == [("near", address) for address in range(scan.STRANGERS)]
