@@ -39,7 +39,7 @@ class LateNodes:
         await anyio.sleep(max_reply_delay)
         if error.address is not None and error.address in self._ages:
             _, age = self._ages.pop(error.address)
-            error.hint = advice(age)
+            error.hint = advice(age, in_file=self._in_file)
 
     def print_advice(self) -> None:
         """Print advice on standard error, once for each late node."""

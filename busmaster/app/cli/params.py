@@ -248,9 +248,9 @@ async def diff(lines: Lines, sides: Sequence[SetFile | Target], items: Sequence[
     """Print the differences and return the exit status."""
     files = [each.set for each in sides if isinstance(each, SetFile)]
     async with AsyncExitStack() as opened:
-        for bus in lines.buses.values():
+        for where, bus in lines.buses.items():
             await opened.enter_async_context(bus)
-            await opened.enter_async_context(late_nodes(bus))
+            await opened.enter_async_context(late_nodes(bus, in_file=where in lines.files))
         one, other = [each.set if isinstance(each, SetFile) else await read(each, files, items) for each in sides]
     kind = sides[0].kind
     wanted: set[str] | None = None

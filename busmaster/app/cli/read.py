@@ -87,7 +87,7 @@ async def read_points(line: ConfiguredLine, bus: Bus | RemoteBus, names: tuple[s
     points = [line.point(name) for name in names]
     other = None if bus is line.bus else bus
     handles = {point.where: line.handle(point.where, other) for point in points}
-    async with bus, late_nodes(bus) as late:
+    async with bus, late_nodes(bus, in_file=True) as late:
         for name, point in zip(names, points, strict=True):
             try:
                 value = point.value_of(await handles[point.where].node.request(point.command))

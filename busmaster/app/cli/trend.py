@@ -98,9 +98,10 @@ def command(
     """
     if csv_path is not None and os.path.exists(csv_path):
         raise click.UsageError(f"{csv_path} exists and is not overwritten; choose another name")
-    how = How(as_json, plain, span or SPAN, csv_path)
+    in_file = is_line_file(connection.port)
+    how = How(as_json, plain, span or SPAN, csv_path, in_file)
     names = tuple(dict.fromkeys(names))
-    if not is_line_file(connection.port):
+    if not in_file:
         bus = reach(connection)
         traces = [trace_on_port(connection, bus, name) for name in names]
         return until_ended(trend, bus, traces, period, seconds, how)
@@ -115,12 +116,16 @@ def command(
 
 
 class How(NamedTuple):
-    """How samples are shown: as JSON or plain lines, how many seconds of them as a plot, and in which file."""
+    """How samples are shown: as JSON or plain lines, how many seconds of them as a plot, and in which file.
+
+    `in_file`: the points are those of a LINE.toml, which defines the reply windows too.
+    """
 
     as_json: bool
     plain: bool
     span: float
     csv_path: str | None
+    in_file: bool = False
 
 
 # the sampled items
@@ -395,7 +400,7 @@ async def trend(
     """Sample the points until Ctrl-C, or for so many seconds, print and plot them, and return the exit status."""
     plotext = plotter(how.plain or how.as_json)
     with Output(how.as_json, plotext is None, how.csv_path) as output:
-        async with bus, late_nodes(bus):
+        async with bus, late_nodes(bus, in_file=how.in_file):
             sampler = Sampler(bus, traces, period)
             try:
                 with Plot(sampler, plotext, how.span) if plotext is not None else nullcontext() as plot:

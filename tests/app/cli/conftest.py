@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import os
@@ -10,8 +11,10 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,7 +23,11 @@ from typing import Any
 
 import pytest
 
+from busmaster import Service
 from busmaster.app.cli import main
+from busmaster.app.cli.serving import secrets_of, served, service_of
+from busmaster.app.config import load
+from busmaster.app.line import ConfiguredLine
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import find, make_device
@@ -155,3 +162,36 @@ def owner(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         finally:
             process.terminate()
             process.communicate(timeout=PATIENCE)
+
+
+@contextmanager
+def owner_here(path: Path, **options: Any) -> Iterator[Service]:
+    """Serve the line of a file from a thread of this process, and yield its service: quicker than `owner`."""
+    ready: Future[tuple[Service, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def serve_line() -> None:
+        try:
+            line = ConfiguredLine(load(path), **options)
+            line.authorisation.take_secrets(secrets_of(line.file))
+            ended = asyncio.Event()
+            async with line, served(service_of(line), announce=False) as service:
+                assert service is not None
+                ready.set_result((service, asyncio.get_running_loop(), ended))
+                await ended.wait()
+                for _ in range(10):  # a connection that was only accepted so far is taken, and closed
+                    await asyncio.sleep(0)
+        except BaseException as error:
+            if ready.done():
+                raise
+            ready.set_exception(error)
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve_line()))
+    thread.start()
+    try:
+        service, loop, ended = ready.result(PATIENCE)
+        try:
+            yield service
+        finally:
+            loop.call_soon_threadsafe(ended.set)
+    finally:
+        thread.join()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import enum
 import importlib.util
 import io
 import json
@@ -14,6 +16,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
@@ -23,12 +26,13 @@ from busmaster import Bus, Hcp2Controller, MemoryPort, MscController
 from busmaster.app.cli import trend
 from busmaster.app.cli.trend import Sampler, Trace, thinned
 from busmaster.app.outputs.cells import csv_lines
+from busmaster.app.service.remote import RemoteBus
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer
-from busmaster.errors import InvalidCommand
+from busmaster.errors import BusClosed, InvalidCommand, Refused
 from busmaster.protocols._comms.mint import EmulatedMint
-from tests.app.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, owner, serve
+from tests.app.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, owner, owner_here, serve
 from tests.patience import PATIENCE
 from tests.stories import in_virtual_time
 
@@ -373,3 +377,307 @@ def test_a_formula_in_a_name_is_none_in_the_csv() -> None:
     row = trend.Row(0.0, 0.0, Trace("=cmd", point, point), 1)
     [read] = csv.reader(io.StringIO(csv_lines([trend.cells(row)]).decode()))
     assert read[2:5] == ["'=cmd", "1", "'=1+1"]
+
+
+# the options, and the samples as they are shown
+
+
+class HandedOver:
+    """What the command samples, and how, instead of sampling it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(trend, "until_ended", self._until_ended)
+        self.bus: Any = None
+        self.names: list[str] = []
+        self.items: list[tuple[str, str]] = []
+        self.rest: tuple[Any, ...] = ()
+
+    def _until_ended(self, _: Any, bus: Any, traces: list[Trace], *rest: Any) -> int:
+        self.bus, self.names, self.rest = bus, [trace.name for trace in traces], rest
+        self.items = [(trace.node.label, trace.point.item) for trace in traces]
+        return 0
+
+
+@pytest.fixture
+def handed(monkeypatch: pytest.MonkeyPatch) -> HandedOver:
+    return HandedOver(monkeypatch)
+
+
+ALL = ("--period", "0.5", "--seconds", "7", "--span", "9", "--csv", "CSV", "--plain", "--json")
+
+
+def test_each_option_reaches_the_samples_of_a_port_a_file_and_an_owner(
+    busmaster: Command, file: Path, tmp_path: Path, handed: HandedOver
+) -> None:
+    path = str(tmp_path / "x.csv")
+    options = [path if word == "CSV" else word for word in ALL]
+
+    def both(*command: str, in_file: bool = True) -> None:
+        expected: Any = (None, None, trend.How(False, False, trend.SPAN, None, in_file))
+        assert busmaster("trend", *command).status == 0
+        assert handed.rest == expected
+        assert busmaster("trend", *command, *options).status == 0
+        assert handed.rest == (0.5, 7.0, trend.How(True, True, 9.0, path, in_file))
+
+    both(NOBODY, "1/10", "2/axis0.position", "1/10", "--protocol", "hcp2", in_file=False)
+    assert handed.names == ["1/10", "2/axis0.position"]
+    assert handed.items == [("node 1", "10"), ("node 2", "axis0.position")]
+    both(str(file), "winder/force", "winder/11", "winder/force")
+    assert handed.names == ["winder/force", "winder/11"]
+    with owner_here(file):
+        both(str(file), "winder/force", "winder/11")
+    assert handed.names == ["winder/force", "winder/11"]
+    assert isinstance(handed.bus, RemoteBus)
+
+
+def test_an_item_of_a_node_without_an_address_is_its_whole_name(busmaster: Command, handed: HandedOver) -> None:
+    assert busmaster("trend", NOBODY, "12", "--protocol", "dc104").status == 0
+    assert handed.names == ["12"]
+    assert [item for _, item in handed.items] == ["12"]
+
+
+def trace_of(unit: str = "mm", precision: int | None = 2) -> Trace:
+    point: Any = SimpleNamespace(unit=unit, meaning=SimpleNamespace(precision=precision))
+    return Trace("winder/force", point, point)
+
+
+@pytest.mark.parametrize(
+    ("counts", "text"),
+    [
+        ({}, "winder/force: 0 samples, 0 lost"),
+        ({"lost": 3, "missed": 2}, "winder/force: 0 samples, 3 lost, 2 missed"),
+        (
+            {"samples": 5, "lowest": 1.0, "highest": 2.5},
+            "winder/force: 5 samples, 2.5 a second, lowest 1.00, highest 2.50 mm, 0 lost",
+        ),
+        ({"samples": 1, "lost": 1}, "winder/force: 1 samples, 0.5 a second, 1 lost"),
+    ],
+)
+def test_the_summary_has_what_there_is(counts: dict[str, Any], text: str) -> None:
+    trace = trace_of()
+    for name, value in counts.items():
+        setattr(trace, name, value)
+    assert trace.summary(2.0) == text
+    assert " a second" not in trace.summary(0.0)
+
+
+def test_a_summary_without_a_unit_ends_its_values_without_one() -> None:
+    trace = trace_of("", None)
+    trace.take(0.0, 3)
+    assert ", lowest 3, highest 3, 0 lost" in trace.summary(2.0)
+
+
+class Word(enum.IntFlag):
+    READY = 1
+
+
+def test_a_sample_is_printed_with_its_precision_its_names_or_its_error() -> None:
+    good, bad = trend.Row(0.0, 1.25, trace_of(), 3.5), trend.Row(0.0, 1.25, trace_of(), error="no reply")
+    word = trend.Row(0.0, 0.1234567, trace_of(), Word.READY)
+    assert trend.plain_line(good) == "1970-01-01T00:00:00.000Z winder/force 3.50"
+    assert trend.plain_line(bad) == "1970-01-01T00:00:00.000Z winder/force - no reply"
+    assert json.loads(trend.fields(good)) == {
+        "point": "winder/force",
+        "value": 3.5,
+        "seconds": 1.25,
+        "time": "1970-01-01T00:00:00.000Z",
+    }
+    assert json.loads(trend.fields(bad))["error"] == "no reply"
+    assert "value" not in json.loads(trend.fields(bad))
+    assert json.loads(trend.fields(word))["names"] == ["READY"]
+    assert json.loads(trend.fields(word))["seconds"] == 0.123457
+    assert trend.cells(good) == ("1970-01-01T00:00:00.000Z", "1.250000", "winder/force", "3.5", "mm", "")
+    assert trend.cells(bad) == ("1970-01-01T00:00:00.000Z", "1.250000", "winder/force", "", "mm", "no reply")
+    formula = trend.Row(0.0, 0.0, trace_of(), error="=1+1")
+    assert trend.cells(formula)[-1] == "'=1+1"
+
+
+def test_samples_are_in_the_file_at_once_and_printed_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "x.csv"
+    with trend.Output(False, True, str(path)) as output:
+        output.write([trend.Row(0.0, 1.25, trace_of(), 3.5)])
+        assert [row["value"] for row in rows(path)] == ["3.5"]
+        assert "winder/force 3.50" in capsys.readouterr().out
+        file = output._csv
+    assert file is not None
+    assert file.closed
+    with pytest.raises(FileExistsError), trend.Output(False, True, str(path)):
+        pass
+    with trend.Output(True, False, None) as output:  # there is a plot
+        output.write([trend.Row(0.0, 1.25, trace_of(), 3.5)])
+    assert capsys.readouterr().out == ""
+
+
+class Plotter:
+    """A plot that keeps what is drawn."""
+
+    def __init__(self) -> None:
+        self.shown: list[tuple[str, str, list[tuple[float, float]]]] = []
+        self.limits: tuple[float, float] = (0.0, 0.0)
+        self.size: tuple[int, int] = (0, 0)
+
+    def clear_figure(self) -> None:
+        self.shown.clear()
+
+    def theme(self, name: str) -> None:
+        pass
+
+    def plot_size(self, columns: int, rows: int) -> None:
+        self.size = columns, rows
+
+    def xlim(self, first: float, last: float) -> None:
+        self.limits = first, last
+
+    def plot(self, times: Any, values: Any, *, label: str, marker: str) -> None:
+        self.shown.append((label, marker, list(zip(times, values, strict=True))))
+
+    def build(self) -> str:
+        return "the plot\n\n"
+
+
+def plot_of(*traces: Trace, elapsed: float, span: float = 60.0) -> tuple[trend.Plot, Plotter]:
+    sampler: Any = SimpleNamespace(elapsed=elapsed, traces=traces)
+    plotter = Plotter()
+    return trend.Plot(sampler, plotter, span), plotter
+
+
+def test_the_plot_has_each_point_that_has_samples_in_its_span_with_a_marker_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "90")
+    monkeypatch.setenv("LINES", "30")
+    traces = [trace_of() for _ in range(6)]
+    for number, trace in enumerate(traces[:5]):
+        trace.name = f"p{number}"
+        for since in (1.0, 25.0, 30.0):
+            trace.take(since, number + since)
+    plot, plotter = plot_of(*traces, elapsed=30.0, span=10.0)
+    assert plot.lines()[0] == "the plot"
+    assert plotter.limits == (20.0, 30.0)
+    assert plotter.size == (90, 28)
+    assert [(label, marker) for label, marker, _ in plotter.shown] == [
+        *(("p0", "braille"), ("p1", "dot"), ("p2", "x"), ("p3", "o"), ("p4", "braille"))
+    ]
+    assert plotter.shown[1][2] == [(25.0, 26.0), (30.0, 31.0)]
+    plot, plotter = plot_of(*traces, elapsed=30.0)
+    plot.lines()
+    assert plotter.limits == (0.0, 30.0)
+    assert len(plotter.shown[1][2]) == 3
+
+
+def test_a_small_terminal_gets_the_smallest_plot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "7")
+    monkeypatch.setenv("LINES", "3")
+    plot, plotter = plot_of(trace_of(), elapsed=0.0)
+    lines = plot.lines()
+    assert plotter.size == trend.SMALLEST
+    assert plotter.limits == (0.0, trend.DRAW_EVERY)
+    assert len(lines[-1]) == trend.SMALLEST[0]
+
+
+def test_the_last_line_has_the_last_values_rates_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    empty, trace, bare = trace_of(), trace_of(), trace_of("", None)
+    for since in range(10):
+        trace.take(since, since + 0.5)
+        bare.take(since, 7)
+    trace.lost, trace.missed = 2, 3
+    plot, _ = plot_of(empty, trace, bare, elapsed=4.0)
+    assert plot.lines()[-1] == (
+        "4.0 s  winder/force - mm (0.0/s, 0 lost)  winder/force 9.50 mm (2.5/s, 2 lost)  winder/force 7 (2.5/s, 0 lost)"
+    )
+
+
+def test_a_plot_takes_the_terminal_and_gives_it_back(capsys: pytest.CaptureFixture[str]) -> None:
+    plot, _ = plot_of(trace_of(), elapsed=1.0)
+    with plot:
+        assert capsys.readouterr().out == trend.OTHER_SCREEN
+        plot.draw()
+        drawn = capsys.readouterr().out
+        assert drawn.startswith("\x1b[Hthe plot\x1b[K\n")
+        assert drawn.endswith("\x1b[K\x1b[J")
+    left = capsys.readouterr().out
+    assert left.startswith(f"{trend.USUAL_SCREEN}the plot\n")
+    assert left.endswith("\n")
+
+
+@pytest.mark.parametrize(
+    ("plain", "as_json", "terminal", "drawn"),
+    [(False, False, True, True), (True, False, True, False), (False, True, True, False), (False, False, False, False)],
+)
+def test_a_plot_is_drawn_on_a_terminal_unless_lines_are_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    plain: bool,
+    as_json: bool,
+    terminal: bool,
+    drawn: bool,
+) -> None:
+    plotter = Plotter()
+    monkeypatch.setitem(sys.modules, "plotext", plotter)
+    monkeypatch.setattr(trend, "WRITE_EVERY", 0.02)
+    monkeypatch.setattr(trend, "DRAW_EVERY", 0.05)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+
+    async def story() -> int:
+        bus = memory_bus()
+        traces = traces_of(bus, "1/10", "2/10")
+        return await trend.trend(bus, traces, 0.05, 0.6, trend.How(as_json, plain, 0.3, None))
+
+    assert anyio.run(story) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(trend.OTHER_SCREEN) == drawn
+    assert (" 1/10 " in out or '"1/10"' in out) == (not drawn or "1/10 0 (" in out)
+    assert "2/10" in out
+    assert [line.split(":")[1].strip() for line in err.splitlines()] == ["1/10", "2/10"]
+    if drawn:
+        first, last = plotter.limits
+        assert last - first == pytest.approx(0.3)
+
+
+@in_virtual_time
+async def test_a_trend_has_values_if_any_point_has_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trend, "note", lambda *_: None)
+    for counts, status in (((3, 0), 0), ((0, 3), 0), ((0, 0), 1)):
+
+        async def run(sampler: Sampler, *_: Any, counts: tuple[int, ...] = counts) -> None:
+            for trace, count in zip(sampler.traces, counts, strict=True):
+                trace.samples = count
+
+        monkeypatch.setattr(trend, "run", run)
+        bus = memory_bus()
+        traces = traces_of(bus, "1/10", "2/10")
+        assert await trend.trend(bus, traces, 0.1, 3.0, trend.How(False, True, 60.0, None)) == status
+
+
+@in_virtual_time
+async def test_a_read_that_is_refused_ends_a_trend_only_before_the_first_sample() -> None:
+    async with memory_bus() as bus:
+        for samples, ends in ((0, True), (1, False)):
+            sampler = Sampler(bus, traces_of(bus, "1/10"), None)
+            [trace] = sampler.traces
+            trace.samples = samples
+
+            async def refused(*_: Any, **__: Any) -> Any:
+                raise Refused("refused", hint="it does not exist")
+
+            trace.node = SimpleNamespace(request=refused)
+            with pytest.raises(ExceptionGroup) if ends else contextlib.nullcontext():
+                await sampled(sampler, 0.95)
+            # after a failure it waits, so that a lost line does not fail thousands of times
+            assert trace.lost == len(sampler.rows) == (0 if ends else 10)
+
+
+@in_virtual_time
+async def test_the_end_of_the_bus_ends_a_trend() -> None:
+    async with memory_bus() as bus:
+        sampler = await sampler_of(bus, "1/10")
+        [trace] = sampler.traces
+        trace.samples = 1
+
+        async def closed(*_: Any, **__: Any) -> Any:
+            raise BusClosed("the bus is closed", hint="")
+
+        trace.node = SimpleNamespace(request=closed)
+        with pytest.raises(ExceptionGroup):
+            await sampled(sampler, 1.0)
