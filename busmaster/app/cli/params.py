@@ -258,7 +258,7 @@ async def diff(lines: Lines, sides: Sequence[SetFile | Target], items: Sequence[
         wanted = {
             parameter.item for each in sides if isinstance(each, Target) for parameter in parameters_of(each, items)
         }
-        wanted = wanted or set(items)
+        wanted = wanted or named_items(files, items)
     found = [each for each in kind.handle.differences(one, other) if wanted is None or each.parameter.item in wanted]
     for item in one.identity.keys() & other.identity.keys():
         if one.identity[item] != other.identity[item]:
@@ -281,6 +281,19 @@ async def diff(lines: Lines, sides: Sequence[SetFile | Target], items: Sequence[
     elif rows:
         emit(*columns([("ITEM", "NAME", "ONE", "OTHER", "UNIT"), *rows], right=(2, 3)))
     return DIFFERENT if found else OK
+
+
+def named_items(files: Sequence[ParameterSet], items: Sequence[str]) -> set[str]:
+    """Return the items of two files that the user wants, each named by its item or its name.
+
+    Raises UsageError for one that neither file has: the files would be called equal without a comparison.
+    """
+    parameters = [entry.parameter for one in files for entry in one.entries.values()]
+    known = {one.name: one.item for one in parameters if one.name} | {one.item: one.item for one in parameters}
+    for item in items:
+        if item not in known:
+            raise click.UsageError(f"neither file has a parameter {item!r}; {meant(item, known)}")
+    return {known[item] for item in items}
 
 
 async def read(target: Target, files: Sequence[ParameterSet], items: Sequence[str] | None) -> ParameterSet:
