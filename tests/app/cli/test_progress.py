@@ -10,6 +10,7 @@ from contextlib import suppress
 
 import pytest
 from rich.console import Console
+from rich.progress import Progress
 
 from busmaster.app.cli.progress import Bar
 from busmaster.emulator.serve import TcpServer
@@ -66,3 +67,38 @@ def test_a_result_on_the_same_terminal_has_a_line_of_its_own(controllers: TcpSer
     for node in b"678":
         assert b"\x1b[2K" + bytes([node]) + b" read element 1: 0\r\n" in drawn
     assert drawn.endswith(b"\x1b[2K")
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_bar_is_on_a_terminal_alone_away_while_a_result_is_printed_and_gone_at_the_end(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(Console, "is_terminal", terminal)
+    for name in ("start", "stop", "update"):
+        monkeypatch.setattr(Progress, name, lambda *_, name=name, **__: done.append(name))
+
+    def read() -> None:
+        with Bar("reading", 3) as bar:
+            assert done == ["start"] * terminal
+            with bar.hidden():
+                assert done == ["start", "stop"] * terminal
+            assert done == ["start", "stop", "start"] * terminal
+            bar.advance()
+            with bar.hidden():
+                raise OSError("lost")
+
+    with pytest.raises(OSError, match="lost"):
+        read()
+    assert done == ["start", "stop", "start", "update", "stop", "start", "stop"] * terminal
+
+
+def test_the_bar_is_drawn_on_standard_error_with_its_total(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Console, "is_terminal", True)
+    with Bar("reading", 5) as bar:
+        bar.advance(5)
+    drawn = capsys.readouterr()
+    assert "5/5" in drawn.err
+    assert drawn.out == ""
