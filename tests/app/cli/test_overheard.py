@@ -310,6 +310,21 @@ def test_each_group_is_fed_at_its_period_and_what_is_left_at_the_end_is_written_
     assert {one["group"] for one in kept if "group" in one} == {"fast", "slow", "slowest"}
 
 
+def test_a_listener_without_groups_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "line.toml").write_text(FED.replace("FOLDER", str(tmp_path)).partition("[groups")[0])
+    line = ConfiguredLine(load(tmp_path / "line.toml"))
+    waits: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        raise EOFError
+
+    monkeypatch.setattr("busmaster.app.cli.overheard.anyio.sleep", sleep)
+    with pytest.raises(EOFError):
+        anyio.run(feed, line, Overheard(find("hcp2").protocol, [], time.monotonic), lambda _: None)
+    assert waits == [pytest.approx(1.0, abs=0.5)]
+
+
 def group_of_two() -> tuple[HeardGroup, list[Any]]:
     line = ConfiguredLine(
         read(Source("line.toml", FILE.format(kind="hcp2", options="address = 5", a="10", b="11"))), outputs=False

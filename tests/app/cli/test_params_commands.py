@@ -110,6 +110,12 @@ def test_a_node_of_a_file_is_saved_and_compared_in_the_units_of_its_points(
     compared = busmaster("params", "diff", str(path), node, "--items", "11,12")
     assert [line.split()[0] for line in compared.lines] == ["ITEM", "11"]
     assert busmaster("params", "diff", str(path), node, "--items", "12").status == 0
+    # of a node that is compared with a file, the parameters of the file are read, as LINE.toml describes them
+    few = str(written(tmp_path / "few.toml", '"10" = { value = 400 }\n"12" = { value = 12 }'))
+    compared = busmaster("params", "diff", node, few)
+    assert [line.split() for line in compared.lines[1:]] == [["10", "force", "12.5", "40", "N"]]
+    compared = busmaster("params", "diff", node, few, "--items", "11,12")
+    assert [line.split() for line in compared.lines[1:]] == [["11", "7", "-"]]
 
 
 def test_two_nodes_of_a_line_and_two_files_are_compared(
@@ -330,6 +336,20 @@ def test_through_an_owner_a_set_is_saved_and_loaded_and_the_limits_of_both_apply
         assert ran.status == 1
         assert held(three_controllers, 10) == [0]
     assert [row[0] for row in audit(tmp_path) if row[4] == "written"] == ["service"]
+
+
+def test_the_bar_of_a_save_and_of_a_comparison_counts_each_parameter(
+    busmaster: Command, controllers: TcpServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[int] = []
+    monkeypatch.setattr("busmaster.app.cli.progress.Bar.advance", lambda _, count=1: counted.append(count))
+    node, path = f"8@{controllers.path}", tmp_path / "one.toml"
+    save = ("params", "save", controllers.path, "8", "-o", str(path), "--items", "10,11,12", *HCP2)
+    assert busmaster(*save).status == 0
+    assert sum(counted) == 3
+    counted.clear()
+    assert busmaster("params", "diff", str(path), node, *HCP2).status == 0
+    assert sum(counted) == 3
 
 
 # the question

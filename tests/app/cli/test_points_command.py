@@ -76,11 +76,13 @@ def test_a_terminal_narrower_than_the_table_shows_the_points_one_below_the_other
 
 
 @pytest.fixture
-def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+def narrow(monkeypatch: pytest.MonkeyPatch) -> io.BytesIO:
     """Standard output is a terminal of 60 columns."""
     monkeypatch.setenv("COLUMNS", "60")
-    terminal = SimpleNamespace(isatty=lambda: True, flush=lambda: None, buffer=io.BytesIO())
+    buffer = io.BytesIO()
+    terminal = SimpleNamespace(isatty=lambda: True, flush=lambda: None, buffer=buffer)
     monkeypatch.setattr("busmaster.app.cli.points.sys", SimpleNamespace(stdout=terminal))
+    return buffer
 
 
 @pytest.mark.usefixtures("narrow")
@@ -102,13 +104,15 @@ def test_points_that_fit_into_the_terminal_are_a_table(busmaster: Command, path:
     ]
 
 
-@pytest.mark.usefixtures("narrow")
-def test_csv_on_a_terminal_is_printed_once_and_moves_no_cursor(busmaster: Command, path: Path) -> None:
+def test_csv_on_a_terminal_is_printed_once_and_moves_no_cursor(
+    busmaster: Command, path: Path, narrow: io.BytesIO
+) -> None:
     path.write_text(LINE.replace('unit = "°C"', 'unit = "\\u001b[31m"'))
     shown = busmaster("points", str(path), "--csv")
     assert "\x1b" not in shown.out
     assert r"\u001b[31m" in shown.out
     assert sum(line.startswith("w,position,") for line in shown.lines) == 1
+    assert narrow.getvalue() == b""
 
 
 def test_csv_is_printed_to_the_letter_and_taken_from_standard_input(

@@ -73,6 +73,7 @@ def test_a_run_without_options_is_that_of_the_file(busmaster: Command, file: Pat
     assert handed.interval == pytest.approx(run.SWITCH_INTERVAL)
     assert sys.getswitchinterval() == usual
     assert handed.running._view == View()
+    assert handed.running.watch.output is not None  # a full disk does not end it
 
 
 @pytest.mark.parametrize("command", ["run", "serve"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,9 @@ import pytest
 
 from busmaster import Priority
 from busmaster.app.cli import scan
+from busmaster.emulator.serve import TcpServer
 from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
+from tests.app.cli.conftest import Command
 
 
 class Node:
@@ -104,3 +107,17 @@ def test_only_some_silent_nodes_are_tried_and_only_those_that_the_protocol_can_h
     silent = [*range(200, 220), *range(30)]
     tried, _ = others(monkeypatch, silent, replying=-1)
     assert tried == [("near", address) for address in range(scan.STRANGERS)]
+
+
+def test_what_replies_in_another_protocol_is_reported(
+    busmaster: Command, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def in_other_protocols(bus: Any, profile: Any, silent: list[int]) -> AsyncIterator[str]:
+        for address in silent:
+            yield f"node {address} replies in HCP1; use --protocol hcp"
+
+    monkeypatch.setattr(scan, "in_other_protocols", in_other_protocols)
+    ran = busmaster("scan", controllers.path, "--protocol", "hcp2", "--nodes", "8-10", "--timeout", "50")
+    assert [line.split()[0] for line in ran.lines] == ["8"]
+    for address in (9, 10):
+        assert f"busmaster: node {address} replies in HCP1; use --protocol hcp\n" in ran.err

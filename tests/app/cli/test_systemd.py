@@ -78,7 +78,7 @@ def goes_on_after(movement: Movement, line: Any, seconds: float, patience: float
 
 def test_a_line_that_stands_still_is_noticed_after_the_time_of_the_manager(line: Any) -> None:
     movement = Movement(line)
-    assert goes_on_after(movement, line, 0.0)
+    assert goes_on_after(movement, line, 10.0)  # the time counts from the first look
     assert goes_on_after(movement, line, 2.9)
     assert not goes_on_after(movement, line, 0.2)
     line.exchanges += 1

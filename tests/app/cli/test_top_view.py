@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from busmaster.app.cli import top
+from busmaster.errors import LineDown
 from tests.app.cli.conftest import Command, owner_here
 from tests.patience import PATIENCE
 
@@ -35,7 +36,8 @@ class FakeScreen:
         self.taken += 1
 
     def exit(self, status: int | None) -> None:
-        self._status = status
+        if not self._left.is_set():  # the first reason counts
+            self._status = status
         self._left.set()
 
     async def until(self, fact: Callable[[], bool]) -> None:
@@ -117,7 +119,8 @@ def test_a_terminal_that_is_closed_ends_it(busmaster: Command, file: Path, termi
 
     told(story)
     with owner_here(file):
-        assert busmaster("top").status == 1
+        ran = busmaster("top")
+    assert (ran.status, ran.err) == (1, "")
 
 
 @pytest.mark.parametrize("stream", ["stdin", "stdout"])
@@ -183,3 +186,20 @@ def test_control_characters_of_the_line_do_not_reach_the_screen(
     [screen] = FakeScreen.shown
     assert "\x1b" not in screen.picture.frame.title
     assert "Slit" in screen.picture.frame.title
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_a_line_by_tcp_is_followed_with_the_token_of_the_environment(
+    monkeypatch: pytest.MonkeyPatch, busmaster: Command, read_only: bool
+) -> None:
+    followed: dict[str, Any] = {}
+
+    def following(address: Callable[[], str], **options: Any) -> None:
+        followed.update(address=address(), **options)
+        raise LineDown("that is enough", hint="")
+
+    monkeypatch.setenv("BUSMASTER_TOKEN", "secret")
+    monkeypatch.setattr(top, "Following", following)
+    ran = busmaster("top", "tcp://plant:7420", *(("--read-only",) * read_only))
+    assert ran.status == 1
+    assert (followed["address"], followed["token"], followed["read_only"]) == ("tcp://plant:7420", "secret", read_only)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Callable
+import os
+import signal
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +13,10 @@ from typing import Any
 import anyio
 import pytest
 
+from busmaster import Snapshot
 from busmaster.app.cli import watching
 from busmaster.app.cli.arguments import View
+from busmaster.app.cli.ending import SIGNALS
 from busmaster.app.cli.output import Level
 from busmaster.app.cli.poll import KEPT, Cycles
 from busmaster.app.cli.watching import Watch, p99_of
@@ -60,6 +64,30 @@ def ends(status: int) -> Callable[[], Any]:
     return draw
 
 
+@pytest.fixture
+def ctrl_c_after(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+    """End the command by Ctrl-C once cycles of so many groups were printed, three of them at least."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    usual, printed = watching.print_cycle, list[str]()
+    groups = 1
+
+    def print_cycle(watch: Watch, snapshot: Snapshot) -> None:
+        usual(watch, snapshot)
+        enough = len(printed) >= 3 and len(set(printed)) >= groups
+        printed.append(snapshot.group)
+        if not enough and len(printed) >= 3 and len(set(printed)) >= groups:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def of_groups(count: int) -> None:
+        nonlocal groups
+        groups = count
+
+    monkeypatch.setattr(watching, "print_cycle", print_cycle)
+    yield of_groups
+    for number, handler in before.items():  # after a signal a command ignores further ones: its process ends
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("status", [0, 130, 1])
 def test_a_poll_on_a_terminal_draws_no_lines_and_ends_with_its_screen(
     busmaster: Command, controllers: TcpServer, terminal: Terminal, status: int
@@ -73,6 +101,7 @@ def test_a_poll_on_a_terminal_draws_no_lines_and_ends_with_its_screen(
     assert "poll: " in ran.err
 
 
+@pytest.mark.usefixtures("ctrl_c_after")
 @pytest.mark.parametrize(
     ("options", "stream"),
     [(("--plain",), ""), (("--json",), ""), ((), "stdin"), ((), "stdout")],
@@ -83,8 +112,8 @@ def test_no_screen_is_drawn_where_another_form_is_wanted_or_there_is_no_terminal
     if stream:
         setattr(terminal, stream, False)
     terminal.missing = "an extra"
-    ran = busmaster("poll", controllers.path, *POLL, "--seconds", "0.4", *options)
-    assert (ran.status, terminal.drawn) == (0, []), ran.err
+    ran = busmaster("poll", controllers.path, *POLL, *options)
+    assert (ran.status, terminal.drawn) == (130, []), ran.err
     assert "an extra" not in ran.err
     if options == ("--json",):
         assert {key for line in ran.lines for key in json.loads(line)["samples"]} >= {"1/1", "2/axis0.idle"}
@@ -92,16 +121,18 @@ def test_no_screen_is_drawn_where_another_form_is_wanted_or_there_is_no_terminal
         assert {line.split()[1] for line in ran.lines} == {"1/1", "1/axis0.idle", "2/1", "2/axis0.idle"}
 
 
+@pytest.mark.usefixtures("ctrl_c_after")
 def test_a_poll_without_the_packages_of_the_screen_names_them_and_prints_lines(
     busmaster: Command, controllers: TcpServer, terminal: Terminal
 ) -> None:
     terminal.missing = "an extra"
-    ran = busmaster("poll", controllers.path, *POLL, "--seconds", "0.4")
+    ran = busmaster("poll", controllers.path, *POLL)
     assert "the live view needs an extra; showing plain lines" in ran.err
-    assert (ran.status, terminal.drawn) == (0, [])
+    assert (ran.status, terminal.drawn) == (130, [])
     assert ran.lines
 
 
+@pytest.mark.usefixtures("ctrl_c_after")
 @pytest.mark.parametrize("error", [OSError("no folder"), InvalidCommand("no folder")])
 def test_a_screen_that_cannot_be_served_is_replaced_by_lines(
     busmaster: Command,
@@ -118,17 +149,30 @@ def test_a_screen_that_cannot_be_served_is_replaced_by_lines(
             pass
 
     monkeypatch.setattr(watching, "served_here", lambda *_: Unserved())
-    ran = busmaster("poll", controllers.path, *POLL, "--seconds", "0.4")
+    ran = busmaster("poll", controllers.path, *POLL)
     assert "no live view: no folder; showing plain lines" in ran.err
-    assert (ran.status, terminal.drawn) == (0, [])
+    assert (ran.status, terminal.drawn) == (130, [])
     assert ran.lines
 
 
 def test_a_run_goes_on_without_its_terminal_and_reports_from_then_on(
-    busmaster: Command, file: Path, three_controllers: TcpServer, terminal: Terminal
+    busmaster: Command,
+    file: Path,
+    three_controllers: TcpServer,
+    terminal: Terminal,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     terminal.draw = ends(1)
+    views: list[View] = []
+    summarise = Watch.summarise
+
+    def seen(watch: Watch) -> None:
+        views.append(watch.view)
+        summarise(watch)
+
+    monkeypatch.setattr(Watch, "summarise", seen)
     ran = busmaster("run", str(file), "--seconds", "0.5")
+    assert [view.plain for view in views] == [True]  # events are printed again
     assert terminal.drawn
     assert ran.status == 0
     assert "the terminal was closed; polling continues without it" in ran.err
@@ -143,17 +187,34 @@ def test_a_run_ends_with_its_screen(busmaster: Command, file: Path, terminal: Te
 
 @pytest.mark.parametrize("options", [("--plain",), ("--json",)])
 def test_a_run_prints_each_group_and_reports_where_it_is_served_only_to_a_service(
-    busmaster: Command, file: Path, options: tuple[str, ...]
+    busmaster: Command, file: Path, ctrl_c_after: Callable[[int], None], options: tuple[str, ...]
 ) -> None:
     file.write_text(file.read_text() + '[groups.slow]\nperiod = 0.04\npoints = ["winder/11"]\n')
-    ran = busmaster("run", str(file), "--seconds", "0.8", *options)
-    assert ran.status == 0
+    ctrl_c_after(2)
+    ran = busmaster("run", str(file), *options)
+    assert ran.status == 130
     for name in ("winder/force", "winder/11"):
         assert any(name in line for line in ran.lines)
     assert "is served at" not in ran.err
     silent = busmaster("serve", str(file), "--seconds", "0.2")
     assert (silent.status, silent.out) == (0, "")
     assert "Slitter is served at unix:" in silent.err
+
+
+def test_a_run_prints_through_the_output_that_survives_a_full_disk(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    printed: list[list[str]] = []
+    steady: Any = SimpleNamespace(print=lambda lines: printed.append(list(lines)))
+    point: Any = Point()
+    sample = SimpleNamespace(error=None, value=5)
+    snapshot: Any = SimpleNamespace(samples={point: sample}, finished=0.0, wall_at=lambda at: at)
+    watch: Any = SimpleNamespace(view=View(), output=steady)
+    watching.print_cycle(watch, snapshot)
+    assert printed == [["1970-01-01T00:00:00.000Z 1/1 5"]]
+    watch.output = None
+    watching.print_cycle(watch, snapshot)
+    assert capsys.readouterr().out == "1970-01-01T00:00:00.000Z 1/1 5\n"
 
 
 # events while there is a screen
