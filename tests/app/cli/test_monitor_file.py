@@ -251,6 +251,17 @@ MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.max_reply_delay
             [],
             id="open requests outlive what is asked in between",
         ),
+        pytest.param(
+            [
+                (0, asked(3)),
+                (MAX_REPLY_DELAY - 0.01, asked(3)),
+                (MAX_REPLY_DELAY - 0.005, REPLY),
+                (MAX_REPLY_DELAY + 0.03, asked(2)),
+                (MAX_REPLY_DELAY + 0.04, REPLY),
+            ],
+            [],
+            id="of two replies to a repeated request the second may still come",
+        ),
         pytest.param([(0, asked(3, 4)), (0.03, asked(2)), (0.04, REPLY)], [0.5], id="its reply would begin otherwise"),
         pytest.param([(0, asked(3)), (0.03, asked(3)), (0.04, NAK), (0.05, asked(2)), (0.06, REPLY)], [], id="a NAK"),
         pytest.param([(0, asked(9)), (0.03, asked(2)), (0.04, REPLY)], [], id="of a node that is not in the file"),

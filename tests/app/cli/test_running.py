@@ -44,11 +44,13 @@ class HandedOver:
         self.running: Any = None
         self.recording: dict[str, Any] = {}
         self.interval = 0.0
+        self.hangup: Any = None
         monkeypatch.setattr(run, "until_ended", self._until_ended)
         monkeypatch.setattr(run, "capturing", self._capturing)
 
     def _until_ended(self, function: Any) -> int:
         self.running, self.interval = function.__self__, sys.getswitchinterval()
+        self.hangup = signal.getsignal(signal.SIGHUP)
         return self.ends()
 
     @contextmanager
@@ -83,8 +85,11 @@ def test_each_option_of_a_run_has_its_effect(
     file.write_text(file.read_text() + '[nodes.other]\nprotocol = "microflex"\naddress = 7\n' + SAFE)
     capture = str(tmp_path / "x.pcapng")
     options = ("--port", "socket://127.0.0.1:7", "--read-only", "--capture", capture, "--seconds", "2.5")
+    usual = signal.getsignal(signal.SIGHUP)
     assert busmaster(command, str(file), *options).status == 0
     line = handed.running.line
+    assert handed.hangup == handed.running._hangups._receive  # by default the signal ends a process
+    assert signal.getsignal(signal.SIGHUP) == usual
     assert line.bus.endpoint.name == "127.0.0.1:7"
     assert line.authorisation.read_only
     # the recorder knows the protocol of a line only if there is one

@@ -231,6 +231,23 @@ def watch_of(monkeypatch: pytest.MonkeyPatch, **view: Any) -> tuple[Watch, list[
     return watch, journal
 
 
+@pytest.mark.parametrize(
+    ("view", "screen"),
+    [
+        (View(), True),
+        (View(read_only=True), True),
+        (View(plain=True), False),
+        (View(as_json=True), False),
+        (View(silent=True), False),
+    ],
+)
+def test_only_a_view_of_values_for_people_wants_a_screen(terminal: Terminal, view: View, screen: bool) -> None:
+    assert watching.wants_screen(view) is screen
+    assert watching.shown_on_screen(view) is screen
+    terminal.missing = "an extra"
+    assert not watching.shown_on_screen(view)
+
+
 def test_what_happens_is_shown_on_the_screen_and_printed_only_where_it_does_no_damage(
     terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
