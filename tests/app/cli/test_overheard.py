@@ -23,7 +23,7 @@ from busmaster.arbiter.tap import Attempt
 from busmaster.bus.polling import Snapshot
 from busmaster.capture.decode import Decoder
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import InvalidCommand
+from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -362,3 +362,26 @@ def test_a_group_keeps_to_its_grid_and_counts_only_periods_with_values() -> None
         return [snapshot.cycle async for snapshot in stream]
 
     assert [anyio.run(received, stream) for stream in streams] == [[1, 2], [1, 2]]
+
+
+def test_a_value_that_a_point_cannot_have_does_not_keep_the_others_from_being_heard() -> None:
+    group, [a, b] = group_of_two()
+
+    class Refusing:
+        def value_of(self, raw: Any) -> Any:
+            raise GarbledReply("it is no value")
+
+    overheard = Overheard(find("hcp2").protocol, [], lambda: 5.0)
+    overheard.groups += [HeardGroup("more", 10.0, [a, b], 100.0), group]
+    refusing: Any = Refusing()
+    overheard._deliver({refusing: 1, a: 4.0, b: 3.0}, 9.0)
+    for one in overheard.groups:
+        snapshot = one.turn(0.0, 0.0)
+        assert snapshot is not None
+        assert list(snapshot.samples) == [a, b]
+    before = time.monotonic()
+    overheard._deliver({a: 4.0}, 9.0)  # by a clock that was set back
+    snapshot = group.turn(0.0, 0.0)
+    assert snapshot is not None
+    [sample] = snapshot.samples.values()
+    assert before <= sample.finished <= time.monotonic()  # never of the future

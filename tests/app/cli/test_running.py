@@ -19,7 +19,7 @@ from busmaster.app.cli.arguments import View
 from busmaster.app.cli.hangups import Hangups
 from busmaster.app.cli.output import Level
 from busmaster.app.cli.run import Running, output_text
-from busmaster.app.config import load
+from busmaster.app.config import LineFile, load
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import OutputStatistics
 from busmaster.emulator.serve import TcpServer
@@ -45,6 +45,8 @@ class HandedOver:
         self.recording: dict[str, Any] = {}
         self.interval = 0.0
         self.hangup: Any = None
+        self.line: dict[str, Any] = {}
+        monkeypatch.setattr(run, "ConfiguredLine", self._line)
         monkeypatch.setattr(run, "until_ended", self._until_ended)
         monkeypatch.setattr(run, "capturing", self._capturing)
 
@@ -53,10 +55,15 @@ class HandedOver:
         self.hangup = signal.getsignal(signal.SIGHUP)
         return self.ends()
 
+    def _line(self, file: LineFile, **options: Any) -> ConfiguredLine:
+        self.line = dict(options)
+        options.pop("tap")
+        return ConfiguredLine(file, **options)
+
     @contextmanager
-    def _capturing(self, capture: str | None, **options: Any) -> Iterator[None]:
+    def _capturing(self, capture: str | None, **options: Any) -> Iterator[str]:
         self.recording = {"capture": capture, **options}
-        yield
+        yield "the recorder"
 
 
 @pytest.fixture
@@ -94,6 +101,8 @@ def test_each_option_of_a_run_has_its_effect(
     assert line.authorisation.read_only
     # the recorder knows the protocol of a line only if there is one
     assert handed.recording == {"capture": capture, "port": "127.0.0.1:7", "protocol": "", "echo": False}
+    assert handed.line["tap"] == "the recorder"
+    assert handed.line["wait_for_port"] is True
     assert handed.running._view == View(2.5, read_only=True, silent=command == "serve")
     assert handed.running._ending.patience == 7.0 + run.CLOSE_WITHIN
 
@@ -213,6 +222,12 @@ def on_a_run(file: Path, story: Story) -> Running:
 
 def test_a_reload_replaces_title_groups_and_points(file: Path, told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
     accepted: list[Any] = []
+    gains: list[Any] = []
+
+    async def gain(running: Running) -> None:
+        gains.append(running)
+
+    monkeypatch.setattr(Running, "_print_gain_of_learning", gain)
     text = file.read_text().replace('title = "Slitter"', 'title = "Winder"')
     slow = '[groups.slow]\nperiod = 0.05\npoints = ["winder/11"]\n'
     monkeypatch.setattr("busmaster.app.cli.run.ext.accept_device", accepted.append)
@@ -220,6 +235,8 @@ def test_a_reload_replaces_title_groups_and_points(file: Path, told: Told, monke
     async def story(running: Running, reload: Callable[[], Awaitable[None]]) -> None:
         service, bus = running.watch.service, running.line.bus
         assert service is not None
+        assert service.report == running._print_refusals
+        assert gains == [running]
         fast = running.watch.groups[0]
         write(file, text.replace("[groups.fast]", f"{slow}[groups.fast]"))
         await reload()

@@ -121,3 +121,17 @@ def test_what_replies_in_another_protocol_is_reported(
     assert [line.split()[0] for line in ran.lines] == ["8"]
     for address in (9, 10):
         assert f"busmaster: node {address} replies in HCP1; use --protocol hcp\n" in ran.err
+
+
+def test_the_reply_window_of_the_option_is_that_of_each_node(
+    busmaster: Command, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows: list[float] = []
+
+    async def ask(node: Any) -> tuple[object, str]:
+        windows.append(node.timings.read.window)
+        return 0, "it replies"
+
+    monkeypatch.setattr(scan, "ask", ask)
+    busmaster("scan", controllers.path, "--protocol", "hcp2", "--nodes", "7-8", "--timeout", "50")
+    assert windows == [0.05, 0.05]

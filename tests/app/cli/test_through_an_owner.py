@@ -124,17 +124,29 @@ def test_the_values_of_a_run_are_on_one_line_each_with_the_precision_of_the_poin
             f'port = "{server.path}?baudrate=19200"\n[nodes.press]\nprotocol = "modbus"\naddress = 1\n'
             'points.cam = { item = "holding:10:3", factor = 0.5, precision = 2 }\n'
         )
+        modbus = (server.path, "--protocol", "modbus", "--node", "1")
+        (tmp_path / "table").write_text("\n".join(map(str, range(200))))
+        ran = busmaster("write", *modbus, f"holding:100:200=@{tmp_path}/table")  # more than fit into one exchange
+        assert (ran.status, ran.lines) == (0, ["holding:100:200 ok"]), ran.err
+        assert busmaster("read", *modbus, "holding:299").lines == ["holding:299 199"]
         assert busmaster("write", str(path), "press/cam=0.5,1,1.5").status == 0
         ran = busmaster("read", str(path), "press/cam")
     assert (ran.status, ran.lines) == (0, ["press/cam 0.50,1.00,1.50"]), ran.err
 
 
-def test_the_read_of_a_file_is_recorded(busmaster: Command, points: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [("read", "winder/force"), ("write", "winder/force=1"), ("trend", "winder/force", "--seconds", "0.5")],
+)
+def test_what_is_sent_on_the_line_of_a_file_is_recorded(
+    busmaster: Command, points: Path, tmp_path: Path, command: tuple[str, ...]
+) -> None:
     capture = tmp_path / "line.pcapng"
-    ran = busmaster("read", str(points), "winder/force", "--capture", str(capture))
-    assert (ran.status, ran.err) == (0, "")
+    verb, *rest = command
+    ran = busmaster(verb, str(points), *rest, "--capture", str(capture))
+    assert ran.status == 0, ran.err
     with capture.open("rb") as file:
-        assert len(list(read_packets(file))) == 2
+        assert len(list(read_packets(file))) >= 2
 
 
 def test_a_node_without_a_reply_ends_a_read_with_its_error(
@@ -538,6 +550,16 @@ def test_of_several_owners_that_of_the_port_is_found(monkeypatch: pytest.MonkeyP
     assert owner.name == "two"
 
 
+def test_one_common_address_of_two_hosts_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = {"plant:1": {"192.0.2.1", "192.0.2.2"}, "winder:1": {"192.0.2.2", "192.0.2.3"}, "other:1": {"192.0.2.3"}}
+    found = [Owner("line", "plant:1", "/run/one.sock", 1)]
+    monkeypatch.setattr(reaching, "owners", lambda: iter(found))
+    monkeypatch.setattr(reaching, "device_of", lambda name, by_tcp: places[name])
+    for name, owned in (("plant:1", True), ("winder:1", True), ("other:1", False)):
+        endpoint: Any = SimpleNamespace(name=name)
+        assert (reaching.owner_of(endpoint) is not None) is owned
+
+
 def test_a_host_that_is_not_known_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     def unknown(*_: object, **__: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
@@ -627,6 +649,24 @@ def test_a_table_from_a_file_is_written_in_the_background() -> None:
     assert write.options_of(table, True) == {"verify": True, "priority": Priority.BACKGROUND}
     assert write.write_request_of("a/1", (5,)).value == 5
     assert write.write_request_of("a/1", (5, 6)).value == (5, 6)
+
+
+def test_a_table_on_a_port_is_written_in_the_background(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def prepare_write(handle: Any, item: str, values: Any, **options: Any) -> list[Any]:
+        asked.append({"item": item, "values": tuple(values), **options})
+        return []
+
+    monkeypatch.setattr("busmaster.app.cli.write.ext.prepare_write", prepare_write)
+    (tmp_path / "table").write_text("5 6")
+    busmaster("write", "socket://127.0.0.1:1", *HCP2, "--node", "2", f"1=@{tmp_path}/table", "3=7", "--verify")
+    assert asked == [
+        {"item": "1", "values": (5, 6), "verify": True, "priority": Priority.BACKGROUND},
+        {"item": "3", "values": (7,), "verify": True},
+    ]
 
 
 def test_a_table_for_a_point_is_written_in_the_background_over_the_bus_that_is_given() -> None:

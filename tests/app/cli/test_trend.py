@@ -681,3 +681,14 @@ async def test_the_end_of_the_bus_ends_a_trend() -> None:
         trace.node = SimpleNamespace(request=closed)
         with pytest.raises(ExceptionGroup):
             await sampled(sampler, 1.0)
+
+
+def test_the_last_samples_are_written_at_the_end(
+    busmaster: Command, controllers: TcpServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trend, "WRITE_EVERY", 60.0)
+    path = tmp_path / "x.csv"
+    options = ("--seconds", "0.5", "--csv", str(path))
+    ran = busmaster("trend", controllers.path, "--protocol", "hcp2", "5/1", *options)
+    assert ran.status == 0
+    assert len(ran.lines) == len(rows(path)) > 0

@@ -295,3 +295,9 @@ def test_groups_are_replaced_in_the_order_of_the_new_ones_and_those_that_stay_go
     silent.add(a)
     silent.show_groups(tasks)
     assert begun == groups
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_the_keys_of_a_view_that_is_read_only_write_nothing(read_only: bool) -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [])))
+    assert Watch(bus, "test", View(read_only=read_only)).authorisation.read_only is read_only
