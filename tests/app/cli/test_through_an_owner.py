@@ -634,7 +634,7 @@ def test_each_item_of_a_write_is_printed_and_listed_in_json(
     assert held(three_controllers, *range(1, 91), node=2) == list(range(1, 91))
 
 
-@pytest.mark.parametrize("command", [("read", "1"), ("write", "1=5"), ("scan",)])
+@pytest.mark.parametrize("command", [("read", "1"), pytest.param(("write", "1=5"), marks=pytest.mark.slow), ("scan",)])
 def test_a_node_without_an_address_is_null_in_json(busmaster: Command, command: tuple[str, ...]) -> None:
     with serve("dc104", 0) as server:
         ran = busmaster(command[0], server.path, "--protocol", "dc104", *command[1:], "--json")
