@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import sqlite3
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, closing
@@ -16,6 +17,7 @@ import anyio
 import click
 import pytest
 
+from busmaster import Priority
 from busmaster.app.cli import params, targets
 from busmaster.app.config import LineFile, load
 from busmaster.app.line.parameter_sets import read_set
@@ -574,3 +576,23 @@ def test_the_line_of_a_file_is_recorded_as_the_file_describes_it(
         assert capture == "x.pcapng"
         assert options["echo"] is echo
         assert options["port"].startswith("127.0.0.1:")
+
+
+def test_the_old_values_are_saved_beside_the_set_with_the_time() -> None:
+    assert re.fullmatch(r"/sets/one\.undo-\d{8}T\d{6}\.toml", params.default_undo("/sets/one.toml"))
+    assert re.fullmatch(r"one\.undo-\d{8}T\d{6}\.toml", params.default_undo("one"))
+
+
+def test_a_change_is_written_in_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def prepare_write(handle: Any, item: str, values: Any, **options: Any) -> list[str]:
+        asked.append((handle, item, values, options))
+        return ["the send"]
+
+    monkeypatch.setattr("busmaster.app.cli.params.ext.prepare_write", prepare_write)
+    target: Any = SimpleNamespace(line=None, owned=False, handle="the handle")
+    wanted: Any = SimpleNamespace(check_range=lambda item: None)
+    send: Any = params.prepare_change(target, wanted, Change(Parameter(item="10"), 0, 1), "10")
+    assert send == "the send"
+    assert asked == [("the handle", "10", [1], {"priority": Priority.BACKGROUND})]

@@ -237,6 +237,7 @@ def test_a_reload_replaces_title_groups_and_points(file: Path, told: Told, monke
         assert service is not None
         assert service.report == running._print_refusals
         assert gains == [running]
+        assert running.line.outputs.report == running._print_output_event
         fast = running.watch.groups[0]
         write(file, text.replace("[groups.fast]", f"{slow}[groups.fast]"))
         await reload()
@@ -312,7 +313,8 @@ def test_a_reload_takes_the_tokens_of_the_file_again(file: Path, told: Told, tmp
 def test_all_safe_writes_are_named_at_the_start_and_sent_once_at_the_end(
     file: Path, told: Told, three_controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file.write_text(file.read_text() + SAFE)
+    second = f'[outputs.jsonl]\npath = "{file.parent}/line.jsonl"\n'
+    file.write_text(file.read_text() + second + SAFE)
     entered: list[str] = []
 
     async def story(running: Running, reload: Callable[[], Awaitable[None]]) -> None:
@@ -329,7 +331,7 @@ def test_all_safe_writes_are_named_at_the_start_and_sent_once_at_the_end(
     assert entered == ["end of run"]
     assert told.count("safe state at the end: winder/force = 1.5, winder/11 = 2 within 7 s") == 1
     assert told.count("safe state confirmed: winder/force, winder/11") == 1
-    assert told.count("sqlite: ") == 1
+    assert [told.count(f"{output}: ") for output in ("sqlite", "jsonl")] == [1, 1]
 
 
 def test_a_safe_state_that_is_not_confirmed_is_remembered(file: Path, told: Told, three_controllers: TcpServer) -> None:

@@ -737,3 +737,55 @@ def test_a_node_of_a_file_that_is_too_late_is_reported_with_the_key_of_the_file(
     assert "; late reply, " in ran.err
     assert "set timing = { window = " in ran.err
     assert "--timeout" not in ran.err
+
+
+@pytest.fixture
+def mentor() -> Iterator[TcpServer]:
+    with serve("mentor", 12) as server:
+        yield server
+
+
+def test_the_options_of_a_read_reach_each_item(
+    busmaster: Command, mentor: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    async def read_item(handle: Any, item: str, **options: Any) -> float:
+        asked.append((item, options))
+        return 5
+
+    monkeypatch.setattr("busmaster.app.cli.read.ext.read_item", read_item)
+    read = ("read", mentor.path, "--protocol", "mentor", "--node", "12", "1.17", "1.18")
+    assert busmaster(*read, "--chain").lines == ["1.17 5", "1.18 5"]
+    assert asked == [("1.17", {"chain": True}), ("1.18", {"chain": True})]
+    asked.clear()
+    assert busmaster(*read).status == 0
+    assert asked == [("1.17", {}), ("1.18", {})]
+
+
+def test_the_decimals_of_a_write_are_those_of_each_item(busmaster: Command, mentor: TcpServer) -> None:
+    node = (mentor.path, "--protocol", "mentor", "--node", "12")
+    ran = busmaster("write", *node, "1.17=1.5", "1.18:2=2.5,3.5", "--decimals", "1")
+    assert (ran.status, ran.lines) == (0, ["1.17 ok", "1.18:2 ok"]), ran.err
+    assert busmaster("read", *node, "1.17:3").lines == ["1.17 15", "1.18 25", "1.19 35"]
+
+
+def test_a_trend_ends_with_the_owner_of_its_line(
+    busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serving = owner_here(file)
+    serving.__enter__()
+    printed: list[str] = []
+
+    def emit_all(lines: Any) -> None:
+        found = list(lines)
+        if found and not printed:
+            serving.__exit__(None, None, None)
+        printed.extend(found)
+
+    monkeypatch.setattr("busmaster.app.cli.trend.emit_all", emit_all)
+    ran = busmaster("trend", str(file), "winder/force", "--period", "0.05")
+    assert printed
+    assert ran.status == 1
+    assert "the program that owns the line has ended" in ran.err
+    assert "winder/force: " in ran.err

@@ -22,7 +22,7 @@ from typing import Any
 import anyio
 import pytest
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, MscController
+from busmaster import Bus, Hcp2Controller, MemoryPort, MscController, Priority
 from busmaster.app.cli import trend
 from busmaster.app.cli.trend import Sampler, Trace, thinned
 from busmaster.app.outputs.cells import csv_lines
@@ -692,3 +692,18 @@ def test_the_last_samples_are_written_at_the_end(
     ran = busmaster("trend", controllers.path, "--protocol", "hcp2", "5/1", *options)
     assert ran.status == 0
     assert len(ran.lines) == len(rows(path)) > 0
+
+
+@in_virtual_time
+async def test_a_sample_is_read_in_the_background() -> None:
+    asked: list[dict[str, Any]] = []
+
+    async def request(command: Any, **options: Any) -> float:
+        asked.append(options)
+        return 5.0
+
+    async with memory_bus() as bus:
+        [trace] = traces_of(bus, "1/10")
+        trace.node = SimpleNamespace(request=request)
+        assert await trace.read() == 5.0
+    assert asked == [{"priority": Priority.BACKGROUND}]
