@@ -583,6 +583,11 @@ def test_the_old_values_are_saved_beside_the_set_with_the_time() -> None:
     assert re.fullmatch(r"one\.undo-\d{8}T\d{6}\.toml", params.default_undo("one"))
 
 
+def test_a_port_may_have_the_sign_that_separates_it_from_the_node() -> None:
+    assert targets.split("5@/dev/line@2") == ("5", "/dev/line@2")
+    assert targets.split("@/dev/line") == ("", "/dev/line")
+
+
 def test_a_change_is_written_in_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Any, ...]] = []
 

@@ -33,6 +33,11 @@ def test_nothing_has_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().out == "4 exchanges: 2 the same, 0 changed, 2 not judged\n"
 
 
+def test_one_exchange_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", capture(tmp_path, Outcome.OK)]) == 0
+    assert capsys.readouterr().out == "1 exchange: 1 the same, 0 changed\n"
+
+
 def test_what_has_changed_is_a_line_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.REFUSED)]) == 1
     first, last = capsys.readouterr().out.splitlines()

@@ -400,6 +400,23 @@ def test_a_process_that_does_not_reply_makes_the_status_1_and_another_line_is_li
     assert "none.sock" in ran.lines[1]
 
 
+def test_what_each_line_has_refused_is_reported(
+    busmaster: Command, owners: list[Owner], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def ask(owner: Owner) -> dict[str, Any]:
+        counts = {"refused_connections": owner.pid, "refused_requests": 0, "failed_logins": 0}
+        state = {"state": "ready", "utilisation": 0.125, "programs": 2, "up": 1, "nodes": 3, "error": None}
+        return {"name": owner.name, "port": owner.port, "process": owner.pid, **state, **counts}
+
+    owners += [Owner(name, f"/dev/{name}", f"/run/{name}.sock", pid) for name, pid in (("a", 7), ("b", 0), ("c", 9))]
+    monkeypatch.setattr(status, "ask", ask)
+    ran = busmaster("status")
+    assert ran.status == 0
+    assert ran.lines[1].split() == ["a", "/dev/a", "7", "2", "12.5%", "1/3"]
+    assert ran.err == "busmaster: a: 7 connections refused\nbusmaster: c: 9 connections refused\n"
+    assert busmaster("status", "--json").err == ""
+
+
 def test_a_line_that_is_not_for_this_user_is_no_error(
     busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
