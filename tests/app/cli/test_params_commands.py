@@ -191,11 +191,11 @@ class Walk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *found: Found) -> None:
         self.found = found
-        self.asked: list[str] = []
+        self.requested: list[str] = []
         monkeypatch.setattr(params, "walk", self.walk)
 
     async def walk(self, handle: Any, parameters: tuple[Parameter, ...]) -> AsyncIterator[Found]:
-        self.asked += [parameter.item for parameter in parameters]
+        self.requested += [parameter.item for parameter in parameters]
         for one in self.found:
             if one.why == "the port was lost":
                 raise OSError(one.why)
@@ -233,7 +233,7 @@ def test_an_interrupted_save_reports_how_many_it_has_and_continues_with_the_othe
     ran = busmaster(*save)
     assert ran.status == 0
     assert f"{path}.part: 2 of 3 were read before; continuing" in ran.err
-    assert walk.asked == ["12"]
+    assert walk.requested == ["12"]
     assert [entry.value for entry in read_set(str(path)).set.entries.values()] == [5, 6, 7]
 
 
@@ -358,7 +358,7 @@ def test_the_bar_of_a_save_and_of_a_comparison_counts_each_parameter(
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], None]]:
+def requested(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], None]]:
     """A terminal on standard input, and what types a line there."""
     master, slave = pty.openpty()
     with os.fdopen(slave) as terminal:
@@ -376,11 +376,11 @@ def test_a_load_is_written_after_a_yes(
     busmaster: Command,
     three_controllers: TcpServer,
     tmp_path: Path,
-    asked: Callable[[bytes], None],
+    requested: Callable[[bytes], None],
     answer: str,
 ) -> None:
     path = written(tmp_path / "one.toml", '"10" = { value = 1 }')
-    asked(f"{answer}\n".encode())
+    requested(f"{answer}\n".encode())
     ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", *HCP2)
     assert ran.status == 0, ran.err
     assert "Write 1 parameters to node 1? [y/N]: " in ran.err
@@ -393,11 +393,11 @@ def test_a_load_is_not_written_after_any_other_answer(
     busmaster: Command,
     three_controllers: TcpServer,
     tmp_path: Path,
-    asked: Callable[[bytes], None],
+    requested: Callable[[bytes], None],
     answer: str,
 ) -> None:
     path = written(tmp_path / "one.toml", '"10" = { value = 1 }')
-    asked(f"{answer}\n".encode())
+    requested(f"{answer}\n".encode())
     ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", *HCP2)
     assert ran.status == 1
     assert "busmaster: nothing was written\n" in ran.err
@@ -409,7 +409,7 @@ def test_a_drive_that_was_started_during_the_question_is_not_written(
     busmaster: Command,
     three_controllers: TcpServer,
     tmp_path: Path,
-    asked: Callable[[bytes], None],
+    requested: Callable[[bytes], None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = written(tmp_path / "one.toml", '"10" = { value = 1 }')
@@ -419,7 +419,7 @@ def test_a_drive_that_was_started_during_the_question_is_not_written(
         return next(states)
 
     monkeypatch.setattr(find("hcp2").handle, "in_operation", in_operation)
-    asked(b"y\n")
+    requested(b"y\n")
     ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", *HCP2)
     assert ran.status == 1
     assert "node 1 is in operation: it runs; nothing was written; stop the drive first, or use --enabled" in ran.err
@@ -427,7 +427,7 @@ def test_a_drive_that_was_started_during_the_question_is_not_written(
 
 
 @pytest.mark.parametrize(
-    ("why", "enabled", "again", "written", "told"),
+    ("why", "enabled", "again", "written", "reported"),
     [
         ("", False, False, True, ""),
         (None, False, False, True, "cannot report"),
@@ -440,7 +440,7 @@ def test_a_drive_that_was_started_during_the_question_is_not_written(
     ],
 )
 def test_a_drive_in_operation_is_written_only_if_that_is_permitted(
-    capfd: pytest.CaptureFixture[str], why: str | None, enabled: bool, again: bool, written: bool, told: str
+    capfd: pytest.CaptureFixture[str], why: str | None, enabled: bool, again: bool, written: bool, reported: str
 ) -> None:
     async def in_operation(**_: object) -> str | None:
         return why
@@ -450,8 +450,8 @@ def test_a_drive_in_operation_is_written_only_if_that_is_permitted(
     )
     assert anyio.run(lambda: params.may_be_written(target, enabled, again=again)) is written
     err = capfd.readouterr().err
-    assert told in err
-    assert bool(err) == bool(told)
+    assert reported in err
+    assert bool(err) == bool(reported)
 
 
 # the end of a load
@@ -559,10 +559,10 @@ def test_the_line_of_a_file_is_recorded_as_the_file_describes_it(
     busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch, module: str, command: tuple[str, ...]
 ) -> None:
     text = file.read_text()
-    asked: list[tuple[str | None, dict[str, Any]]] = []
+    requested: list[tuple[str | None, dict[str, Any]]] = []
 
     def capturing(capture: str | None, **options: Any) -> None:
-        asked.append((capture, options))
+        requested.append((capture, options))
         raise click.UsageError("that is enough")
 
     monkeypatch.setattr(f"busmaster.app.cli.{module}.capturing", capturing)
@@ -571,8 +571,8 @@ def test_the_line_of_a_file_is_recorded_as_the_file_describes_it(
         file.write_text(text.replace("?baudrate=57600", port))
         ran = busmaster(*(word.replace("FILE", str(file)) for word in command), "--capture", "x.pcapng")
         assert "that is enough" in ran.err
-        [(capture, options)] = asked
-        asked.clear()
+        [(capture, options)] = requested
+        requested.clear()
         assert capture == "x.pcapng"
         assert options["echo"] is echo
         assert options["port"].startswith("127.0.0.1:")
@@ -589,10 +589,10 @@ def test_a_port_may_have_the_sign_that_separates_it_from_the_node() -> None:
 
 
 def test_a_change_is_written_in_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Any, ...]] = []
+    requested: list[tuple[Any, ...]] = []
 
     def prepare_write(handle: Any, item: str, values: Any, **options: Any) -> list[str]:
-        asked.append((handle, item, values, options))
+        requested.append((handle, item, values, options))
         return ["the send"]
 
     monkeypatch.setattr("busmaster.app.cli.params.ext.prepare_write", prepare_write)
@@ -600,4 +600,4 @@ def test_a_change_is_written_in_the_background(monkeypatch: pytest.MonkeyPatch) 
     wanted: Any = SimpleNamespace(check_range=lambda item: None)
     send: Any = params.prepare_change(target, wanted, Change(Parameter(item="10"), 0, 1), "10")
     assert send == "the send"
-    assert asked == [("the handle", "10", [1], {"priority": Priority.BACKGROUND})]
+    assert requested == [("the handle", "10", [1], {"priority": Priority.BACKGROUND})]

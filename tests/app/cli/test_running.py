@@ -148,7 +148,7 @@ def test_the_status_is_how_the_run_was_ended_or_1_for_an_unconfirmed_safe_state(
 # a line that runs
 
 
-class Told(list[tuple[str, Level]]):
+class Reports(list[tuple[str, Level]]):
     """What is reported on standard error, each with its level."""
 
     def note(self, text: str, level: Level = Level.INFO) -> None:
@@ -162,8 +162,8 @@ class Told(list[tuple[str, Level]]):
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> Told:
-    found = Told()
+def reported(monkeypatch: pytest.MonkeyPatch) -> Reports:
+    found = Reports()
     for module in ("run", "serving", "safe"):
         monkeypatch.setattr(f"busmaster.app.cli.{module}.note", found.note)
     return found
@@ -180,7 +180,7 @@ def write(path: Path, text: str) -> None:
 
 
 class Manager:
-    """A service manager that keeps what it is told."""
+    """A service manager that keeps what it receives."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
@@ -196,7 +196,7 @@ Story = Callable[[Running, Callable[[], Awaitable[None]]], Awaitable[None]]
 
 
 def on_a_run(file: Path, story: Story) -> Running:
-    """Run a line while a story is told, which gets the run and what reads the file again."""
+    """Run a line while a story runs, which gets the run and what reads the file again."""
     hangups = Hangups()
     running = Running(ConfiguredLine(load(file), wait_for_port=True), str(file), View(silent=True), hangups, None)
     running._manager.close()
@@ -207,20 +207,22 @@ def on_a_run(file: Path, story: Story) -> Running:
         hangups._receive(signal.SIGHUP, None)
         await comes_true(lambda: manager.said[count:] == ["reloading", "ready"])
 
-    async def tell() -> None:
+    async def run_story() -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(running.run)
             await comes_true(lambda: "show_life" in manager.said)
             await story(running, reload)
             tasks.cancel_scope.cancel()
 
-    anyio.run(tell)
+    anyio.run(run_story)
     assert manager.said[0] == "ready"
     assert manager.said[-2:] == ["stopping", "close"]
     return running
 
 
-def test_a_reload_replaces_title_groups_and_points(file: Path, told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reload_replaces_title_groups_and_points(
+    file: Path, reported: Reports, monkeypatch: pytest.MonkeyPatch
+) -> None:
     accepted: list[Any] = []
     gains: list[Any] = []
 
@@ -253,14 +255,18 @@ def test_a_reload_replaces_title_groups_and_points(file: Path, told: Told, monke
         assert running.watch.groups == []
 
     on_a_run(file, story)
-    assert told.count(f"{file} was reloaded") == 3
-    assert told.level_of("was reloaded") is Level.NOTICE
-    assert told.count("nothing is polled, because the file has no poll group; add [groups.NAME]") == 1
-    assert told.count("no safe state: at the end, nodes keep the values") == 4  # at the start, and after each reload
-    assert told.count("sqlite: ") == 0  # an output that the file does not have any more
+    assert reported.count(f"{file} was reloaded") == 3
+    assert reported.level_of("was reloaded") is Level.NOTICE
+    assert reported.count("nothing is polled, because the file has no poll group; add [groups.NAME]") == 1
+    assert (
+        reported.count("no safe state: at the end, nodes keep the values") == 4
+    )  # at the start, and after each reload
+    assert reported.count("sqlite: ") == 0  # an output that the file does not have any more
 
 
-def test_a_reload_with_an_error_changes_nothing_and_the_next_one_counts(file: Path, told: Told, tmp_path: Path) -> None:
+def test_a_reload_with_an_error_changes_nothing_and_the_next_one_counts(
+    file: Path, reported: Reports, tmp_path: Path
+) -> None:
     text = file.read_text()
     tokens = tmp_path / "tokens"
     listen = f'[service]\nlisten = "127.0.0.1:0"\ntoken_file = "{tokens}"\n[service.tokens.hmi]\nrole = "read"\n'
@@ -277,17 +283,17 @@ def test_a_reload_with_an_error_changes_nothing_and_the_next_one_counts(file: Pa
             assert [group.name for group in running.watch.groups] == ["fast"]
         os.unlink(file)
         await reload()
-        assert told.count("reload failed, nothing was changed: ") == 5
+        assert reported.count("reload failed, nothing was changed: ") == 5
         write(file, text)
         await reload()
-        assert told.count("was reloaded") == 1
+        assert reported.count("was reloaded") == 1
 
     on_a_run(file, story)
-    assert told.level_of("reload failed") is Level.ERROR
-    assert told.count("reload failed") == 5
+    assert reported.level_of("reload failed") is Level.ERROR
+    assert reported.count("reload failed") == 5
 
 
-def test_a_reload_takes_the_tokens_of_the_file_again(file: Path, told: Told, tmp_path: Path) -> None:
+def test_a_reload_takes_the_tokens_of_the_file_again(file: Path, reported: Reports, tmp_path: Path) -> None:
     tokens = tmp_path / "tokens"
     tokens.write_text("hmi a-token-of-the-hmi-0001\n")
     tokens.chmod(0o600)
@@ -307,11 +313,11 @@ def test_a_reload_takes_the_tokens_of_the_file_again(file: Path, told: Told, tmp
         assert after != before
 
     on_a_run(file, story)
-    assert told.count(" and tcp://127.0.0.1:") == 1  # where it is served, too
+    assert reported.count(" and tcp://127.0.0.1:") == 1  # where it is served, too
 
 
 def test_all_safe_writes_are_named_at_the_start_and_sent_once_at_the_end(
-    file: Path, told: Told, three_controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+    file: Path, reported: Reports, three_controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     second = f'[outputs.jsonl]\npath = "{file.parent}/line.jsonl"\n'
     file.write_text(file.read_text() + second + SAFE)
@@ -329,21 +335,23 @@ def test_all_safe_writes_are_named_at_the_start_and_sent_once_at_the_end(
     running = on_a_run(file, story)
     assert running.left_safely
     assert entered == ["end of run"]
-    assert told.count("safe state at the end: winder/force = 1.5, winder/11 = 2 within 7 s") == 1
-    assert told.count("safe state confirmed: winder/force, winder/11") == 1
-    assert [told.count(f"{output}: ") for output in ("sqlite", "jsonl")] == [1, 1]
+    assert reported.count("safe state at the end: winder/force = 1.5, winder/11 = 2 within 7 s") == 1
+    assert reported.count("safe state confirmed: winder/force, winder/11") == 1
+    assert [reported.count(f"{output}: ") for output in ("sqlite", "jsonl")] == [1, 1]
 
 
-def test_a_safe_state_that_is_not_confirmed_is_remembered(file: Path, told: Told, three_controllers: TcpServer) -> None:
+def test_a_safe_state_that_is_not_confirmed_is_remembered(
+    file: Path, reported: Reports, three_controllers: TcpServer
+) -> None:
     file.write_text(file.read_text() + SAFE.replace("7.0", "0.2"))
 
     async def story(running: Running, reload: Callable[[], Awaitable[None]]) -> None:
         three_controllers.call(lambda line, now: line.cut(now, line.device(1)))
 
     assert not on_a_run(file, story).left_safely
-    assert told.count("not confirmed: ") == 2
-    assert told.count("safe state confirmed") == 0
-    assert told.level_of("not confirmed") is Level.CRITICAL
+    assert reported.count("not confirmed: ") == 2
+    assert reported.count("safe state confirmed") == 0
+    assert reported.level_of("not confirmed") is Level.CRITICAL
 
 
 # parts of it
@@ -364,20 +372,20 @@ def test_what_ends_the_run_is_named() -> None:
 )
 def test_an_event_of_an_output_is_a_warning_while_any_output_is_down(errors: tuple[str, ...], level: Level) -> None:
     counts = [OutputStatistics("csv", "written", 0, 0, 0, error) for error in errors]
-    told = Told()
+    reported = Reports()
     running: Any = SimpleNamespace(
         line=SimpleNamespace(outputs=SimpleNamespace(statistics=lambda: counts)),
-        watch=SimpleNamespace(announce=told.note),
+        watch=SimpleNamespace(announce=reported.note),
     )
     Running._print_output_event(running, "csv is down")
-    assert told == [("csv is down", level)]
+    assert reported == [("csv is down", level)]
 
 
 @pytest.mark.parametrize("free", [True, False])
-def test_what_the_service_refused_is_printed_unless_the_screen_shows_it(told: Told, free: bool) -> None:
+def test_what_the_service_refused_is_printed_unless_the_screen_shows_it(reported: Reports, free: bool) -> None:
     running: Any = SimpleNamespace(watch=SimpleNamespace(may_print=lambda: free))
     Running._print_refusals(running, "a connection was refused")
-    assert told == [("a connection was refused", Level.WARNING)] * free
+    assert reported == [("a connection was refused", Level.WARNING)] * free
 
 
 @pytest.mark.parametrize(
@@ -390,7 +398,7 @@ def test_what_the_service_refused_is_printed_unless_the_screen_shows_it(told: To
     ],
 )
 def test_what_learned_reply_times_would_save_is_reported_once_if_it_is_worth_it(
-    told: Told, saved: float, groups: int, could_learn: tuple[bool, ...], times: int
+    reported: Reports, saved: float, groups: int, could_learn: tuple[bool, ...], times: int
 ) -> None:
     losses = SimpleNamespace(share=0.01, documented=0.2 + saved, learned=0.2, windows=(0.1, 0.2))
 
@@ -401,9 +409,9 @@ def test_what_learned_reply_times_would_save_is_reported_once_if_it_is_worth_it(
     line = SimpleNamespace(groups=[None] * groups, file=SimpleNamespace(nodes=nodes), bus=SimpleNamespace(plan=plan))
     running: Any = SimpleNamespace(line=line)
     anyio.run(Running._print_gain_of_learning, running)
-    assert told.count("if 1% of all frames are lost, the schedule needs 21% of the line, and 20%") == times
-    assert told.count("(windows of 100 ms to 200 ms)") == times
-    assert len(told) == times
+    assert reported.count("if 1% of all frames are lost, the schedule needs 21% of the line, and 20%") == times
+    assert reported.count("(windows of 100 ms to 200 ms)") == times
+    assert len(reported) == times
 
 
 @pytest.mark.parametrize(

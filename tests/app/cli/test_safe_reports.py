@@ -21,7 +21,7 @@ from busmaster.events import LineChange, LineChanged, PortFailed
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
+def reported(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
     """What is reported on standard error, each with its level."""
     found: list[tuple[str, Level]] = []
 
@@ -46,7 +46,7 @@ LOST = NoReply("no reply")
 )
 def test_each_point_is_confirmed_or_named_and_one_that_is_not_makes_the_status_1(
     capsys: pytest.CaptureFixture[str],
-    told: list[tuple[str, Level]],
+    reported: list[tuple[str, Level]],
     outcomes: dict[str, BusError | None],
     out: str,
     unsafe: list[str],
@@ -54,10 +54,10 @@ def test_each_point_is_confirmed_or_named_and_one_that_is_not_makes_the_status_1
 ) -> None:
     assert safe.print_outcomes(outcomes) == status
     assert capsys.readouterr().out == out
-    assert told == [(f"safe state of {name} not confirmed: {LOST}", Level.CRITICAL) for name in unsafe]
+    assert reported == [(f"safe state of {name} not confirmed: {LOST}", Level.CRITICAL) for name in unsafe]
 
 
-def test_each_failure_of_the_port_is_reported_and_no_other_event(told: list[tuple[str, Level]]) -> None:
+def test_each_failure_of_the_port_is_reported_and_no_other_event(reported: list[tuple[str, Level]]) -> None:
     async def events() -> AsyncIterator[Any]:
         yield PortFailed("it is not there")
         yield LineChanged(LineChange.DOWN, "it hung up")
@@ -65,22 +65,22 @@ def test_each_failure_of_the_port_is_reported_and_no_other_event(told: list[tupl
 
     stream: Any = events()
     anyio.run(safe.print_port_events, stream)
-    assert [text.partition("; ")[0] for text, _ in told] == [
+    assert [text.partition("; ")[0] for text, _ in reported] == [
         "cannot connect: it is not there",
         "cannot connect: it is in use",
     ]
-    assert {level for _, level in told} == {Level.ERROR}
+    assert {level for _, level in reported} == {Level.ERROR}
 
 
 def test_the_recording_is_that_of_the_port_and_what_fails_of_it_is_a_warning(
-    monkeypatch: pytest.MonkeyPatch, told: list[tuple[str, Level]]
+    monkeypatch: pytest.MonkeyPatch, reported: list[tuple[str, Level]]
 ) -> None:
     endpoint: Any = SimpleNamespace(name="/dev/ttyUSB0", echo=True)
-    asked: dict[str, Any] = {}
+    requested: dict[str, Any] = {}
 
     @contextmanager
     def capturing(capture: str | None, **options: Any) -> Iterator[str]:
-        asked.update(capture=capture, **options)
+        requested.update(capture=capture, **options)
         if capture == "bad":
             raise click.UsageError("no such folder")
         yield "the recorder"
@@ -89,11 +89,11 @@ def test_the_recording_is_that_of_the_port_and_what_fails_of_it_is_a_warning(
     recorder: Any
     with safe.recorded("x.pcapng", endpoint) as recorder:
         assert recorder == "the recorder"
-    assert asked == {"capture": "x.pcapng", "port": "/dev/ttyUSB0", "echo": True}
-    assert told == []
+    assert requested == {"capture": "x.pcapng", "port": "/dev/ttyUSB0", "echo": True}
+    assert reported == []
     with safe.recorded("bad", endpoint) as recorder:
         assert recorder is None
-    assert told == [("no such folder", Level.WARNING)]
+    assert reported == [("no such folder", Level.WARNING)]
 
 
 # the service of a line
@@ -136,7 +136,7 @@ def test_each_key_of_the_section_reaches_the_service(
     assert serving.service_of(disabled) is None
     assert made == {}
     tokens.unlink()
-    assert serving.secrets_of(disabled.file) == {}  # nobody can use them
+    assert serving.secrets_of(disabled.file) == {}  # no program can use them
 
 
 class FakeService:
@@ -168,14 +168,14 @@ def served(service: Any, *, announce: bool, error: Exception | None = None) -> A
     return anyio.run(run)
 
 
-def test_where_a_line_is_served_is_announced_and_it_ends_with_the_run(told: list[tuple[str, Level]]) -> None:
+def test_where_a_line_is_served_is_announced_and_it_ends_with_the_run(reported: list[tuple[str, Level]]) -> None:
     service = FakeService()
     assert served(service, announce=False) is service
-    assert (service.calls, told) == (["begin", "end"], [])
+    assert (service.calls, reported) == (["begin", "end"], [])
     served(service, announce=True)
     both = FakeService("tcp://127.0.0.1:7420")
     served(both, announce=True)
-    assert told == [
+    assert reported == [
         ("Slitter is served at unix:/run/slitter.sock", Level.NOTICE),
         ("Slitter is served at unix:/run/slitter.sock and tcp://127.0.0.1:7420", Level.NOTICE),
     ]
@@ -185,10 +185,10 @@ def test_where_a_line_is_served_is_announced_and_it_ends_with_the_run(told: list
     assert failing.calls == ["begin", "end"]
 
 
-def test_a_line_that_cannot_be_served_runs_in_any_case(told: list[tuple[str, Level]]) -> None:
+def test_a_line_that_cannot_be_served_runs_in_any_case(reported: list[tuple[str, Level]]) -> None:
     assert served(None, announce=True) is None
-    assert told == []
+    assert reported == []
     service = FakeService(error=InvalidCommand("it is served already"))
     assert served(service, announce=True) is None
     assert service.calls == ["begin"]
-    assert told == [("no other program can use this line: it is served already", Level.WARNING)]
+    assert reported == [("no other program can use this line: it is served already", Level.WARNING)]

@@ -21,11 +21,11 @@ class Node:
 
     def __init__(self, *replies: Any) -> None:
         self.replies = list(replies)
-        self.asked: list[dict[str, Any]] = []
+        self.requested: list[dict[str, Any]] = []
         self.profile = SimpleNamespace(probe="read element 1")
 
     async def request(self, command: Any, **options: Any) -> Any:
-        self.asked.append({"command": command, **options})
+        self.requested.append({"command": command, **options})
         reply = self.replies.pop(0)
         if isinstance(reply, Exception):
             raise reply
@@ -55,7 +55,7 @@ def test_each_kind_of_reply_is_reported(replies: tuple[Any, ...], found: tuple[A
     assert node.replies == []
     # one attempt, behind the requests of other programs: a missing node takes its whole reply window
     assert all(
-        one == {"command": "read element 1", "retries": 0, "priority": Priority.BACKGROUND} for one in node.asked
+        one == {"command": "read element 1", "retries": 0, "priority": Priority.BACKGROUND} for one in node.requested
     )
 
 

@@ -671,33 +671,33 @@ def test_a_table_from_a_file_is_written_in_the_background() -> None:
 def test_a_table_on_a_port_is_written_in_the_background(
     busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[dict[str, Any]] = []
+    requested: list[dict[str, Any]] = []
 
     def prepare_write(handle: Any, item: str, values: Any, **options: Any) -> list[Any]:
-        asked.append({"item": item, "values": tuple(values), **options})
+        requested.append({"item": item, "values": tuple(values), **options})
         return []
 
     monkeypatch.setattr("busmaster.app.cli.write.ext.prepare_write", prepare_write)
     (tmp_path / "table").write_text("5 6")
     busmaster("write", "socket://127.0.0.1:1", *HCP2, "--node", "2", f"1=@{tmp_path}/table", "3=7", "--verify")
-    assert asked == [
+    assert requested == [
         {"item": "1", "values": (5, 6), "verify": True, "priority": Priority.BACKGROUND},
         {"item": "3", "values": (7,), "verify": True},
     ]
 
 
 def test_a_table_for_a_point_is_written_in_the_background_over_the_bus_that_is_given() -> None:
-    asked: dict[str, Any] = {}
+    requested: dict[str, Any] = {}
     point = SimpleNamespace(where="winder", source=SimpleNamespace(item="10"))
     handle = SimpleNamespace(_counted=lambda item: (item,))
     line: Any = SimpleNamespace(
         point=lambda name: point,
         nodes={"winder": handle},
-        prepare_write=lambda name, values, **options: asked.update(name=name, values=values, **options),
+        prepare_write=lambda name, values, **options: requested.update(name=name, values=values, **options),
     )
     bus: Any = object()
     write.prepare_point(line, Assignment("winder/cam", (5, 6), "cam.csv"), True, bus)
-    assert asked == {
+    assert requested == {
         "name": "winder/cam",
         "values": (5, 6),
         "bus": bus,
@@ -765,19 +765,19 @@ def mentor() -> Iterator[TcpServer]:
 def test_the_options_of_a_read_reach_each_item(
     busmaster: Command, mentor: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[str, dict[str, Any]]] = []
+    requested: list[tuple[str, dict[str, Any]]] = []
 
     async def read_item(handle: Any, item: str, **options: Any) -> float:
-        asked.append((item, options))
+        requested.append((item, options))
         return 5
 
     monkeypatch.setattr("busmaster.app.cli.read.ext.read_item", read_item)
     read = ("read", mentor.path, "--protocol", "mentor", "--node", "12", "1.17", "1.18")
     assert busmaster(*read, "--chain").lines == ["1.17 5", "1.18 5"]
-    assert asked == [("1.17", {"chain": True}), ("1.18", {"chain": True})]
-    asked.clear()
+    assert requested == [("1.17", {"chain": True}), ("1.18", {"chain": True})]
+    requested.clear()
     assert busmaster(*read).status == 0
-    assert asked == [("1.17", {}), ("1.18", {})]
+    assert requested == [("1.17", {}), ("1.18", {})]
 
 
 def test_the_decimals_of_a_write_are_those_of_each_item(busmaster: Command, mentor: TcpServer) -> None:

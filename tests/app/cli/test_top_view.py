@@ -46,13 +46,13 @@ class FakeScreen:
                 await asyncio.sleep(0.005)
 
     async def run_async(self) -> int | None:
-        telling = asyncio.ensure_future(FakeScreen.story(self))
+        playing = asyncio.ensure_future(FakeScreen.story(self))
         left = asyncio.ensure_future(self._left.wait())
         async with asyncio.timeout(PATIENCE):
-            await asyncio.wait([telling, left], return_when=asyncio.FIRST_EXCEPTION)
-        if telling.done():
-            telling.result()
-        telling.cancel()
+            await asyncio.wait([playing, left], return_when=asyncio.FIRST_EXCEPTION)
+        if playing.done():
+            playing.result()
+        playing.cancel()
         return self._status
 
 
@@ -71,7 +71,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> dict[str, bool]:
     return there
 
 
-def told(story: Callable[[FakeScreen], Any]) -> None:
+def plays(story: Callable[[FakeScreen], Any]) -> None:
     FakeScreen.story = staticmethod(story)
 
 
@@ -93,7 +93,7 @@ def test_the_screen_shows_the_line_as_the_options_require(
     read_only: bool,
     leave: str,
 ) -> None:
-    told(leaves)
+    plays(leaves)
     with owner_here(file):
         ran = busmaster("top", *options)
     assert (ran.status, ran.out, ran.err) == (0, "", "")
@@ -108,7 +108,7 @@ def test_the_status_is_that_of_the_screen(
     async def story(screen: FakeScreen) -> None:
         screen.exit(status)
 
-    told(story)
+    plays(story)
     with owner_here(file):
         assert busmaster("top").status == ends
 
@@ -117,7 +117,7 @@ def test_a_terminal_that_is_closed_ends_it(busmaster: Command, file: Path, termi
     async def story(screen: FakeScreen) -> None:
         terminal["open"] = False
 
-    told(story)
+    plays(story)
     with owner_here(file):
         ran = busmaster("top")
     assert (ran.status, ran.err) == (1, "")
@@ -165,7 +165,7 @@ def test_the_end_of_the_owner_is_shown_and_ends_only_its_own_view(
         if not of_owner:
             screen.exit(0)
 
-    told(story)
+    plays(story)
     ran = busmaster("top", "slitter", *(("--of-owner",) * of_owner))
     [screen] = FakeScreen.shown
     assert screen.away
@@ -180,7 +180,7 @@ def test_control_characters_of_the_line_do_not_reach_the_screen(
     busmaster: Command, file: Path, terminal: dict[str, bool]
 ) -> None:
     file.write_text(file.read_text().replace('title = "Slitter"', 'title = "Slit\\u001b[2Jter"'))
-    told(leaves)
+    plays(leaves)
     with owner_here(file):
         assert busmaster("top").status == 0
     [screen] = FakeScreen.shown

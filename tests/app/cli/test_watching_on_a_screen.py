@@ -221,7 +221,7 @@ def test_a_run_prints_through_the_output_that_survives_a_full_disk(
 
 
 def watch_of(monkeypatch: pytest.MonkeyPatch, **view: Any) -> tuple[Watch, list[str]]:
-    """A watch of no bus, and what its screen is told."""
+    """A watch of no bus, and the events of its screen."""
     bus: Any = SimpleNamespace(now=lambda: 5.0, events=lambda: None)
     journal: list[str] = []
     watch = Watch(bus, "test", View(**view), authorisation=SimpleNamespace())  # type: ignore[arg-type]
