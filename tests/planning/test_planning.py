@@ -119,7 +119,74 @@ def test_a_group_without_time_to_spare_is_named_although_it_fits() -> None:
     assert not any("'easy'" in line and "spare" in line for line in tight.advice)
 
 
+def test_a_group_in_background_that_is_alone_has_the_whole_line() -> None:
+    [alone] = planned(group("history", 1.0, 10, priority=BACKGROUND)).groups
+    assert (alone.cycle, alone.longest_cycle, alone.missed) == pytest.approx((10 * EXCHANGE, 10 * EXCHANGE, 0))
+
+
+def test_a_schedule_does_not_fit_if_any_of_its_groups_misses_cycles() -> None:
+    calm, hurried = group("calm", 10.0, 1), group("hurried", 0.020, round(0.022 / EXCHANGE))
+    for groups in ((calm, hurried), (hurried, calm)):
+        prediction = planned(*groups)
+        assert [bool(one.missed) for one in prediction.groups] == [one is hurried for one in groups]
+        assert not prediction.fits
+        assert not replace(prediction, utilisation=1.0).fits
+        assert not replace(prediction, groups=prediction.groups[:0]).fits
+
+
 # what would fit
+
+
+def test_the_advice_names_each_group_and_each_way_out() -> None:
+    node = PlannedNode(mentor.PROFILE, 4, reply_time=0.01)
+    line = replace(mentor.PROFILE.line, baudrate=4800)
+    groups = [
+        PlannedGroup("drive", 0.4, [(node, mentor.Read(1, number)) for number in range(1, 9)]),
+        PlannedGroup("more", 0.4, [(node, mentor.Read(2, number)) for number in range(1, 9)]),
+        PlannedGroup("seldom", 100.0, [(node, mentor.Read(4, 1))]),
+    ]
+    prediction = plan(groups, line=line, could_merge=[mentor.merge_runs])
+    drive, more, _ = prediction.groups
+    longer = [
+        f"it would fit with a period of {each.fitting_period:g} s for group" if each.fitting_period else ""
+        for each in (drive, more)
+    ]
+    saved = f"merged reads would take {drive.could_save / 0.4:.0%} of the line off group"
+    spare = [
+        f"group {each.name!r} will miss {each.missed:.0%} of its cycles: one every {each.achieved:.3g} s in place of "
+        "0.4 s"
+        for each in (drive, more)
+    ]
+    assert prediction.advice == (
+        f"the schedule needs {prediction.utilisation:.0%} of the line; up to 90% is comfortable",
+        spare[0],
+        *([f"{longer[0]} 'drive'"] if longer[0] else []),
+        f"{saved} 'drive', where they are safe",
+        spare[1],
+        *([f"{longer[1]} 'more'"] if longer[1] else []),
+        f"{saved} 'more', where they are safe",
+        f"it would fit with all periods {prediction.utilisation / 0.9:.2f} times as long",
+        f"it would fit at {prediction.fitting_baudrate} baud",
+    )
+    assert drive.missed
+    assert more.missed
+    assert drive.could_save == more.could_save > 0
+    without = replace(prediction, fitting_baudrate=None).advice
+    assert without == prediction.advice[:-1]
+
+
+def test_a_baud_rate_must_be_enough_for_all_groups_and_possible_for_all_nodes() -> None:
+    slow = LineSettings(9600)
+    one, other = group("a", 0.1, 10), group("b", 0.1, 10)
+    rates = [plan(groups, line=slow).fitting_baudrate for groups in ([one], [one, other], [other, one])]
+    assert rates[0] is not None
+    assert rates[1] == rates[2]
+    assert rates[1] is not None
+    assert rates[0] < rates[1]
+    fixed = PlannedNode(replace(hcp2.PROFILE, fixed_rate=True), 2, reply_time=0.002)
+    assert plan([one, group("b", 0.1, 1, node=fixed)], line=slow).fitting_baudrate is None
+    mixed = replace(one, reads=[*one.reads, (fixed, hcp2.Read(1))])
+    assert plan([mixed], line=slow).fitting_baudrate is None
 
 
 def fitting(prediction: Plan, groups: Sequence[PlannedGroup], line: LineSettings = LINE) -> float:
@@ -275,6 +342,19 @@ def test_learning_spares_nothing_where_replies_take_as_long_as_the_window() -> N
     assert losses.learned == pytest.approx(losses.documented, rel=0.01)
     assert losses.windows == (hcp2.PROFILE.timings.read.window,) * 2
     assert planned().losses == Losses(0.01, 0.0, 0.0, (0.0, 0.0))
+
+
+def test_lost_frames_of_each_group_count_by_its_period_and_windows_are_those_of_all_nodes() -> None:
+    slow = PlannedNode(hcp2.PROFILE, 2, reply_time=0.09)
+    groups = [group("a", 1.0, 2), group("b", 2.0, 3, node=slow), PlannedGroup("empty", 1.0, [])]
+    each = [planned(one).losses for one in groups]
+    losses = planned(*groups).losses
+    assert losses.documented == pytest.approx(sum(one.documented for one in each))
+    assert losses.learned == pytest.approx(sum(one.learned for one in each))
+    assert each[0].windows[0] < each[1].windows[1]
+    assert losses.windows == (each[0].windows[0], each[1].windows[1])
+    one_by_one = planned(PlannedGroup("a", 1.0, [(slow, hcp2.Read(1)), (NODE, hcp2.Read(1))])).losses
+    assert one_by_one.windows == losses.windows
 
 
 def test_what_else_may_be_asked_counts_in_the_worst_case() -> None:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from busmaster.app.config.source import FileError
-from busmaster.app.line.parameter_sets import PartFile, read_set, write_set
+from busmaster import Bus, MemoryPort
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import FileError, Source
+from busmaster.app.line import ConfiguredLine
+from busmaster.app.line.parameter_sets import PartFile, line_parameters, read_set, write_set
 from busmaster.bus.parameters import Entry, Found, Parameter, ParameterSet
+from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand
 from busmaster.registry import find
 
@@ -34,7 +40,19 @@ def test_a_value_is_written_in_its_unit_and_read_as_the_lines_number(tmp_path: P
         ("value = -47.6", "valeu = -47.6", "parameters.1.17.valeu: no such key"),
         ("value = -47.6", 'value = "x"', "parameters.1.17.value: must be a number"),
         ('"mentor"', '"mentr"', "drive.protocol: no such protocol"),
-        ("format = 1", "format = 2", "format: the set has format 2"),
+        ("format = 1", "format = 2", "format: the set has format 2, and this version of busmaster reads 1"),
+        ("2026-01-31T00:00:00Z", "2026-01-31T00:00:00", "saved.time: must be a date and time with its zone"),
+        ("2026-01-31T00:00:00Z", '"today"', "saved.time: must be a date and time with its zone"),
+        ("address = 11", "address = 100", "drive.address: must be 0 to 99, not 100"),
+        ('by = ""', 'by = ""\nto = 1', "saved.to: no such key"),
+        ('label = ""', 'label = 5', "drive.label: must be a text"),
+        ("[saved]", "[extra]\n[saved]", "extra: no such key"),
+        ("identity = {}", 'identity = { "11.15" = [1] }', "drive.identity.11.15: must be a number, true or false, not a"),
+        ("value = -47.6, ", "", "parameters.1.17: 'value' is missing; use a number, true or false"),
+        ("decimals = 1", "decimals = 10", "parameters.1.17.decimals: must be 0 to 9, not 10"),
+        ("decimals = 1", "factor = 0", "parameters.1.17: a factor must not be 0"),
+        ("decimals = 1", 'access = "write"', "parameters.1.17.access: no such access 'write'"),
+        ("value = -47.6", "value = [1]", "parameters.1.17.value: must be a number, true or false, not a list"),
     ],
 )
 def test_what_is_wrong_is_named_with_line_and_key(tmp_path: Path, old: str, new: str, what: str) -> None:
@@ -68,3 +86,168 @@ def test_what_was_begun_with_another_list_is_not_gone_on_with(tmp_path: Path) ->
         pass
     with pytest.raises(InvalidCommand, match="other parameters"):
         PartFile(path, EMPTY, WANTED[:2], KIND)
+
+
+FULL = Parameter(
+    item="1.18", name="Preset", unit="A", access="read", decimals=1, factor=2, offset=3, minimum=-5.5, maximum=40.0
+)
+
+
+def test_a_set_is_read_as_it_was_written_with_all_that_its_file_contains(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    written = replace(
+        EMPTY,
+        label="node 11",
+        line="/dev/ttyUSB0",
+        by="maria@press",
+        identity={"11.15": 530},
+        entries={"1.18": Entry(FULL, 50), "1.19": Entry(WANTED[2], True)},
+    )
+    write_set(str(path), written, KIND)
+    assert read_set(str(path)).set == written
+    [line] = [line for line in path.read_text().splitlines() if line.startswith('"1.18"')]
+    assert "value = 13.0" in line  # 50 / 10 x 2 + 3
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("value", "beyond"),
+    [
+        (-5.4, ""),
+        (-5.5, ""),
+        (40.0, ""),
+        (-5.6, "-5.6 is beyond its minimum of -5.5"),
+        (40.2, "40.2 is beyond its maximum of 40.0"),
+    ],
+)
+def test_a_value_beyond_the_range_in_its_file_is_an_error_at_the_value(
+    tmp_path: Path, value: float, beyond: str
+) -> None:
+    path = tmp_path / "a.toml"
+    parameter = replace(FULL, factor=1, offset=0)
+    write_set(str(path), replace(EMPTY, entries={"1.18": Entry(parameter, 50)}), KIND)
+    path.write_text(path.read_text().replace("value = 5.0", f"value = {value}"))
+    file = read_set(str(path))
+    with pytest.raises(FileError, match=f"parameters.1.18.value: {beyond}$") if beyond else nullcontext():
+        file.check_range("1.18")
+
+
+def test_a_set_of_another_kind_of_node_or_with_an_item_that_it_does_not_have_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    write_set(str(path), replace(EMPTY, entries={one.item: Entry(one, 1) for one in WANTED}), KIND)
+    port = MemoryPort(Line(KIND.profile.line, []))
+    handle = KIND.handle(Bus(port), 11)
+    read_set(str(path)).check(handle)
+    with pytest.raises(FileError, match=r"drive.protocol: .* is a hcp2, but the set belongs to a mentor; use a set of"):
+        read_set(str(path)).check(find("hcp2").handle(Bus(port), 1))
+    path.write_text(path.read_text().replace('"1.19"', '"1.190"'))
+    with pytest.raises(FileError, match=r"a.toml:\d+: parameters.1.190: "):
+        read_set(str(path)).check(handle)
+
+
+def test_a_set_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_set(str(tmp_path / "a.toml"), EMPTY, KIND)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_save_to_a_file_that_exists_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("")
+    with pytest.raises(InvalidCommand, match="is not overwritten; choose another name"):
+        PartFile(str(path), EMPTY, WANTED, KIND)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_save_of_another_node_is_not_continued(tmp_path: Path) -> None:
+    path = str(tmp_path / "a.toml")
+    with PartFile(path, replace(EMPTY, label="node 11"), WANTED, KIND):
+        pass
+    for other in (replace(EMPTY, address=12), replace(EMPTY, identity={"11.15": 530})):
+        with pytest.raises(InvalidCommand, match=r"started with another node \(node 11\); remove .*a.toml.part"):
+            PartFile(path, other, WANTED, KIND)
+
+
+def test_a_save_that_was_interrupted_before_its_first_parameter_starts_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    with PartFile(str(path), EMPTY, WANTED, KIND):
+        pass
+    part = tmp_path / "a.toml.part"
+    part.write_text(part.read_text().partition("[saved]")[0])
+    with PartFile(str(path), EMPTY, WANTED, KIND) as fresh:
+        assert fresh.missing == tuple(WANTED)
+        for one in reversed(WANTED):
+            fresh.add(Found(one, 5))
+    assert list(fresh.finish().entries) == [one.item for one in WANTED]  # in the order of the list
+    assert list(read_set(str(path)).set.entries) == [one.item for one in WANTED]
+
+
+def test_a_continued_save_keeps_its_start_and_why_parameters_have_no_value(tmp_path: Path) -> None:
+    path = str(tmp_path / "a.toml")
+    with PartFile(path, EMPTY, WANTED, KIND) as part:
+        part.add(Found(WANTED[0], why="no such parameter", gap=True))
+        part.add(Found(WANTED[1], why="no reply"))
+        part.add(Found(WANTED[2], 7))
+    later = replace(EMPTY, saved=datetime(2026, 2, 28, tzinfo=UTC))
+    with PartFile(path, later, WANTED, KIND) as part:
+        assert part.missing == ()
+        assert part.gaps == {
+            "1.17": Found(WANTED[0], why="no such parameter", gap=True),
+            "1.18": Found(WANTED[1], why="no reply"),
+        }
+    done = part.finish()
+    assert done.saved == EMPTY.saved
+    assert done == read_set(path).set
+    assert done.entries == {"1.19": Entry(WANTED[2], 7)}
+
+
+TEXT = """
+port = "/dev/ttyUSB0"
+[nodes.screw]
+protocol = "mentor"
+address = 11
+points.ramp = { item = "2.04", unit = "s", decimals = 1, minimum = 0.5, maximum = 20 }
+points.same = { item = "2.04", unit = "min", decimals = 1 }
+points."2.05" = { factor = 3, offset = 1, writable = false }
+points.run = { item = "1.17:2" }
+"""
+
+
+def test_parameters_of_a_line_are_those_of_the_document_with_what_the_file_adds() -> None:
+    line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
+    handle = line.nodes["screw"]
+    found = {one.item: one for one in line_parameters(line, "screw", handle)}
+    document = {one.item: one for one in handle.parameters()}
+    assert list(found) == list(document)
+    assert {item for item in document if found[item] != document[item]} == {"2.04", "2.05"}
+    ramp = found["2.04"]
+    assert (ramp.name, ramp.unit, ramp.decimals, ramp.minimum, ramp.maximum) == ("ramp", "s", 1, 0.5, 20)
+    assert (ramp.kept, ramp.stage, ramp.access) == ("", document["2.04"].stage, document["2.04"].access)
+    other = found["2.05"]
+    assert (other.name, other.factor, other.offset) == (document["2.05"].name, 3, 1)
+    assert other.kept == "LINE.toml has writable = false"
+
+
+def test_items_of_a_parameter_set_can_be_named_as_the_points_of_the_file() -> None:
+    line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
+    found = line_parameters(line, "screw", line.nodes["screw"], ["ramp", "1.17"])
+    assert [(one.item, one.unit) for one in found] == [("2.04", "s"), ("1.17", "%")]
+
+
+def test_points_that_are_not_in_the_document_follow_it_and_without_either_there_is_no_set() -> None:
+    head = 'port = "/dev/ttyUSB0?baudrate=9600"\n[nodes.one]\nprotocol = "{}"\naddress = 1\n'
+    point = 'points.{} = {{ item = "{}" }}\n'
+    for protocol, items in (("ei-bisynch", ("Q1", "Q2")), ("msc", ("2008", "2010:2"))):
+        text = head.format(protocol) + "".join(point.format(f"p{item[-1]}", item) for item in items)
+        line = ConfiguredLine(read(Source("line.toml", text)), outputs=False)
+        handle = line.nodes["one"]
+        document = [] if protocol == "msc" else [one.item for one in handle.parameters()]
+        added = [item for item in items if ":" not in item]  # a run has a parameter for each of its values
+        assert [one.item for one in line_parameters(line, "one", handle)] == [*document, *added]
+    line = ConfiguredLine(read(Source("line.toml", head.format("msc"))), outputs=False)
+    with pytest.raises(InvalidCommand, match="documents no list of parameters: name the items"):
+        line_parameters(line, "one", line.nodes["one"])
