@@ -11,12 +11,14 @@ import pytest
 from hypothesis import given, settings
 
 from busmaster import planning
+from busmaster.arbiter.backlog import SHARE
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.planning import Bounds, Losses, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
+from busmaster.planning import Bounds, Losses, Plan, PlannedGroup, PlannedNode, Sharing, bounds, longest_hold, plan
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -117,6 +119,7 @@ def test_a_group_without_time_to_spare_is_named_although_it_fits() -> None:
     assert tight.fits
     assert any("'tight' has no time to spare" in line for line in tight.advice)
     assert not any("'easy'" in line and "spare" in line for line in tight.advice)
+    assert planned(group("easy", 5.0, 1), group("tight", 11 * EXCHANGE, 10, phase=0.0)).advice == tight.advice
 
 
 def test_a_group_in_background_that_is_alone_has_the_whole_line() -> None:
@@ -322,6 +325,24 @@ def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
     assert prediction.worst_waits[COMMAND] == pytest.approx((1 + 4 + 3) * hold)
     assert [g.worst_wait for g in prediction.groups] == pytest.approx([0.5 + 4 * 8 * 6 * hold, 10.0 + 4 * 8 * 6 * hold])
     assert prediction.groups[0].worst_cycle == pytest.approx(prediction.groups[0].worst_wait + hold)
+
+
+def test_r9_other_programs_and_their_sequences_lengthen_the_waits() -> None:
+    alone = planned(group("a", 0.5, 4))
+    for sharing, clients, held in ((Sharing(2, 0.0), 2, 0.0), (Sharing(0, 0.7), 0, 0.7), (Sharing(2, 0.7), 2, 0.7)):
+        waits = planned(group("a", 0.5, 4), sharing=sharing).worst_waits
+        bound = bounds([(NODE, hcp2.Read(1))], TAU, polls=4)
+        expected = replace(bound, clients=clients, held=held)
+        assert waits == {priority: pytest.approx(expected.wait(priority)) for priority in Priority}
+        assert waits[COMMAND] > alone.worst_waits[COMMAND]
+    assert planned(group("a", 0.5, 4), sharing=Sharing()).worst_waits == alone.worst_waits
+
+
+def test_r9_while_the_line_is_held_each_command_may_wait_for_one_of_a_lower_class() -> None:
+    free, held = Bounds(hold=1.0, urgent_hold=1.0), Bounds(hold=0.5, urgent_hold=1.0, held=0.5)
+    each, ahead = 1 + MOST_BEFORE, 2 * SHARE - 1
+    assert free.wait(COMMAND, ahead=ahead) == 1 + each * (ahead + 2) + MOST_BEFORE
+    assert held.wait(COMMAND, ahead=ahead) == 1 + each * (ahead + 2 * SHARE) + MOST_BEFORE
 
 
 # what lost frames cost

@@ -355,6 +355,10 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             "line.toml:6: nodes.winder.points.x.item: no such item 'axis0.positon'",
         ),
         (
+            f"{HEAD}{NODE}[nodes.winder.points]\nspeeed = {{ factor = 2 }}",
+            "line.toml:6: nodes.winder.points.speeed: no such item 'speeed'",
+        ),
+        (
             f"{HEAD}{NODE}[nodes.winder.points]\n1 = {{ factor = 0 }}",
             "line.toml:6: nodes.winder.points.1.factor: must not be 0",
         ),
@@ -394,6 +398,18 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         ),
         (f"{HEAD}[outputs.sqlit]\npath = 'x'", "line.toml:2: outputs.sqlit: no such key; did you mean 'sqlite'?"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\ngroups = ['g']", "line.toml:4: outputs.csv.groups[1]: no such group 'g'"),
+        (
+            f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = 'winder/1'\n[outputs.csv]\npath = 'x'\ngroups = ['g', 'h']",
+            "line.toml:10: outputs.csv.groups[2]: no such group 'h'",
+        ),
+        (
+            f"{HEAD}[outputs.csv]\npath = 'x'\n[outputs.sqlite]\npath = 'y'\nspill = 'x'",
+            "line.toml:6: outputs.sqlite.spill: is already the file of csv.path; use another path",
+        ),
+        (
+            f"{HEAD}{NODE}[groups.g]\nperiod = 1\npoints = ['winder/1,', 'winder/2']",
+            "line.toml:7: groups.g.points[1]: a name is missing in '1,'",
+        ),
         (f"{HEAD}[outputs.csv]\npath = 'x'\nbuffer = 0", "line.toml:4: outputs.csv.buffer: must be 1 to"),
         (f"{HEAD}[outputs.mqtt]\nprefix = 'a/#'", "line.toml:3: outputs.mqtt.prefix: a topic must not contain"),
         (f"{HEAD}[outputs.mqtt]\nqos = 2", "line.toml:3: outputs.mqtt.qos: must be 0 to 1, not 2"),
@@ -421,6 +437,23 @@ def test_what_an_output_cannot_do_is_said_where_the_file_asks_for_it(tmp_path: P
     text = f'{HEAD}{NODE}[outputs.csv]\npath = "{tmp_path}/none/x.csv"\n'
     with pytest.raises(FileError, match=r"line\.toml:5: outputs\.csv: .*the folder .* does not exist; create it"):
         ConfiguredLine(parse(text))
+
+
+def test_each_group_of_an_output_must_be_one_that_it_can_take() -> None:
+    nodes = f'{SLOW}{PRESS}points.run = {{ item = "2000:4" }}\n'
+    groups = "".join(
+        f"[groups.{name}]\nperiod = 1\npoints = 'press/{item}'\n" for name, item in (("a", 1), ("b", "run"))
+    )
+    with pytest.raises(FileError, match=r"outputs\.metrics\.groups: cannot take press/run: it is a run"):
+        ConfiguredLine(parse(f"{nodes}{groups}[outputs.metrics]\ngroups = ['a', 'b']\n"))
+    ConfiguredLine(parse(f"{nodes}{groups}[outputs.metrics]\ngroups = 'a'\n"))
+
+
+def test_an_option_of_a_node_overrides_that_of_its_protocol() -> None:
+    press = PRESS.replace("nodes.press", "nodes.other").replace("address = 1", "address = 2")
+    common = "[protocols.msc]\naddress_step = 4\n"
+    nodes = parse(f"{SLOW}{common}{PRESS}address_step = 2\n{press}").nodes
+    assert [node.options["address_step"] for node in nodes.values()] == [2, 4]
 
 
 def test_a_command_may_only_be_allowed_for_what_can_be_written() -> None:

@@ -13,10 +13,12 @@ import pytest
 
 from busmaster.app.config import FileError, LineFile
 from busmaster.app.config.sections import read
+from busmaster.app.config.service import read_tokens
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.permission import Permission, digest_of
 from busmaster.app.service.rights import Role
+from busmaster.bounds import LONGEST_FILE
 from busmaster.errors import InvalidCommand
 
 USER, GROUP = pwd.getpwuid(0).pw_name, grp.getgrgid(0).gr_name
@@ -171,6 +173,39 @@ def test_tokens_that_others_may_read_or_change_are_refused(tmp_path: Path, mode:
     with pytest.raises(FileError, match=r"service\.token_file: other users can read or change .*; run chmod 600"):
         tokens(tmp_path, HMI, mode)
     assert tokens(tmp_path, HMI, 0o640)
+
+
+def test_a_file_of_tokens_is_bounded_and_a_text(tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    path.write_text(HMI)
+    path.chmod(0o600)
+    os.truncate(path, LONGEST_FILE + 1)
+    with pytest.raises(InvalidCommand, match=f"large has more than {LONGEST_FILE} bytes; it is not a list of tokens"):
+        read_tokens(str(path))
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(InvalidCommand, match="large is not a text file; write a name and its token on each line"):
+        read_tokens(str(path))
+
+
+def test_each_user_group_and_token_has_its_own_role() -> None:
+    names = {
+        kind: [USER if kind == "users" else GROUP, "nobody" if kind == "users" else "daemon"]
+        for kind in ("users", "groups")
+    }
+    roles = "".join(
+        f'[service.{kind}.{name}]\nrole = "{role}"\n'
+        for kind, both in names.items()
+        for name, role in zip(both, ("read", "write"), strict=True)
+    )
+    service = '[service]\nmode = "0660"\nlisten = "127.0.0.1:7420"\ntoken_file = "/none"\n'
+    both = 'tokens.one.role = "read"\ntokens.two.role = "write"\n'
+    access = ConfiguredLine(parse(f"{TEXT}{service}{both}{roles}"), outputs=False).authorisation.access
+    for found, kind in ((access.users, "user"), (access.groups, "group"), (access.tokens, "token")):
+        assert [each.role for each in found.values()] == [Role.READ, Role.WRITE]
+        assert all(each.who.startswith(f"{kind} ") for each in found.values())
+    assert list(access.users) == [0, pwd.getpwnam("nobody").pw_uid]
+    assert list(access.groups) == [0, grp.getgrnam("daemon").gr_gid]
+    assert list(access.tokens) == ["one", "two"]
 
 
 def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Path) -> None:

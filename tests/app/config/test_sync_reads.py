@@ -74,6 +74,13 @@ def test_a_wrong_item_is_an_error_at_its_key(key: str, complaint: str) -> None:
     assert complaint in str(caught.value)
 
 
+@pytest.mark.parametrize("key", ['probe = "x"', 'sync_reads = ["holding:1", "x"]'])
+def test_a_wrong_item_of_a_protocol_is_an_error_at_the_node_that_does_not_have_it(key: str) -> None:
+    with pytest.raises(FileError, match=r"nodes\.press: no such item 'x'") as caught:
+        profile_of(f"{NODE}[protocols.modbus]\n{key}\n", "press")
+    assert caught.value.line == 2
+
+
 @pytest.mark.parametrize(
     "key", ['probe = "holding:1"', 'sync_reads = ["holding:1", "holding:2"]', "reply_time = 0.01", "retries = 1"]
 )

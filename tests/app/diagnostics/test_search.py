@@ -11,7 +11,16 @@ import pytest
 
 from busmaster.app.diagnostics.probing import opened
 from busmaster.app.diagnostics.search import Discovery, Search
-from busmaster.app.diagnostics.steps import LISTENING, Step, addresses, ranges, seconds, steps, usual_kinds
+from busmaster.app.diagnostics.steps import (
+    LISTENING,
+    Step,
+    addresses,
+    ranges,
+    seconds,
+    steps,
+    untuned_steps,
+    usual_kinds,
+)
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Echo, Line
@@ -287,6 +296,46 @@ def test_a_rate_or_settings_that_are_said_are_the_only_ones() -> None:
     assert {step.settings and step.settings.baudrate for step in steps(usual_kinds(), None, 4800)} == {4800}
     wanted = LineSettings(9600, 7, "E")
     assert {step.settings for step in steps(usual_kinds(), None, wanted)} == {wanted}
+
+
+@pytest.mark.parametrize("kind", usual_kinds(), ids=lambda kind: str(kind.name))
+def test_each_framing_of_a_kind_is_tried_once_at_a_named_rate(kind: NodeKind) -> None:
+    known = [kind.profile.line, *kind.profile.other_lines]
+    assert [step.settings for step in steps([kind], None, None)] == known
+    tried = [step.settings for step in steps([kind], None, 4800)]
+    assert all(settings is not None and settings.baudrate == 4800 for settings in tried)
+    framings = dict.fromkeys(settings.framing for settings in known)
+    assert [settings.framing for settings in tried if settings is not None] == list(framings)
+
+
+def test_the_likeliest_settings_of_each_kind_are_tried_before_the_others() -> None:
+    tried = [(step.kind.name, step.settings) for step in steps([find("hcp2"), find("ct-ansi")], None, None)]
+    kinds = {kind: [settings for name, settings in tried if name == kind] for kind in ("hcp2", "ct-ansi")}
+    for kind, settings in kinds.items():
+        assert settings == [find(kind).profile.line, *find(kind).profile.other_lines]
+    assert [name for name, _ in tried[:2]] == ["hcp2", "ct-ansi"]
+
+
+def test_a_port_that_cannot_be_tuned_has_a_step_for_each_kind_that_has_the_nodes() -> None:
+    tried = untuned_steps([find("hcp2"), find("msc")], (0, 200))
+    assert [(step.kind.name, step.settings, step.addresses, step.rest) for step in tried] == [
+        ("hcp2", None, (0, 200), ())
+    ]
+    [step] = untuned_steps([find("msc")], None)
+    assert (step.addresses, step.rest) == (tuple(range(1, 9)), tuple(range(9, 16)))
+    with pytest.raises(InvalidCommand, match="no protocol has these nodes: nothing is left to try"):
+        untuned_steps([find("msc")], (99,))
+
+
+def test_the_time_that_a_search_takes_is_that_of_all_requests_and_of_the_listening() -> None:
+    profile = find("hcp2").profile
+    [step] = untuned_steps([find("hcp2")], (1, 2, 3))
+    each = profile.timings.read.window + 8 * profile.line.byte_time
+    assert step.seconds == pytest.approx(3 * each)
+    assert step.seconds_for((7,)) == pytest.approx(each)
+    assert seconds([step, step]) == pytest.approx(3.0 + 6 * each)
+    slow = replace(step, settings=LineSettings(1200))
+    assert slow.seconds_for((7,)) == pytest.approx(profile.timings.read.window + 8 * LineSettings(1200).byte_time)
 
 
 def found_on(line: Line, *names: str, told: list[str] | None = None) -> Discovery:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from busmaster.app.config import load
 from busmaster.app.diagnostics.search import Discovery, Found
-from busmaster.app.diagnostics.writing import line_text, summary
+from busmaster.app.diagnostics.writing import lasting, line_text, summary
 from busmaster.app.line import ConfiguredLine
 from busmaster.bus.node import Node
 from busmaster.contract.learning import Learned
@@ -114,3 +115,65 @@ def test_several_protocols_on_one_line_are_told_apart(tmp_path: Path) -> None:
     line = line_of(found, SerialPort("/dev/ttyUSB0", baudrate=9600), tmp_path)
     assert list(line.nodes) == ["hcp_1", "hcp2_1"]
     assert summary(found) == ("Host Comms Protocol at 19200 8N1, node 1; Host Comms Protocol 2 at 19200 8N1, node 1")
+
+
+def test_a_file_describes_each_node_with_its_reply_times_and_polls_all_that_do_not_refuse() -> None:
+    hcp2 = find("hcp2").protocol
+    times = {1: (0.0004, 0.0004, 0.0005), 2: (0.001, 0.0202, 0.03), 3: (0.002, 0.003, 0.004)}
+    nodes = [replace(node_of(hcp2, starts), address=node, refuses=node == 3) for node, starts in times.items()]
+    text = line_text(SerialPort("/dev/ttyUSB0", baudrate=9600), Discovery(SETTINGS, found=nodes))
+    parsed = tomllib.loads(text)
+    assert text.startswith("# What answered on /dev/ttyUSB0: Host Comms Protocol 2 at 19200 8N1, nodes 1, 2, 3.\n")
+    assert [node["reply_time"] for node in parsed["nodes"].values()] == [0.001, 0.0202, 0.003]
+    assert [node["address"] for node in parsed["nodes"].values()] == [1, 2, 3]
+    assert not any("timing" in node for node in parsed["nodes"].values())
+    assert parsed["groups"]["all"] == {"period": 0.5, "points": ["node1/1", "node2/1"]}
+    assert '# its reply: it: says "this"; replies began after 1 / 20 / 30 ms (least / median / p99)' in text
+    assert 'protocol = "hcp2"  # or "microflex"' in text
+    assert list(parsed["port"]) == ["path", *(key for key in parsed["port"] if key != "path")]
+
+
+@pytest.mark.parametrize(("slowest", "period"), [(0.01, 0.5), (0.15, 1.0), (0.2, 1.5), (0.3, 1.5)])
+def test_a_cycle_of_all_nodes_has_time_to_spare(slowest: float, period: float) -> None:
+    hcp2 = find("hcp2").protocol
+    nodes = [replace(node_of(hcp2, (0.001, slowest)), address=node) for node in (1, 2)]
+    text = line_text(SerialPort("/dev/ttyUSB0", baudrate=9600), Discovery(SETTINGS, found=nodes))
+    total = 2 * (slowest + 64 * SETTINGS.byte_time)
+    expected = tomllib.loads(text)["groups"]["all"]["period"]
+    assert expected >= 2 * total
+    assert expected == 0.5 or expected - 0.5 < 4 * total
+
+
+def test_a_window_is_written_only_for_a_node_that_needs_it() -> None:
+    hcp2 = find("hcp2").protocol
+    window = hcp2.profile.timings.read.window
+    for slowest, wanted in ((0.75 * window, None), (0.76 * window, pytest.approx(0.155))):
+        found = Discovery(SETTINGS, found=[node_of(hcp2, (0.001, slowest))])
+        [node] = tomllib.loads(line_text(SerialPort("/dev/ttyUSB0", baudrate=9600), found))["nodes"].values()
+        assert node.get("timing", {}).get("window") == wanted
+
+
+def test_a_drive_without_an_address_is_the_drive_and_unknown_settings_are_not_written() -> None:
+    found = Discovery(None, found=[node_of(find("dc104").protocol)])
+    assert summary(found) == f"{find('dc104').profile.title}, one drive"
+    port = SerialPort("/dev/ttyUSB0", baudrate=4800)
+    parsed = tomllib.loads(line_text(port, found))
+    assert parsed["nodes"].keys() == {"drive"}
+    assert "address" not in parsed["nodes"]["drive"]
+    assert parsed["port"] == {"path": "/dev/ttyUSB0", "baudrate": 4800}
+
+
+def test_reply_times_are_learned_if_any_of_the_nodes_allows_it() -> None:
+    both = [replace(node_of(find(name).protocol), address=1) for name in ("hcp", "hcp2")]
+    for nodes, learned in ((both[:1], False), (both, True), (both[::-1], True)):
+        text = line_text(SerialPort("/dev/ttyUSB0", baudrate=9600), Discovery(SETTINGS, found=nodes))
+        assert ("timing" in tomllib.loads(text)) is learned
+
+
+def test_a_port_that_is_not_a_usb_adapter_keeps_its_name(tmp_path: Path) -> None:
+    for port in (
+        SerialPort(str(tmp_path / "gone"), baudrate=9600),
+        SerialPort("usb:A1", baudrate=9600),
+        TcpPort("h", 1),
+    ):
+        assert lasting(port) is port

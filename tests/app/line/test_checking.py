@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -259,3 +261,53 @@ def test_what_only_the_emulator_refuses_is_a_warning(tmp_path: Path) -> None:
     assert report.problems == ()
     [warning] = report.warnings
     assert warning.startswith("`busmaster emulate` rejects the file: ")
+
+
+def test_each_bad_point_of_a_node_is_reported_and_a_limit_of_the_node_hides_none(tmp_path: Path) -> None:
+    points = 'a = { item = "none" }\nb = { item = "11", maximum = 5 }\nc = { factor = 0 }\nd = { minimum = "x" }\n'
+    found = problems(tmp_path, f"{HEAD}{NODE}[nodes.winder.points]\n{points}{GROUP}")
+    assert [error.key for error in found] == [
+        f"nodes.winder.points.{key}" for key in ("a.item", "c.factor", "d.minimum")
+    ]
+    found = problems(tmp_path, f"{HEAD}{NODE}[nodes.winder.points]\n{points.partition('c =')[0]}{GROUP}")
+    assert [error.key for error in found] == ["nodes.winder.points.a.item"]
+
+
+def test_each_limit_that_cannot_be_is_reported(tmp_path: Path) -> None:
+    limits = "[nodes.winder.points]\n1 = { minimum = 2, maximum = 1 }\n2 = { max_step = 0 }\n3 = { minimum = 0 }\n"
+    found = problems(tmp_path, f"{HEAD}{NODE}{limits}{GROUP}")
+    assert [error.key for error in found] == ["nodes.winder.points.1", "nodes.winder.points.2"]
+
+
+def test_files_that_cannot_be_written_are_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    year = time.strftime("%Y")
+    (tmp_path / year).mkdir()
+    (tmp_path / "%y").mkdir()
+    text = (
+        f'learned = "{tmp_path}/learned"\n{HEAD}timing = "learned"\n{NODE}{GROUP}'
+        f'[outputs.csv]\npath = "{tmp_path}/%Y"\n[outputs.sqlite]\npath = "{tmp_path}/a"\nspill = "{tmp_path}/%y"\n'
+    )
+    path = written(tmp_path, text)
+    folders = [
+        f"outputs.csv.path: {tmp_path}/{year} is a folder; name a file",
+        f"outputs.sqlite.spill: {tmp_path}/%y is a folder; name a file",
+    ]
+    assert check(path).problems == ()
+    assert check(path).warnings == tuple(folders)
+    asked: list[tuple[str, int]] = []
+
+    def access(name: Path, mode: int) -> bool:
+        asked.append((str(name), mode))
+        return False
+
+    monkeypatch.setattr(os, "access", access)
+    why = f"{tmp_path} cannot be written by this user; check the permissions"
+    assert check(path).warnings == (folders[0], f"outputs.sqlite.path: {why}", folders[1], f"learned: {why}")
+    assert set(asked) == {(str(tmp_path), os.W_OK)}
+
+
+def test_tokens_are_read_unless_the_service_is_disabled(tmp_path: Path) -> None:
+    service = '[service]\nlisten = "127.0.0.1:7420"\ntoken_file = "/no/such/file"\n'
+    [error] = problems(tmp_path, GOOD + service)
+    assert error.key == "service.token_file"
+    assert problems(tmp_path, f"{GOOD}{service}enabled = false\n") == []

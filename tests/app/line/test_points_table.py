@@ -242,6 +242,33 @@ def test_points_of_a_range_of_nodes_are_those_of_its_section() -> None:
     ]
 
 
+def test_limits_of_every_section_of_nodes_are_shown() -> None:
+    other = "".join(f'[nodes.{n}]\nprotocol = "hcp2"\naddress = {a}\n' for n, a in (("x", 6), ("y", 7)))
+    point = 'points.{} = {{ item = "10"{} }}\n'
+    parts = other.split("[nodes.y]")
+    held = read(
+        Source(
+            "line.toml",
+            f"{HEAD}{point.format('a', '')}{parts[0]}{point.format('b', ', maximum = 5')}{point.format('c', '')}[nodes.y]"
+            f"{parts[1]}{point.format('d', ', writable = false')}{point.format('e', '')}",
+        )
+    )
+    assert [(row.node, row.point, row.limited_by) for row in rows(held)] == [
+        ("w", "a", ()),
+        ("x", "b", ()),
+        ("x", "c", ("b",)),
+        ("y", "d", ()),
+        ("y", "e", ("d",)),
+    ]
+
+
+def test_several_points_are_added_to_inline_points_behind_the_last() -> None:
+    back = take(file(FORMS["in the node"], ""), "node,point,item", "w,c,12", "w,d,13")
+    assert 'b = { item = "11" }, c = { item = "12" }, d = { item = "13" } }' in back.text
+    empty = take(file("points = {}\n", ""), "node,point,item", "w,c,12", "w,d,13")
+    assert 'points = { c = { item = "12" }, d = { item = "13" } }\n' in empty.text
+
+
 def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
     (tmp_path / "ours.toml").write_text(
         'protocol = "hcp2"\n[points]\na = { item = "10", maximum = 5 }\nz = { item = "12" }\n'
@@ -257,6 +284,14 @@ def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
     assert faults(held, "node,point,maximum", "w,a,") == [
         "points.csv: row 2, column maximum: is 5 in the template and cannot be removed; write another value"
     ]
+
+
+def test_a_key_that_a_node_repeats_of_its_template_stays_in_its_section(tmp_path: Path) -> None:
+    (tmp_path / "ours.toml").write_text('protocol = "hcp2"\n[points]\na = { item = "10", maximum = 5 }\n')
+    path = tmp_path / "line.toml"
+    path.write_text(HEAD + 'template = "ours.toml"\n[nodes.w.points]\na = { maximum = 5, unit = "m" }\n')
+    back = take(load(path), "node,point,unit", "w,a,mm")
+    assert tomllib.loads(back.text)["nodes"]["w"]["points"] == {"a": {"maximum": 5, "unit": "mm"}}
 
 
 # what is refused
@@ -277,6 +312,7 @@ def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
         ("w,c,12,{ READY = 70 },", "row 2, column bits: READY is bit 70"),
         ("w,c,12,{ READY = x },", "row 2, column bits: must be a table of names"),
         ('w,c,12,"{ READY = 0, FAULT = 1.5 }",', "row 2, column bits: FAULT must be a whole number"),
+        ('w,c,12,,"5\nx = 2"', "row 2, column maximum: must be a number, not '5"),
         ("w,c,12,5,", "row 2, column bits: must be a table of names"),
         ('w,c,12,"1\nx = 2",', "row 2, column bits: must be a table of names"),
         ('w,c,"12', "not valid CSV: unexpected end of data"),
@@ -368,3 +404,24 @@ def test_a_file_that_cannot_be_replaced_is_as_it_was(tmp_path: Path, monkeypatch
         write_beside(str(path), "after")
     assert path.read_text() == "before"
     assert [one.name for one in tmp_path.iterdir()] == ["line.toml"]
+
+
+def test_a_file_keeps_its_owner_and_is_written_in_its_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text("before")
+    status = path.stat()
+    owners: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "fchown", lambda _, user, group: owners.append((user, group)))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    write_beside(str(path), "after")
+    assert owners == [(status.st_uid, status.st_gid)]
+    assert path.read_text() == "after"
+
+    def refused(*_: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "fchown", refused)
+    write_beside(str(path), "by another user")
+    assert path.read_text() == "by another user"
