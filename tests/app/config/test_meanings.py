@@ -164,6 +164,28 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
             'item = "10", factor = 0.1, bits = { A = 0 }',
             "bits: apply to the unscaled number on the line; leave",
         ),
+        (
+            "hcp2",
+            'item = "10", offset = 1, labels = { 0 = "x" }',
+            "labels: apply to the unscaled number on the line; leave",
+        ),
+        ("mentor", 'item = "8.77", decimals = 1, bits = { A = 0 }', "bits: need whole numbers, but 8.77 has decimals"),
+        (
+            "modbus",
+            'item = "holding:1", labels = { 65536 = "x" }',
+            "labels: holding:1 cannot be 65536, because it has 16 b",
+        ),
+        (
+            "modbus",
+            'item = "holding:1", labels = { -32769 = "x" }',
+            "labels: holding:1 cannot be -32769, because it has 1",
+        ),
+        ("modbus", 'item = "holding:1:4", max_step = 1', "max_step: is not possible for holding:1:4, a run of values"),
+        (
+            "modbus",
+            'item = "coil:1", hysteresis = 0.5',
+            "hysteresis: is not possible for coil:1, which is a bit and not",
+        ),
         ("hcp2", 'item = "10", bits = { A = 0 }, labels = { 0 = "x" }', "labels: a number has bits or labels, not bo"),
         ("mentor", 'item = "1.17", bits = { A = 16 }', "bits: A is bit 16, but the highest bit of 1.17 is 15"),
         (

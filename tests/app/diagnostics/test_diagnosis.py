@@ -185,8 +185,8 @@ def test_a_longer_maximum_reply_delay_is_kept_where_values_arrive_late() -> None
 
 def test_no_learned_window_is_promised_that_is_not_shorter() -> None:
     assert diagnosis.learning([0.001, 0.02], TIMING).what == (
-        "learned windows would be 32 ms at most; a lost reply would occupy the line for about as long, instead of 150 ms "
-        '(--timeout learned, timing = "learned")'
+        "learned windows would be 32 ms at most; a lost reply would occupy the line for about as long, instead of 150 "
+        'ms (--timeout learned, timing = "learned")'
     )
     same = "learned windows would not be shorter than the configured one"
     assert diagnosis.learning([0.001, 0.09], TIMING) == Finding("learning", True, same)

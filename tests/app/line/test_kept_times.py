@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
 
-from busmaster import InvalidCommand, MemoryPort
+from busmaster import InvalidCommand, MemoryPort, ext
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine, kept_times
 from busmaster.bus.node import Node
+from busmaster.statistics import LearnedTimes
 from busmaster.testing import run_in_virtual_time
 
 TEXT = """
@@ -128,6 +130,9 @@ DAMAGED = [
     "{",
     "[]",
     '{"version": 1, "nodes": {}}',
+    '{"nodes": {}}',
+    '{"version": 2}',
+    '{"version": 2, "nodes": {"winder": {"times": []}}}',
     '{"version": 2, "nodes": {"winder": {"settings": "", "times": [{"kind": "Read"}]}}}',
     '{"version": 2, "nodes": {"winder": 5}}',
     '{"version": 2, "nodes": [5]}',
@@ -206,6 +211,87 @@ def test_a_file_that_is_read_again_may_bring_back_a_node_and_its_times(text: str
             assert trusted(line) == {"winder", "drive"}
 
     run_in_virtual_time(main())
+
+
+def test_a_file_that_is_read_again_does_not_begin_with_the_kept_times_again(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_for(text, LONG)
+    begun: list[str] = []
+    begin_with = ext.begin_with
+
+    def noted(node: Node, times: Iterable[LearnedTimes]) -> None:
+        begun.append(node.label)
+        begin_with(node, times)
+
+    async def main() -> None:
+        async with opened(text) as line:
+            await line.take(read(Source("line.toml", text)))
+
+    monkeypatch.setattr(ext, "begin_with", noted)
+    run_in_virtual_time(main())
+    assert begun == ["winder", "drive"]
+
+
+def test_the_times_of_each_kind_of_request_are_kept(text: str, kept: Path) -> None:
+    async def main() -> int:
+        async with opened(text) as line:
+            for value in range(250):
+                await line.nodes["winder"].write(10, value)
+                await line.nodes["drive"].read(10)
+            return len(ext.times_to_keep(Node.of(line.nodes["winder"])))
+
+    both = run_in_virtual_time(main())
+    assert both > 1
+    assert len(json.loads(kept.read_text())["nodes"]["winder"]["times"]) == both
+
+
+def test_a_disk_that_hangs_holds_up_nothing_and_is_written_by_one_thread(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported: list[str] = []
+    released, begun = threading.Event(), list[threading.Thread]()
+
+    def hang(path: str) -> None:
+        begun.append(threading.current_thread())
+        released.wait()
+
+    line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
+    kept = kept_times.KeptTimes(line.bus, reported.append)
+    monkeypatch.setattr(kept_times, "PATIENCE", 0.01)
+    try:
+        for _ in range(2):
+            kept._do(kept_times.NOT_KEPT, hang, "x.json")
+            kept._report_trouble()
+    finally:
+        released.set()
+    assert reported == ["x.json: the file system did not respond for 0.01 s; the learned reply times are not stored"]
+    [thread] = begun
+    assert thread.daemon  # a process can end without it
+    thread.join()
+    monkeypatch.setattr(kept_times, "PATIENCE", 5.0)
+    kept._do(kept_times.NOT_KEPT, hang, "x.json")
+    assert len(begun) == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError("odd"), "the file is damaged, or from another version"),
+        (ValueError("odd"), "the file is damaged, or from another version"),
+    ],
+)
+def test_why_times_are_not_kept_is_reported_in_words(
+    text: str, kept: Path, error: Exception, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(_: str) -> bytes:
+        raise error
+
+    monkeypatch.setattr(kept_times, "read_file", failing)
+    reported: list[str] = []
+    run_for(text, 0.3, reported.append)
+    assert reported == [f"{kept}: {why}; reply times are learned again"]
 
 
 def test_a_place_without_a_folder_or_without_learning_is_refused(text: str) -> None:

@@ -249,8 +249,8 @@ def test_limits_of_every_section_of_nodes_are_shown() -> None:
     held = read(
         Source(
             "line.toml",
-            f"{HEAD}{point.format('a', '')}{parts[0]}{point.format('b', ', maximum = 5')}{point.format('c', '')}[nodes.y]"
-            f"{parts[1]}{point.format('d', ', writable = false')}{point.format('e', '')}",
+            f"{HEAD}{point.format('a', '')}{parts[0]}{point.format('b', ', maximum = 5')}{point.format('c', '')}"
+            f"[nodes.y]{parts[1]}{point.format('d', ', writable = false')}{point.format('e', '')}",
         )
     )
     assert [(row.node, row.point, row.limited_by) for row in rows(held)] == [
