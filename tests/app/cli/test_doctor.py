@@ -6,6 +6,7 @@ number, and is deaf while it is another than its own.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import random
@@ -14,8 +15,10 @@ import subprocess
 import sys
 import termios
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -27,12 +30,13 @@ from busmaster.app.diagnostics import adapters, diagnosis, examination
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
 from busmaster.app.diagnostics.probing import Outcome, Prober, opened
+from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.capture.pcapng import read_packets
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
-from busmaster.emulator.memory import MemoryPort
+from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
@@ -45,6 +49,7 @@ from tests.transport.rs485_driver import FakeDriver
 from tests.transport.usb import UsbTree
 
 HCP2 = ("--protocol", "hcp2")
+HCP2_SETTINGS = LineSettings(57600)
 
 
 def line_of(protocol: str, devices: Iterable[Device], **options: object) -> Line:
@@ -157,7 +162,76 @@ def test_a_node_is_left_with_nothing_unacknowledged() -> None:
     assert (controller.unacknowledged, controller.retransmitted) == (False, 0)
 
 
+def test_settings_that_are_not_usual_are_noted_where_the_port_is_opened() -> None:
+    line = Line(LineSettings(19200), [hcp2(1)], chance=random.Random(1))
+    finding = examined(line, (1,)).on("open")
+    assert finding == Finding("open", True, "it opens at 19200 8N1", "Host Comms Protocol 2 usually has 57600 8N1")
+    assert examined(line_of("hcp2", [hcp2(1)]), (1,)).on("open").advice == ""
+
+
+@pytest.mark.parametrize(
+    ("addresses", "crowd"),
+    [
+        ((7,), "node 7"),
+        ((7, 9), "nodes 7, 9"),
+        (tuple(range(8)), "nodes 0, 1, 2, 3, 4, 5, 6, 7"),
+        (tuple(range(9)), "any of 9 addresses"),
+    ],
+)
+def test_many_silent_nodes_are_counted_and_few_are_named(addresses: tuple[int, ...], crowd: str) -> None:
+    patient = Patient(MemoryPort(line_of("hcp2", [])), "hcp2", addresses=addresses)
+    assert patient.crowd(addresses) == crowd
+
+
+def test_silent_nodes_are_reported_only_if_the_user_has_named_them() -> None:
+    for named, topics in ((True, ["node 1", "node 2", "node 3"]), (False, ["node 2"])):
+        tap, findings = Requests(), Findings()
+        patient = Patient(MemoryPort(line_of("hcp2", [hcp2(2)])), "hcp2", addresses=(1, 2, 3), named=named)
+        run_in_virtual_time(examine(patient, findings.append, tap))
+        assert [finding.topic for finding in findings if finding.topic.startswith("node ")] == topics
+        absent = examination.SILENT_PROBES if named else 1
+        assert tap.asked == {1: absent, 2: 1 + examination.PROBES, 3: absent}
+
+
+class Requests(Tap):
+    """Counts the requests to each node."""
+
+    def __init__(self) -> None:
+        self.asked: Counter[int] = Counter()
+        self.sent = b""
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self.sent += data
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        pass
+
+    def attempted(self, attempt: Attempt, /) -> None:
+        self.asked[attempt.address] += 1
+
+
 # Before anybody is asked
+
+
+def test_without_a_protocol_nothing_is_sent_but_bytes_that_no_node_replies_to() -> None:
+    for words, sent, topics in (
+        (b"\x11\x22", b"", ["open", "silence"]),
+        (b"", HARMLESS, ["open", "silence", "echo", "nodes"]),
+    ):
+        tap, findings = Requests(), Findings()
+        port = MemoryPort(line_of("hcp2", [Chatterbox(words)] if words else []))
+        run_in_virtual_time(examine(Patient(port), findings.append, tap))
+        assert [finding.topic for finding in findings] == topics
+        assert tap.sent == sent
+
+
+def test_bytes_that_the_opening_of_a_port_causes_are_not_unexpected() -> None:
+    class Click(Chatterbox):
+        def wake(self, now: float) -> None:
+            self.reply(self.words, now, 0.0)
+            self.wakeup = inf
+
+    assert examined(line_of("hcp2", [Click(b"\x11"), hcp2(1)]), (1,)).wrong == set()
 
 
 def test_the_harmless_bytes_begin_no_frame_and_acknowledge_nothing() -> None:
@@ -544,6 +618,40 @@ def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
     assert LineSettings(9600, 7, "E") not in candidates
     framings = [candidate.framing for candidate in candidates]
     assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)
+
+
+@dataclass(frozen=True)
+class Tunable(MemoryPort):
+    """A port whose own settings differ from those of the line."""
+
+    own: LineSettings = HCP2_SETTINGS
+
+    @property
+    def settings(self) -> LineSettings:
+        return self.own
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
+    ) -> MemoryTransport:
+        transport = await MemoryPort.open(self, protocol_factory, only)
+        await transport.tune(self.own)
+        return transport
+
+
+@pytest.mark.parametrize("settings", [LineSettings(9600), LineSettings(2400), LineSettings(19200, 7, "E")])
+def test_a_node_at_other_settings_is_found_at_any_of_the_first_addresses(settings: LineSettings) -> None:
+    line = Line(settings, [hcp2(4), hcp2(5)], chance=random.Random(1))
+    findings = examined(line, (1, 2, 4, 5), port=Tunable(line))
+    assert findings.on("nodes").what == "no reply from nodes 1, 2, 4, 5 at 57600 8N1"
+    assert findings.on("settings").what == f"nodes 1, 2, 4, 5: node 4 replies at {diagnosis.speed(settings)}"
+    assert line.host == LineSettings(57600), "the settings of the port are as they were"
+
+
+def test_no_more_than_some_nodes_are_tried_at_each_of_the_other_settings() -> None:
+    line = Line(LineSettings(9600), [hcp2(5)], chance=random.Random(1))
+    findings = examined(line, (1, 2, 3, 4, 5), port=Tunable(line))
+    tried = len(other_settings(LineSettings(57600)))
+    assert findings.on("settings").what == f"nodes 1, 2, 3, 4: no reply with {tried} other settings either"
 
 
 @pytest.mark.parametrize(("nodes", "named"), [(None, False), ((), True), ((3, 4), True)])

@@ -164,6 +164,12 @@ def test_what_is_wrong_in_a_template_is_said_with_its_own_line(text: str, what: 
         line(tmp_path, 'template = "ours.toml"\n')
 
 
+def test_an_error_in_a_template_is_reported_although_the_node_overrides_the_key(tmp_path: Path) -> None:
+    (tmp_path / "ours.toml").write_text('protocol = "hcp2"\n[points]\nspeed = { item = "10", factor = 0 }\n')
+    with pytest.raises(FileError, match=r"ours.toml:3: points.speed.factor: must not be 0"):
+        line(tmp_path, 'template = "ours.toml"\npoints.speed = { factor = 1 }\n')
+
+
 def test_a_template_that_is_a_folder_is_an_error_with_the_line_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     with pytest.raises(FileError, match=r"line.toml:5: .*folder.toml cannot be read: Is a directory"):

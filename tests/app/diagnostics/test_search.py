@@ -371,6 +371,31 @@ def test_a_microflex_is_found_as_one_whether_it_refuses_or_ignores_the_reads_of_
     assert found == {2: ("microflex", False), 9: ("microflex", False), 4: ("hcp2", False), 11: ("hcp2", False)}
 
 
+def test_the_other_addresses_are_announced_with_the_time_that_they_can_take() -> None:
+    told: list[str] = []
+    line = line_of(find("hcp").profile.line, make_device("hcp", 3), make_device("hcp2", 4))
+    discovery = found_on(line, "hcp", "hcp2", told=told)
+    assert [(node.kind.name, node.address) for node in discovery.found] == [("hcp", 3), ("hcp2", 4)]
+    due = [next(step for step in steps([find(name)], None, None)) for name in ("hcp", "hcp2")]
+    total = sum(step.seconds_for(step.rest) for step in due)
+    assert told == [
+        f"nodes have replied, so the other addresses are tried too (hcp 0, 9-15; hcp2 0, 9-255): up to {total:.0f} s"
+    ]
+
+
+def test_garbled_replies_are_reported_until_a_node_is_found() -> None:
+    told: list[str] = []
+    broken = make_device("hcp2", 2)
+    broken.faults.corrupt = 1.0
+    found = found_on(line_of(LineSettings(57600), broken), "hcp2", told=told)
+    assert found.found == []
+    assert told[0].startswith("Host Comms Protocol 2, node 2 at 57600 8N1: ")
+    told.clear()
+    line = line_of(LineSettings(57600), make_device("hcp2", 1), broken)
+    assert [node.address for node in found_on(line, "hcp2", told=told).found] == [1]
+    assert not any(text.startswith("Host Comms Protocol 2, node 2") for text in told)
+
+
 def test_what_was_not_asked_is_reported() -> None:
     line = line_of(find("hcp2").profile.line, make_device("hcp2", 3))
     discovery = found_on(line, "hcp", "hcp2")
