@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
 import grp
 import os
@@ -15,10 +16,19 @@ from typing import Any
 
 import pytest
 
-from busmaster.app.diagnostics.adapters import Finding, inspect, latency_timer, low_latency, made_rate, rs485_mode
-from busmaster.app.diagnostics.examination import driver, rate
+from busmaster.app.diagnostics.adapters import (
+    Finding,
+    inspect,
+    latency_timer,
+    low_latency,
+    made_rate,
+    opened_latency,
+    rs485_mode,
+)
+from busmaster.app.diagnostics.examination import driver, rate, remote_port
 from busmaster.transport import identity
 from busmaster.transport.holders import Holder, holders, how_to_open, lock_owner, owning_group
+from busmaster.transport.rfc2217 import ModemLines
 from tests.transport.fakes import PtyMaster, plugged
 from tests.transport.usb import UsbTree
 
@@ -77,6 +87,31 @@ def test_a_quick_adapter_is_in_order(pty_master: PtyMaster, sysfs: Path) -> None
     assert topics(inspect(pty_master.path))["latency"]
     timer.unlink()
     assert latency_timer(pty_master.path) is None
+
+
+def test_a_latency_timer_of_more_than_2_ms_comes_with_the_ways_to_shorten_it(
+    pty_master: PtyMaster, sysfs: Path
+) -> None:
+    timer = sysfs / "class/tty" / os.path.basename(pty_master.path) / "device/latency_timer"
+    timer.write_text("2\n")
+    assert topics(inspect(pty_master.path))["latency"]
+    timer.write_text("3\n")
+    [found] = [finding for finding in inspect(pty_master.path) if finding.topic == "latency"]
+    by_root = f"write 1 to {timer} as root"
+    assert (found.ok, found.what) == (False, "the adapter gathers received bytes for up to 3 ms (latency_timer)")
+    assert found.advice == f"add ?low_latency=1 to the port (low_latency=True in Python), or {by_root}"
+    assert "latency" in topics(inspect(pty_master.path, low_latency=False))
+    assert "latency" not in topics(inspect(pty_master.path, low_latency=True)), "its timer is set as it is opened"
+    [opened] = opened_latency(pty_master.path)
+    assert opened.advice == f"low_latency=1 did not shorten it; {by_root}"
+    timer.write_text("odd\n")
+    assert list(opened_latency(pty_master.path)) == []
+
+
+def test_a_port_must_be_readable_and_writable(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:
+    for allowed, ok in ((os.R_OK, False), (os.W_OK, False), (os.R_OK | os.W_OK, True)):
+        monkeypatch.setattr(os, "access", lambda _, mode, allowed=allowed: mode & ~allowed == 0)
+        assert topics(inspect(pty_master.path))["permission"] is ok
 
 
 def test_an_adapter_that_is_named_by_a_link_is_examined_as_what_it_points_to(tmp_path: Path, sysfs: Path) -> None:
@@ -253,6 +288,45 @@ def test_a_rate_that_a_uart_cannot_make_is_told_where_its_driver_tells_what_it_d
     [finding] = rate(pty_master.fd, 76800)
     assert not finding.ok
     assert finding.what == "its UART makes 57600 baud of 76800, -25.0%"
+
+
+def test_the_rs485_mode_of_a_driver_is_reported_unless_software_switches(
+    monkeypatch: pytest.MonkeyPatch, pty_master: PtyMaster
+) -> None:
+    def found(mode: int | None, *, switched: bool = False) -> Finding:
+        def ioctl(_descriptor: int, request: int, settings: Any) -> int:
+            if mode is None or request == termios.TIOCGSERIAL:
+                raise OSError("no such mode")
+            settings[0] = mode
+            return 0
+
+        monkeypatch.setattr(fcntl, "ioctl", ioctl)
+        [finding] = [finding for finding in driver(pty_master.fd, switched=switched) if finding.topic == "rs485"]
+        assert finding.ok
+        return finding
+
+    assert found(None).what.startswith("the driver has no RS-485 mode: the adapter switches by itself")
+    assert found(1) == Finding("rs485", True, "the driver switches the transmitter (RS-485 mode)")
+    assert found(0).what == "the driver's RS-485 mode is off"
+    assert "add ?rs485=1 (rs485=True in Python), or ?rs485.by=software" in found(0).advice
+    for mode in (None, 0, 1):
+        assert found(mode, switched=True) == Finding("rs485", True, "software switches the transmitter by RTS")
+
+
+class Remote(asyncio.Transport):
+    """A connection to an RFC 2217 server that reports these errors and lines."""
+
+    def __init__(self, errors: object, lines: ModemLines | None) -> None:
+        super().__init__({"line_errors": lambda: errors, "modem_lines": lines})
+
+
+def test_what_an_rfc_2217_server_reports_of_its_port_is_shown() -> None:
+    errors, lines = remote_port(Remote(object(), ModemLines(cts=True, dsr=False, ri=False, cd=True)))
+    assert errors == Finding("line errors", True, "the server reports line errors")
+    assert lines == Finding("modem lines", True, "the server reports CTS on, DSR off, RI off, CD on")
+    [errors] = remote_port(Remote(None, None))
+    assert (errors.ok, errors.what) == (True, "the server has not confirmed that it reports line errors")
+    assert errors.advice.startswith("parity and framing errors are not counted: each shows as a garbled reply")
 
 
 def test_who_is_not_root_is_told_that_other_users_programs_cannot_be_seen(

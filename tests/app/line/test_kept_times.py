@@ -246,9 +246,7 @@ def test_the_times_of_each_kind_of_request_are_kept(text: str, kept: Path) -> No
     assert len(json.loads(kept.read_text())["nodes"]["winder"]["times"]) == both
 
 
-def test_a_disk_that_hangs_holds_up_nothing_and_is_written_by_one_thread(
-    text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_hangs_holds_up_nothing_and_is_written_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     reported: list[str] = []
     released, begun = threading.Event(), list[threading.Thread]()
 
