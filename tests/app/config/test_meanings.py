@@ -181,11 +181,6 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
             "labels: holding:1 cannot be -32769, because it has 1",
         ),
         ("modbus", 'item = "holding:1:4", max_step = 1', "max_step: is not possible for holding:1:4, a run of values"),
-        (
-            "modbus",
-            'item = "coil:1", hysteresis = 0.5',
-            "hysteresis: is not possible for coil:1, which is a bit and not",
-        ),
         ("hcp2", 'item = "10", bits = { A = 0 }, labels = { 0 = "x" }', "labels: a number has bits or labels, not bo"),
         ("mentor", 'item = "1.17", bits = { A = 16 }', "bits: A is bit 16, but the highest bit of 1.17 is 15"),
         (

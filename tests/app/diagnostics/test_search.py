@@ -386,7 +386,7 @@ def test_the_other_addresses_are_announced_with_the_time_that_they_can_take() ->
 def test_garbled_replies_are_reported_until_a_node_is_found() -> None:
     told: list[str] = []
     broken = make_device("hcp2", 2)
-    broken.faults.corrupt = 1.0
+    broken.faults.wrong = 1.0
     found = found_on(line_of(LineSettings(57600), broken), "hcp2", told=told)
     assert found.found == []
     assert told[0].startswith("Host Comms Protocol 2, node 2 at 57600 8N1: ")

@@ -238,7 +238,7 @@ def test_the_times_of_each_kind_of_request_are_kept(text: str, kept: Path) -> No
         async with opened(text) as line:
             for value in range(250):
                 await line.nodes["winder"].write(10, value)
-                await line.nodes["drive"].read(10)
+                await line.nodes["winder"].read(10)
             return len(ext.times_to_keep(Node.of(line.nodes["winder"])))
 
     both = run_in_virtual_time(main())
