@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 import hypothesis.strategies as st
@@ -122,6 +123,13 @@ def test_a_group_without_time_to_spare_is_named_although_it_fits() -> None:
     assert planned(group("easy", 5.0, 1), group("tight", 11 * EXCHANGE, 10, phase=0.0)).advice == tight.advice
 
 
+def test_a_cycle_that_never_ends_is_endless() -> None:
+    [endless, empty] = planned(group("a", 0.01, 200), PlannedGroup("empty", 0.01, [])).groups
+    assert endless.line_time > 10 * endless.period
+    assert (endless.cycle, endless.longest_cycle) == (inf, inf)
+    assert (empty.cycle, empty.longest_cycle) == (0, 0)
+
+
 def test_a_group_in_background_that_is_alone_has_the_whole_line() -> None:
     [alone] = planned(group("history", 1.0, 10, priority=BACKGROUND)).groups
     assert (alone.cycle, alone.longest_cycle, alone.missed) == pytest.approx((10 * EXCHANGE, 10 * EXCHANGE, 0))
@@ -135,6 +143,18 @@ def test_a_schedule_does_not_fit_if_any_of_its_groups_misses_cycles() -> None:
         assert not prediction.fits
         assert not replace(prediction, utilisation=1.0).fits
         assert not replace(prediction, groups=prediction.groups[:0]).fits
+
+
+def test_a_group_without_time_to_spare_is_named_although_the_line_is_not_busy() -> None:
+    """An exchange of another group that starts just before it is due takes nearly all of its spare time."""
+    period = 2.1 * EXCHANGE
+    quick, seldom = group("quick", period, 1, phase=0.0), group("seldom", 10.0, 1, phase=3 * period - 0.05 * EXCHANGE)
+    for groups in ((quick, seldom), (seldom, quick)):
+        prediction = planned(*groups)
+        assert prediction.utilisation < 0.5
+        assert prediction.fits
+        [_, spare] = prediction.advice
+        assert spare.startswith("group 'quick' has no time to spare: a cycle takes up to ")
 
 
 # what would fit
@@ -301,6 +321,11 @@ def test_r9_every_nodes_probe_counts_but_a_broadcast_has_none() -> None:
     alone = bounds([broadcast], tau)
     drive = (PlannedNode(mentor.PROFILE, 1), mentor.Write(1, 17, 0))
     assert bounds([broadcast, drive], tau).hold > alone.hold
+    long = replace(mentor.PROFILE, probe=mentor.ReadRun(1, 1, 8))
+    for address, longest in ((0, mentor.Write(1, 17, 0)), (1, long.probe)):
+        node = PlannedNode(long, address)
+        bound = bounds([(node, mentor.Write(1, 17, 0))], tau)
+        assert bound.hold == bound.urgent_hold == longest_hold(node.open(longest), tau)
 
 
 def test_r9_the_waits_of_the_four_classes() -> None:

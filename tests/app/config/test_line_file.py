@@ -17,6 +17,7 @@ from busmaster.bus.node import Node
 from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
+from busmaster.ext import TIMES
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import kinds
@@ -290,6 +291,21 @@ def test_the_emulator_has_delays_and_faults_for_all_nodes_and_for_single_ones() 
     assert (first.delay, second.delay) == (Delay(0.004), Delay(0.01, 0.02))
     assert (first.faults.lost, first.faults.dead, second.faults.lost, second.faults.dead) == (0.1, 0, 0, 1)
     assert emulated.tau == 0
+
+
+def test_the_emulated_line_echoes_if_the_port_is_declared_to() -> None:
+    for option, echoes in (("", False), ("&echo=0", False), ("&echo=1", True)):
+        file = parse(f'port = "/dev/ttyUSB0?baudrate=57600{option}"\n{NODE}')
+        assert (emulated_line(file).echo is not None) is echoes
+
+
+def test_an_old_name_of_a_reply_time_is_reported_with_the_new_one() -> None:
+    old, new = next(iter(TIMES.items()))
+    with pytest.raises(FileError) as caught:
+        parse(f"{HEAD}{NODE}timing = {{ {old} = 0.01 }}\n")
+    assert f"timing.{old}: no such key; renamed to {new!r}; `busmaster migrate line.toml --write` changes" in str(
+        caught.value
+    )
 
 
 def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_rate() -> None:

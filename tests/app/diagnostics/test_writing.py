@@ -157,7 +157,9 @@ def test_a_drive_without_an_address_is_the_drive_and_unknown_settings_are_not_wr
     found = Discovery(None, found=[node_of(find("dc104").protocol)])
     assert summary(found) == f"{find('dc104').profile.title}, one drive"
     port = SerialPort("/dev/ttyUSB0", baudrate=4800)
-    parsed = tomllib.loads(line_text(port, found))
+    text = line_text(port, found)
+    assert 'protocol = "dc104"\n' in text, "there is no other kind of node to name"
+    parsed = tomllib.loads(text)
     assert parsed["nodes"].keys() == {"drive"}
     assert "address" not in parsed["nodes"]["drive"]
     assert parsed["port"] == {"path": "/dev/ttyUSB0", "baudrate": 4800}

@@ -195,7 +195,9 @@ def test_a_continued_save_keeps_its_start_and_why_parameters_have_no_value(tmp_p
     with PartFile(path, EMPTY, WANTED, KIND) as part:
         part.add(Found(WANTED[0], why="no such parameter", gap=True))
         part.add(Found(WANTED[1], why="no reply"))
+        assert [one.item for one in part.missing] == ["1.19"]
         part.add(Found(WANTED[2], 7))
+        assert part.missing == ()
     later = replace(EMPTY, saved=datetime(2026, 2, 28, tzinfo=UTC))
     with PartFile(path, later, WANTED, KIND) as part:
         assert part.missing == ()
@@ -224,9 +226,10 @@ points.run = { item = "1.17:2" }
 def test_parameters_of_a_line_are_those_of_the_document_with_what_the_file_adds() -> None:
     line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
     handle = line.nodes["screw"]
-    found = {one.item: one for one in line_parameters(line, "screw", handle)}
+    listed = line_parameters(line, "screw", handle)
+    found = {one.item: one for one in listed}
     document = {one.item: one for one in handle.parameters()}
-    assert list(found) == list(document)
+    assert [one.item for one in listed] == list(document), "each once, in the order of the document"
     assert {item for item in document if found[item] != document[item]} == {"2.04", "2.05"}
     ramp = found["2.04"]
     assert (ramp.name, ramp.unit, ramp.decimals, ramp.minimum, ramp.maximum) == ("ramp", "s", 1, 0.5, 20)

@@ -377,6 +377,8 @@ def test_a_form_that_cannot_be_changed_is_left_alone() -> None:
     held = file('[nodes.w.points.a]\nitem = "10"\n[nodes.w.points.a.bits]\nREADY = 0\n', "")
     with pytest.raises(FileError, match=r"line.toml:7: nodes.w.points.a.bits: is not written as one pair"):
         take(held, "node,point,bits", "w,a,{ READY = 1 }")
+    with pytest.raises(FileError, match=r"line.toml:7: nodes.w.points.a.bits: is not written as one pair"):
+        take(held, "node,point,bits", "w,a,")
 
 
 # the file
