@@ -352,6 +352,30 @@ def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
     assert prediction.groups[0].worst_cycle == pytest.approx(prediction.groups[0].worst_wait + hold)
 
 
+def test_r9_the_exchanges_of_all_groups_count_in_the_waits() -> None:
+    slow = PlannedNode(hcp2.PROFILE, 9, Timings.uniform(ReplyTiming(0.1, 0.5, 0.7, 0.02)))
+    reads = {
+        "a": [(NODE, hcp2.Read(1)), (NODE, hcp2.Read(2))],
+        "b": [(slow, hcp2.Read(1))],
+        "c": [(NODE, hcp2.Read(3))],
+    }
+    classes = {"a": POLL, "b": POLL, "c": BACKGROUND, "d": BACKGROUND}
+    reads["d"] = [(NODE, hcp2.Read(4)), (NODE, hcp2.Read(5))]
+    groups = [PlannedGroup(name, 10.0, each, priority=classes[name]) for name, each in reads.items()]
+    bound = bounds([read for each in reads.values() for read in each], TAU, polls=3, background=3)
+    waits = {priority: pytest.approx(bound.wait(priority)) for priority in Priority}
+    assert planned(*groups).worst_waits == planned(*reversed(groups)).worst_waits == waits
+
+
+def test_the_usual_waits_are_those_of_the_slowest_exchange_of_all_groups() -> None:
+    slow = PlannedNode(hcp2.PROFILE, 9, Timings.uniform(ReplyTiming(0.1, 0.5, 0.7, 0.02)), reply_time=0.05)
+    groups = [group("a", 1.0, 2), group("b", 1.0, 1, node=slow)]
+    for ordered in (groups, groups[::-1]):
+        prediction = planned(*ordered, receive_latency=0.016)
+        assert prediction.typical_wait == pytest.approx(EXCHANGE - 0.002 + 0.05)
+        assert prediction.dead_wait == pytest.approx(8 * TAU + 0.7 + 0.016)
+
+
 def test_r9_other_programs_and_their_sequences_lengthen_the_waits() -> None:
     alone = planned(group("a", 0.5, 4))
     for sharing, clients, held in ((Sharing(2, 0.0), 2, 0.0), (Sharing(0, 0.7), 0, 0.7), (Sharing(2, 0.7), 2, 0.7)):

@@ -137,6 +137,17 @@ def test_no_such_point_is_said_with_what_there_is() -> None:
             line.point(name)
 
 
+def test_a_point_that_is_not_writable_is_refused_under_its_name() -> None:
+    line = opened(TEXT.replace("[nodes.drive2-3]", 'held = { item = "12", writable = false }\n[nodes.drive2-3]'))
+    for name, what in (
+        ("held", "^winder/held is read-only$"),
+        ("axis0.position", "^winder/axis0.position is read-only$"),
+    ):
+        with pytest.raises(InvalidCommand, match=what):
+            line.prepare_write(f"winder/{name}", [1])
+    assert callable(line.prepare_write("winder/force", [1]))
+
+
 def test_the_plan_counts_each_group_once_whether_it_runs_or_not() -> None:
     async def main() -> None:
         line = opened()
