@@ -73,10 +73,14 @@ def _limits_text(row: Row, details: Mapping[str, Any]) -> str:
             for name, word in (("minimum", "from"), ("maximum", "to"), ("max_step", "in steps of at most"))
             if limit[name] is not None
         ]
-        texts.append(" ".join(bounds) if limit["writable"] else "may not be written")
-    written = "; ".join(text for text in texts if text) or ("any value" if row.writable else "it is read-only")
+        texts.append(" ".join(bounds))
+    if not all(limit["writable"] for limit in details["limits"]):
+        written = "may not be written"
+    else:
+        written = "written " * row.writable
+        written += "; ".join(text for text in texts if text) or ("any value" if row.writable else "it is read-only")
     alarms = [f"{name} {number_text(details[name])}" for name in ("low", "high") if details.get(name) is not None]
-    return f"{'written ' * row.writable}{written}" + (f"; alarm {', '.join(alarms)}" if alarms else "")
+    return written + (f"; alarm {', '.join(alarms)}" if alarms else "")
 
 
 def _exchange_text(times: Mapping[str, Any]) -> str:
