@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from busmaster.app.cli.cells import age_text, clock_text, column_widths, fit_value, sparkline
+from busmaster.app.cli.cells import (
+    age_text,
+    clock_text,
+    column_widths,
+    fit,
+    fit_value,
+    gauge_line,
+    group_line,
+    header_line,
+    row_line,
+    sparkline,
+    title_line,
+)
+from busmaster.app.service.picture import Frame, Group, Node, Row
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(10**400), 10**400), st.integers(8, 24))
@@ -56,9 +70,165 @@ def test_a_trend_spans_its_own_lowest_and_highest_and_shows_gaps() -> None:
     assert sparkline([5.0, 5.0]) == "▁▁"
     assert sparkline([None, None]) == ""
     assert sparkline([1.0, math.nan, 2.0]) == "▁ █"
+    assert sparkline([0.0, 0.0]) == "▁▁"
+
+
+def test_a_ripple_of_negative_numbers_is_no_trend_either() -> None:
+    assert sparkline([-100.0, -99.9]) == sparkline([100.0, 100.1]) == "▁▁"
 
 
 def test_ages_and_clocks_fit_their_columns() -> None:
     ages = (None, 0.04, 9.94, 9.96, 12.3, 599, 6000, 360_000)
     assert [age_text(age) for age in ages] == ["-", "0.0s", "9.9s", "10s", "12s", "599s", "100m", "100h"]
     assert clock_text(3661.9) == "1:01:01"
+    assert age_text(-0.2) == "0.0s", "a clock that was read before the request"
+
+
+def test_a_text_as_wide_as_its_column_is_not_cut() -> None:
+    assert [fit("abcd", width) for width in (5, 4, 3)] == ["abcd", "abcd", "ab…"]
+
+
+# the lines of the head
+
+FRAME = Frame("Slitter", "/dev/ttyS0", "9600 8N1", False, 200.0, 61.0, "ready", 0.5, 2, 0, 1, 1, 1, 0, ())
+GROUP = Group("fast", 0.25, cycles=61, missed=1, achieved=0.2512, jitter=0.0123)
+
+
+def test_the_title_has_port_and_settings_and_why_there_is_no_news_in_place_of_the_clock() -> None:
+    assert title_line(FRAME, 50).plain == f" {'Slitter  /dev/ttyS0  9600 8N1':<40} 0:01:01 "
+    assert title_line(replace(FRAME, settings=""), 40).plain.startswith(" Slitter  /dev/ttyS0   ")
+    silent = title_line(FRAME, 50, "no data for 3 s").plain
+    assert silent.endswith(" no data for 3 s ")
+    assert "0:01:01" not in silent
+    assert len(silent) == 50
+
+
+@pytest.mark.parametrize(
+    ("width", "utilisation", "gauge"),
+    [
+        (79, 0.5, "━━━━━─────  50% busy"),
+        (80, 0.5, "━━━━━━━━━━──────────  50% busy"),
+        (80, 1.7, "━━━━━━━━━━━━━━━━━━━━ 170% busy"),
+        (60, 0.0, "──────────   0% busy"),
+    ],
+)
+def test_the_gauge_fills_with_the_load_and_never_beyond_its_width(width: int, utilisation: float, gauge: str) -> None:
+    assert gauge_line(replace(FRAME, utilisation=utilisation), width).plain == f" line {gauge}  ready  2 queued"
+
+
+def test_the_gauge_line_counts_disconnects_and_names_a_line_that_takes_no_writes() -> None:
+    assert gauge_line(replace(FRAME, losses=1), 120).plain.endswith("2 queued  1 disconnect")
+    both = gauge_line(replace(FRAME, losses=2, read_only=True), 120)
+    assert both.plain.endswith("2 queued  2 disconnects  read-only")
+
+
+def styles(line: object) -> dict[str, str]:
+    """The style of each part of a line that has one."""
+    return {line.plain[span.start : span.end].strip(): str(span.style) for span in line.spans}  # type: ignore[attr-defined]
+
+
+def test_a_load_that_leaves_no_room_and_a_lost_line_stand_out() -> None:
+    assert "50% busy" not in styles(gauge_line(FRAME, 80))
+    assert styles(gauge_line(replace(FRAME, utilisation=0.91), 80))["91% busy"] == "bold magenta"
+    assert "90% busy" not in styles(gauge_line(replace(FRAME, utilisation=0.9), 80))
+    assert styles(gauge_line(replace(FRAME, state="offline"), 80))["offline"] == "bold reverse"
+
+
+def test_the_line_of_a_group_has_its_times_in_milliseconds() -> None:
+    assert group_line(GROUP, 120).plain == " fast every 250 ms  missed 1  cycle 61, achieved 251.2, late p99 12.3"
+    assert group_line(replace(GROUP, achieved=0.0), 120).plain == " fast every 250 ms  missed 1  cycle 61"
+    assert group_line(replace(GROUP, paused=True), 120).plain.startswith(" fast  paused  every 250 ms")
+    assert len(group_line(GROUP, 30)) == 30
+
+
+# the lines of the table
+
+
+def point(**known: object) -> Row:
+    row = Row("fast", "5/force", "node 5", "hcp2", 5, "force", value=1.5, asked=199.0)
+    for name, value in known.items():
+        setattr(row, name, value)
+    return row
+
+
+NODE = Node("winder", "hcp2", 5, "up", p50=0.0031, p99=0.0124)
+
+
+def cells(row: Row, node: Node | None = NODE, group: Group | None = GROUP, frame: Frame = FRAME) -> dict[str, str]:
+    """What stands in the columns of a wide terminal."""
+    widths = column_widths(120)
+    line = row_line(row, node, group, frame, widths).plain
+    found, place = {}, 0
+    for name, width in widths.items():
+        found[name] = line[place : place + width].strip()
+        place += width + 1
+    return found
+
+
+def test_each_cell_has_its_own_fact() -> None:
+    row = point(unit="% of rated current", value=1.256, precision=2)
+    row.past.extend((float(number), float(number % 2)) for number in range(40))
+    row.past.extend((float(number), 5.0) for number in range(40, 80))
+    assert cells(row) == {
+        "NODE": "winder",
+        "ITEM": "force",
+        "": "",
+        "VALUE": "1.26",
+        "UNIT": "%",
+        "TREND": "▁" * column_widths(120)["TREND"],  # of the newest values
+        "AGE": "1.0s",
+        "P50ms": "3.1",
+        "HEALTH": "up",
+    }
+
+
+def test_a_node_that_is_not_known_yet_is_named_as_its_point_does() -> None:
+    found = cells(point(asked=None), None, None)
+    assert (found["NODE"], found["HEALTH"], found["P50ms"], found["AGE"]) == ("node 5", "", "-", "-")
+    assert cells(point(), replace(NODE, p50=0.0))["P50ms"] == "-"
+
+
+def test_no_node_of_a_lost_line_is_up_and_the_age_of_a_paused_group_rests() -> None:
+    assert cells(point(), frame=replace(FRAME, state="offline"))["HEALTH"] == "offline"
+    assert cells(point(), group=replace(GROUP, paused=True))["AGE"] == "rests"
+
+
+@pytest.mark.parametrize(
+    ("known", "mark"),
+    [
+        ({"error": "no reply", "alarm": "high", "quality": "bad"}, "!"),
+        ({"alarm": "low", "quality": "late"}, "↓"),
+        ({"alarm": "high", "quality": "good"}, "↑"),
+        ({"alarm": "set", "quality": "good"}, "↑"),
+        ({"alarm": "clear", "quality": "good"}, "↓"),
+        ({"quality": "late"}, "~"),
+        ({"quality": "stale"}, "?"),
+        ({"quality": "good"}, ""),
+    ],
+)
+def test_of_an_error_an_alarm_and_a_quality_the_first_has_the_mark(known: dict[str, object], mark: str) -> None:
+    assert cells(point(**known))[""] == mark
+
+
+@pytest.mark.parametrize(("age", "style"), [(0.74, None), (0.76, "bold magenta")])
+def test_a_value_older_than_three_periods_of_its_group_stands_out(age: float, style: str | None) -> None:
+    line = row_line(point(asked=200.0 - age), NODE, GROUP, FRAME, column_widths(120))
+    assert styles(line).get(f"{age:.1f}s") == style
+
+
+def test_states_of_health_and_the_selected_row_stand_out() -> None:
+    widths = column_widths(120)
+    for health, style in (("down", "bold reverse"), ("suspended", "magenta"), ("suspect", "bold magenta")):
+        assert styles(row_line(point(), replace(NODE, health=health), GROUP, FRAME, widths))[health] == style
+    assert "reverse" in {str(span.style) for span in row_line(point(), NODE, GROUP, FRAME, widths, True).spans}
+    assert "reverse" not in {str(span.style) for span in row_line(point(), NODE, GROUP, FRAME, widths).spans}
+
+
+def test_names_of_columns_stand_where_their_cells_do() -> None:
+    widths = column_widths(120)
+    header = header_line(widths).plain
+    row = row_line(point(), NODE, GROUP, FRAME, widths).plain
+    for name, cell in (("VALUE", "1.5"), ("AGE", "1.0s"), ("P50ms", "3.1")):
+        assert header.index(name) + len(name) == row.index(cell) + len(cell)
+    for name, cell in (("NODE", "winder"), ("ITEM", "force"), ("HEALTH", "up")):
+        assert header.index(name) == row.index(cell)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
@@ -10,11 +11,13 @@ import pytest
 from rich.cells import cell_len
 from textual.pilot import Pilot
 
+from busmaster.app.cli import live
 from busmaster.app.cli.live import Screen
 from busmaster.app.cli.terminal import made_printable
 from busmaster.app.service.picture import Picture
-from busmaster.errors import WriteUnconfirmed
+from busmaster.errors import InvalidCommand, LineDown, WriteUnconfirmed
 from tests.app.service.pictures import GROUP, node, row, tell, three_drives
+from tests.patience import PATIENCE
 
 SIZES = [(60, 20), (80, 24), (120, 40)]
 sizes = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
@@ -50,10 +53,10 @@ class Wishes:
 
 @asynccontextmanager
 async def drawn(
-    picture: Picture, size: tuple[int, int] = (80, 24), *, read_only: bool = False
+    picture: Picture, size: tuple[int, int] = (80, 24), *, read_only: bool = False, leave: str = "leave"
 ) -> AsyncIterator[tuple[Screen, Wishes, Pilot[int]]]:
     line = Wishes()
-    screen = Screen(picture, line, read_only=read_only)
+    screen = Screen(picture, line, read_only=read_only, leave=leave)
     async with screen.run_test(size=size) as pilot:
         await pilot.pause()
         yield screen, line, pilot
@@ -241,6 +244,124 @@ async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
 
 
 @pytest.mark.asyncio
+async def test_an_empty_filter_shows_all_rows_again_and_escape_keeps_the_filter() -> None:
+    async with drawn(tell(Picture(), *three_drives())) as (screen, _, pilot):
+        screen.words = "9"
+        await pilot.press("slash", "enter")  # the dialog begins with the present words
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9"]
+        await pilot.press("slash", "backspace", "escape")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9"]
+        await pilot.press("slash", "backspace", "space", "enter")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["1", "2", "9"]
+        assert "filter:" not in lines(screen)[-1]
+
+
+ORDERED = (
+    row(3, "b", asked=1050.0, alarm="low"),
+    row(4, "a", asked=1060.0, quality="stale"),
+    row(1, "d", None, asked=1055.0, error="no reply"),
+    row(2, "c", asked=1040.0, quality="late"),
+    row(6, "e", asked=1059.0),
+)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("presses", "shown", "word"),
+    [
+        (0, ["1", "2", "3", "4", "6"], ""),
+        (1, ["4", "3", "2", "1", "6"], "item"),
+        (2, ["1", "2", "3", "6", "4"], "oldest"),
+        (3, ["1", "2", "3", "4", "6"], "trouble"),
+        (4, ["1", "2", "3", "4", "6"], ""),
+    ],
+)
+async def test_o_orders_rows_by_node_item_age_and_trouble_in_turn(presses: int, shown: list[str], word: str) -> None:
+    nodes = tuple(node(number, "suspect" if number == 2 else "up") for number in (1, 2, 3, 4, 6))
+    async with drawn(tell(Picture(), *ORDERED, nodes=nodes)) as (screen, _, pilot):
+        await pilot.press(*["o"] * presses)
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == shown
+        assert lines(screen)[-1].startswith(f" {word} " if word else " ? keys")
+
+
+@pytest.mark.asyncio
+async def test_trouble_is_first_an_error_then_a_node_that_is_not_up_then_an_alarm_then_a_quality() -> None:
+    rows = (
+        row(1),
+        row(2, quality="late"),
+        row(3, alarm="low"),
+        row(4),
+        row(5, error="no reply"),
+        row(6, quality="stale"),
+    )
+    nodes = tuple(node(number, "suspect" if number == 4 else "up") for number in range(1, 7))
+    async with drawn(tell(Picture(), *rows, nodes=nodes)) as (screen, _, pilot):
+        screen.order = "item"
+        await pilot.press("o", "o")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["5", "4", "3", "2", "6", "1"]
+
+
+@pytest.mark.asyncio
+async def test_the_foot_has_the_error_of_the_selected_row_and_the_last_events_since_the_start() -> None:
+    events = [[1000.0 + number, f"event {number}"] for number in (4, 1, 3, 2)]
+    async with drawn(tell(Picture(), *three_drives(), events=events)) as (screen, _, pilot):
+        assert "no reply within 100 ms" not in "".join(lines(screen))
+        await pilot.press("end")
+        screen.take_picture()
+        await pilot.pause()
+        assert [line.strip() for line in lines(screen)[-5:-1]] == [
+            "node 9 axis0.position: no reply within 100 ms",
+            *(f"{number}.0 s  event {number}" for number in (2, 3, 4)),
+        ]
+        screen._show_message("written")
+        await pilot.pause()
+        assert [line.strip() for line in lines(screen)[-3:-1]] == ["4.0 s  event 4", "61.0 s  written"]
+        await pilot.resize_terminal(80, 20)
+        await pilot.pause()
+        assert "event 4" not in "".join(lines(screen)), "a small terminal has room for the last one"
+        assert "written" in "".join(lines(screen))
+
+
+@pytest.mark.asyncio
+async def test_points_beyond_those_that_are_shown_are_counted() -> None:
+    async with drawn(tell(Picture(), *three_drives(), left_out=7)) as (screen, _, _):
+        assert " 7 points more than are shown" in "\n".join(lines(screen))
+
+
+@pytest.mark.asyncio
+async def test_help_shows_what_q_does_here_and_each_of_its_keys_opens_and_closes_it() -> None:
+    async with drawn(tell(Picture(), row()), leave="end the run") as (screen, _, pilot):
+        assert "q end the run" in lines(screen)[-1]
+        for key, close in (("question_mark", "q"), ("h", "enter"), ("f1", "space"), ("h", "question_mark")):
+            await pilot.press(key)
+            await pilot.pause()
+            assert "q       end the run" in "\n".join(lines(screen))
+            await pilot.press(close)
+            await pilot.pause()
+            assert len(screen.screen_stack) == 1
+    assert screen.return_value is None
+
+
+@pytest.mark.asyncio
+async def test_a_text_longer_than_the_terminal_is_scrolled() -> None:
+    async with drawn(tell(Picture(), row()), (80, 10)) as (screen, _, pilot):
+        await pilot.press("question_mark")
+        await pilot.pause()
+        first = next(number for number, line in enumerate(lines(screen)) if "another row" in line)
+        await pilot.press("down")
+        await pilot.pause()
+        assert next(number for number, line in enumerate(lines(screen)) if "another row" in line) == first - 1
+        await pilot.press("up")
+        await pilot.pause()
+        assert next(number for number, line in enumerate(lines(screen)) if "another row" in line) == first
+
+
+@pytest.mark.asyncio
 async def test_an_offline_line_is_not_up() -> None:
     async with drawn(tell(Picture(), *three_drives(), state="offline", losses=1)) as (screen, _, _):
         shown = "\n".join(lines(screen))
@@ -293,6 +414,32 @@ async def test_keys_pause_poll_and_suspend_what_is_selected_or_all() -> None:
         ("pause", "slow", False),
         ("suspend", "hcp2", 6, 0.0),
     ]
+
+
+@pytest.mark.asyncio
+async def test_all_groups_are_paused_unless_all_are_and_only_then_resumed() -> None:
+    paused = {**GROUP, "name": "slow", "paused": True}
+    for groups, wanted in (((GROUP, paused), True), (({**GROUP, "paused": True}, paused), False)):
+        async with drawn(tell(Picture(), row(), groups=groups)) as (_, line, pilot):
+            await pilot.press("P")
+            await pilot.pause()
+        assert line.said == [("pause", "axes", wanted), ("pause", "slow", wanted)]
+
+
+@pytest.mark.asyncio
+async def test_the_question_names_what_is_done_to_which_node() -> None:
+    nodes = (node(5), node(6, "suspended"))
+    async with drawn(tell(Picture(), row(5), row(6), nodes=nodes)) as (screen, line, pilot):
+        await pilot.press("s")
+        await pilot.pause()
+        assert "suspend node 5 for 60 s, all its polls?  y or n" in "\n".join(lines(screen))
+        await pilot.press("n", "down", "s")
+        await pilot.pause()
+        assert "resume node 6?  y or n" in "\n".join(lines(screen))
+        await pilot.press("n")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+    assert line.said == []
 
 
 @pytest.mark.asyncio
@@ -349,6 +496,78 @@ async def test_it_is_said_what_became_of_a_write() -> None:
         await pilot.press("w", "2", "enter", "y")
         await pilot.pause()
         assert "node 5 outputs = 2: no reply within 100 ms" in "\n".join(lines(screen))
+
+
+@pytest.mark.asyncio
+async def test_the_dialog_of_a_write_shows_the_unit_and_why_a_value_is_none() -> None:
+    async with drawn(tell(Picture(), row(unit="mm"))) as (screen, line, pilot):
+        await pilot.press("w", "enter")  # nothing is not a value
+        await pilot.pause()
+        assert "write node 5 outputs in mm  (Enter; Esc cancels)" in "\n".join(lines(screen))
+        await pilot.press("x", "enter")
+        await pilot.pause()
+        assert "write node 5 outputs: 'x' is not a number  (Enter" in "\n".join(lines(screen))
+        await pilot.press("backspace", "7", "enter")
+        await pilot.pause()
+        assert "write node 5 outputs = 7 mm?  y or n" in "\n".join(lines(screen))
+        assert line.said == []
+        await pilot.press("y")
+        await pilot.pause()
+    assert line.said == [("write", "axes", "5/outputs", 7)]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("writable", "view", "line_", "message"),
+    [
+        (False, False, False, "node 5 outputs is read-only"),
+        (True, True, False, "this view is read-only"),
+        (True, False, True, "this view is read-only"),
+    ],
+)
+async def test_why_a_point_is_not_written_is_shown(writable: bool, view: bool, line_: bool, message: str) -> None:
+    picture = tell(Picture(), row(writable=writable), read_only=line_)
+    async with drawn(picture, read_only=view) as (screen, line, pilot):
+        await pilot.press("w")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+        assert message in "\n".join(lines(screen))
+    assert line.said == []
+
+
+@pytest.mark.asyncio
+async def test_a_write_that_is_refused_shows_why() -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+        line.error = InvalidCommand("9 is above the maximum of 7")
+        await pilot.press("w", "9", "enter", "y")
+        await pilot.pause()
+        assert "node 5 outputs = 9: 9 is above the maximum of 7" in "\n".join(lines(screen))
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("error", [InvalidCommand("no point 5/outputs"), LineDown("no point 5/outputs")])
+async def test_details_follow_the_value_and_say_that_a_point_is_gone(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(live, "ASKED_EVERY", 0.0)
+    again = asyncio.Event()
+    async with drawn(tell(Picture(), row(value=3))) as (screen, line, pilot):
+
+        async def gone(group: str, key: str, /) -> Mapping[str, Any]:
+            if screen.picture.rows[0].value == 4:
+                again.set()
+                await asyncio.Event().wait()
+            tell(screen.picture, row(value=4))
+            raise error
+
+        monkeypatch.setattr(line, "details", gone)
+        await pilot.press("enter")
+        await asyncio.wait_for(again.wait(), PATIENCE)
+        await pilot.pause()
+        shown = "\n".join(lines(screen))
+        assert "no point 5/outputs" in shown
+        assert "value    4" in shown
+        assert "limits" not in shown
 
 
 @sizes
