@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -94,6 +95,42 @@ def test_a_standard_error_that_takes_nothing_holds_up_nobody_and_what_is_lost_is
         printed.goes_on.set()
     assert [line.split()[1] for line, _ in printed.lines[:-1]] == ["5/0", "5/1", "5/2", "5/3"]
     assert printed.lines[-1] == ("audit: 2 writes are not listed here; standard error was blocked", Level.WARNING)
+
+
+def test_each_loss_is_reported_once_with_its_own_number(
+    authorisation: Authorisation, printed: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit_log, "MOST_WAITING_ENTRIES", 1)
+    monkeypatch.setattr(audit_log, "TICK", 0.001)
+    with AuditLog(lambda: True):
+        for lost in (2, 1):
+            seen = len(printed.lines)
+            printed.began.clear()
+            printed.goes_on.clear()
+            write(authorisation, "5/0")
+            assert printed.began.wait(PATIENCE)
+            for _ in range(lost + 1):
+                write(authorisation, "5/1")
+            printed.goes_on.set()
+            while len(printed.lines) < seen + 3:
+                time.sleep(0.001)
+    said = [line for line, _ in printed.lines if "not listed" in line]
+    assert [line.split()[1] for line in said] == ["2", "1"]
+
+
+def test_a_standard_error_that_stays_blocked_does_not_hold_up_the_end(
+    authorisation: Authorisation, printed: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit_log, "CLOSE_WITHIN", 0.01)
+    printed.goes_on.clear()
+    with AuditLog(lambda: True):
+        write(authorisation, "5/0")
+        assert printed.began.wait(PATIENCE)
+        [thread] = (thread for thread in threading.enumerate() if thread.name == "busmaster audit log")
+    assert thread.is_alive()
+    assert thread.daemon, "else the interpreter would wait for it"
+    printed.goes_on.set()
+    thread.join(PATIENCE)
 
 
 def test_the_log_is_as_before_when_it_has_ended() -> None:
