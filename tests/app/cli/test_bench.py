@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import random
 import signal
@@ -9,14 +10,19 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from busmaster import LEARNED, Priority
+from busmaster.app.cli import bench
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import find, make_device
-from busmaster.testing.bench import BenchReport
+from busmaster.testing.bench import BenchReport, EmulatedLine, Workload
+from busmaster.testing.latency_report import Times
 from tests.app.cli.conftest import ENVIRONMENT, ROOT, Command, started
 from tests.patience import PATIENCE
 
@@ -107,7 +113,90 @@ def test_errors_and_missed_cycles_are_printed_and_no_value_is_a_failure(busmaste
     assert "budget exceeded: " in slow.err
 
 
+# what the options define
+
+
+def run_of(*arguments: str) -> bench.Run:
+    """The measurement that a command line defines."""
+    with bench.command.make_context("bench", [*HCP2, *arguments]) as context:
+        return bench.Run(context.params)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "workload"),
+    [
+        ((), {}),
+        (("--seconds", "2.5"), {"seconds": 2.5}),
+        (("--callers", "0"), {"callers": 0}),
+        (("--callers", "3"), {"callers": 3}),
+        (("--every", "0.5"), {"every": 0.5}),
+        (("--period", "0.25"), {"period": 0.25}),
+        (("--items", "7,outputs"), {"items": ("7", "outputs")}),
+        (("--seed", "9"), {"seed": 9}),
+        (
+            ("--priorities", "command=2,urgent=1"),
+            {"priorities": {Priority.COMMAND: 2, Priority.URGENT: 1}},
+        ),
+    ],
+)
+def test_each_option_of_the_load_defines_it(arguments: tuple[str, ...], workload: dict[str, Any]) -> None:
+    assert run_of(*arguments).workload == Workload(**workload)
+
+
+def test_each_option_of_a_port_reaches_the_bus_and_its_nodes() -> None:
+    options = ("--baud", "9600", "--echo", "--timeout", "250", "--retries", "0")
+    run = run_of("/dev/ttyS0", "--nodes", "2,5", *options)
+    assert (run.addresses, run.connection.retries) == ((2, 5), 0)
+    assert (run.connection.baud, run.connection.echo, run.connection.timeout) == (9600, True, 0.25)
+    assert run_of("--timeout", "learned").connection.timeout is LEARNED
+    with bench.command.make_context("bench", ["--protocol", "msc", "--address-step", "4"]) as context:
+        assert bench.Run(context.params).connection.options == {"address_step": 4}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ((), EmulatedLine("hcp2")),
+        (("--nodes", "3,1"), EmulatedLine("hcp2", (3, 1))),
+        (("--baud", "9600"), EmulatedLine("hcp2", baudrate=9600)),
+        (("--reply-delay", "5"), EmulatedLine("hcp2", delay=(0.005, 0.005))),
+        (("--reply-delay", "5-9"), EmulatedLine("hcp2", delay=(0.005, 0.009))),
+        (("--fault", "lost=0.1", "--fault", "slow=2"), EmulatedLine("hcp2", faults=("lost=0.1", "slow=2"))),
+        (("--seed", "9"), EmulatedLine("hcp2", seed=9)),
+    ],
+)
+def test_each_option_of_the_emulated_line_defines_it(
+    monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], line: EmulatedLine
+) -> None:
+    made: list[EmulatedLine] = []
+
+    def emulated(line: EmulatedLine, *_: object, **__: object) -> ExitStack:
+        made.append(line)
+        return ExitStack()
+
+    monkeypatch.setattr(bench, "emulated", emulated)
+    with ExitStack() as lines:
+        run_of(*arguments)._measurement(lines)
+    assert made == [line]
+
+
 # budgets
+
+
+def test_each_budget_that_is_exceeded_is_a_line(busmaster: Command) -> None:
+    ran = busmaster(*VIRTUAL, "--budget", "p50=1", "--budget", "max=1", "--budget", "p99=20")
+    assert (ran.status, len(ran.err.splitlines())) == (1, 2)
+    assert "busmaster: measuring" not in ran.err
+    wrong = busmaster(*VIRTUAL, "--budget", "p99=20", "--budget", "p99=2x")
+    assert wrong.status == 2
+    cycles = ("--period", "0.5", "--priorities", "urgent=1", "--budget", "cycle.p99=90", "--budget", "urgent.max=20")
+    assert busmaster(*VIRTUAL, *cycles).status == 0
+
+
+def test_no_value_is_a_failure_though_no_budget_is_exceeded(busmaster: Command) -> None:
+    ran = busmaster(*VIRTUAL, "--fault", "dead=1", "--budget", "missed=0")
+    assert ran.status == 1
+    assert ran.err == "busmaster: no value was received; check the port, the protocol and the nodes\n"
 
 
 def test_a_budget_that_is_kept_is_status_0_and_one_that_is_not_status_1(busmaster: Command) -> None:
@@ -215,6 +304,118 @@ def test_two_reports_are_compared(busmaster: Command, reports: tuple[str, str]) 
     assert fields["same_workload"] is False
 
 
+TIMES = Times(4, 0.0025, {"p50": 0.001, "p90": 0.002, "p99": 0.003, "p99.9": 0.004, "max": 0.005})
+HALF = Times(2, 0.00125, {"p50": 0.0005, "p90": 0.001, "p99": 0.0015, "p99.9": 0.002, "max": 0.0025})
+REPORT = BenchReport(
+    line={
+        "protocol": "hcp2",
+        "baudrate": 57600,
+        "framing": "8N1",
+        "virtual": True,
+        "reply_delay": [0.001, 0.009],
+        "faults": ["lost=0.1", "slow=2"],
+    },
+    workload={**Workload(callers=1, every=0.5, period=0.25, seed=7).fields(), "nodes": [3]},
+    elapsed=2.0,
+    values=30,
+    limit=60.0,
+    share=0.25,
+    total=TIMES,
+    nodes={"3": HALF},
+    priorities={"command": TIMES},
+    calls={},
+    cycles=Times(),
+    missed=6,
+    errors={"NoReply": 3, "LineDown": 2},
+    histogram=((0.001, 1), (0.002, 100), (0.004, 0)),
+)
+OTHER = dataclasses.replace(
+    REPORT,
+    line={"protocol": "hcp2", "baudrate": 9600, "framing": "8N1", "port": "COM1"},
+    workload={**Workload(callers=0).fields(), "nodes": [3, 4]},
+    elapsed=1.0,
+    share=0.5,
+    total=HALF,
+    nodes={"3": TIMES, "4": TIMES},
+    missed=9,
+    errors={"NoReply": 8},
+)
+
+
+def test_the_page_has_each_figure_in_its_unit() -> None:
+    assert list(bench.page(REPORT)) == [
+        "hcp2, 1 node, 57600 baud 8N1, replies after 1 to 9 ms, faults lost=0.1 slow=2, emulated in virtual time",
+        "1 caller, each once in 0.5 s (command 1); a poll group every 0.25 s; seed 7",
+        "LATENCY, ms  COUNT  MEAN   p50   p90   p99  p99.9   max",
+        "node 3           2  1.25  0.50  1.00  1.50   2.00  2.50",
+        "total            4  2.50  1.00  2.00  3.00   4.00  5.00",
+        "poll cycles      0     -     -     -     -      -     -",
+        f"to      1.00 ms  {'#':40}  1",
+        f"to      2.00 ms  {'#' * 40}  100",
+        f"to      4.00 ms  {'':40}  0",
+        "30 values in 2.00 s: 15.0 a second, 25.0% of the wire's limit of 60.0",
+        "missed cycles: 6; errors: NoReply 3, LineDown 2",
+    ]
+
+
+def test_the_page_names_port_callers_and_priorities_of_another_load() -> None:
+    assert bench.head(OTHER) == "hcp2, 2 nodes, 9600 baud 8N1, on COM1"
+    assert bench.work(OTHER) == "0 callers, each without pauses (command 1); no poll group; seed 1"
+    default = dataclasses.replace(OTHER, workload={**Workload().fields(), "nodes": [3, 4]})
+    assert bench.work(default).startswith("2 callers, ")
+    assert [name for name, _ in bench.distributions(OTHER)] == ["node 3", "node 4", "total"]
+    two = dataclasses.replace(OTHER, priorities={"urgent": HALF, "command": TIMES})
+    assert [name for name, _ in bench.distributions(two)] == ["node 3", "node 4", "urgent", "command", "total"]
+    line = {**REPORT.line, "reply_delay": [0.002, 0.002], "faults": [], "virtual": False}
+    assert bench.head(dataclasses.replace(REPORT, line=line)).endswith(
+        ", replies after 2 ms, emulated on a pseudo-terminal"
+    )
+
+
+def test_a_comparison_has_each_figure_of_both_reports(busmaster: Command, tmp_path: Path) -> None:
+    for name, report in (("a", REPORT), ("b", OTHER)):
+        (tmp_path / name).write_text(report.to_json())
+    paths = str(tmp_path / "a"), str(tmp_path / "b")
+    done = busmaster("bench", "--compare", *paths)
+    assert (done.status, done.err) == (0, "")
+    assert done.lines[:3] == [
+        f"A: {bench.head(REPORT)}",
+        f"B: {bench.head(OTHER)}",
+        "the workloads differ: callers, every, period, seed, nodes",
+    ]
+    ratios = {tuple(line.split("  ")[0].split()): line.split()[-1] for line in done.lines[4:-4]}
+    assert ratios == {("total",): "0.50", ("node", "3"): "2.00", ("command",): "1.00"}
+    assert done.lines[-4:] == [
+        "values a second: A 15.0, B 30.0",
+        "share of the wire's limit: A 25.0%, B 50.0%",
+        "missed cycles: A 6, B 9",
+        "errors: A 5, B 8",
+    ]
+    fields = json.loads(busmaster("bench", "--compare", *paths, "--json", "--budget", "missed=20").out)
+    assert {name: figures["max"] for name, figures in fields.pop("ratios").items()} == {
+        "total": 0.5,
+        "3": 2.0,
+        "command": 1.0,
+    }
+    assert fields == {
+        "rate": [15.0, 30.0],
+        "share": [0.25, 0.5],
+        "missed": [6, 9],
+        "errors": [5, 8],
+        "same_workload": False,
+    }
+    same = json.loads(busmaster("bench", "--compare", paths[0], paths[0], "--json").out)
+    assert same["same_workload"] is True
+
+
+def test_a_comparison_that_exceeds_a_budget_is_a_failure_in_json_too(
+    busmaster: Command, reports: tuple[str, str]
+) -> None:
+    done = busmaster("bench", "--compare", *reports, "--json", "--budget", "p50=1.5x", "--budget", "max=1.5x")
+    assert (done.status, len(done.err.splitlines())) == (1, 2)
+    assert json.loads(done.out)
+
+
 def test_a_budget_of_a_comparison_is_for_the_second_report(busmaster: Command, reports: tuple[str, str]) -> None:
     assert busmaster("bench", "--compare", *reports, "--budget", "p50=2.1x", "--budget", "max=20").status == 0
     worse = busmaster("bench", "--compare", *reports, "--budget", "p50=1.5x")
@@ -263,6 +464,7 @@ def test_a_file_that_is_no_report_cannot_be_compared(
         ((*HCP2, "--budget", "7.p99=1"), "nothing measured has the name '7'"),
         ((*HCP2, "--budget", "p99=2x"), "needs --compare"),
         ((*HCP2, "--echo"), "--echo needs a PORT"),
+        ((*HCP2, "--budget", "p99=20", "--budget", "7.p99=1"), "nothing measured has the name '7'"),
         ((*HCP2, "--address-step", "2"), "is only for msc"),
         (("/dev/x", *HCP2), "hcp2 needs a node"),
         (("/dev/x", *HCP2, "--nodes", "1", "--virtual"), "--virtual needs an emulated line"),

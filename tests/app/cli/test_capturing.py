@@ -128,6 +128,4 @@ def test_events_that_are_not_in_the_capture_are_counted(tmp_path: Path, capfd: p
     with capturing(str(tmp_path / "line.pcapng"), port="COM1") as recorder:
         assert recorder is not None
         recorder.dropped = 1
-    assert capfd.readouterr().err == (
-        "busmaster: the capture lacks 1 events, which could not be written in time\n"
-    )
+    assert capfd.readouterr().err == ("busmaster: the capture lacks 1 events, which could not be written in time\n")
