@@ -186,7 +186,7 @@ def test_beside_a_file_only_options_that_do_not_describe_its_line_are_permitted(
         command = command.get_command(click.Context(cli), part)
     assert command is not None
     for option in command.get_params(click.Context(command)):
-        if not isinstance(option, click.Option) or option.name is None or "--help" in option.opts:
+        if not isinstance(option, click.Option) or "--help" in option.opts:
             continue
         given = [option.opts[0], *([] if option.is_flag else ["1"])]
         with command.make_context(name, given, resilient_parsing=True):

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.app.cli import check
+from busmaster.app.cli.output import Level
+from busmaster.app.config import FileError
+from busmaster.app.line import Report
 from tests.app.cli.conftest import Command
 
 GOOD = """\
@@ -55,6 +59,41 @@ def test_warnings_go_to_standard_error_and_are_no_problems(busmaster: Command, p
     checked = busmaster("check", str(path))
     assert (checked.status, checked.out) == (0, f"{path}: no problems\n")
     assert "warning: nothing is polled" in checked.err
+
+
+@pytest.fixture
+def reported(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
+    """What is printed on standard error. Each file has a problem and two warnings."""
+    notes: list[tuple[str, Level]] = []
+    problem = FileError("line.toml", 0, "", "the port is missing")
+    monkeypatch.setattr(check, "check", lambda path: Report((problem,), ("nothing is polled", "no output")))
+    monkeypatch.setattr(check, "note", lambda text, level=Level.INFO: notes.append((text, level)))
+    return notes
+
+
+def test_each_warning_is_a_line_with_its_level_and_one_problem_is_one(
+    busmaster: Command, path: Path, reported: list[tuple[str, Level]]
+) -> None:
+    checked = busmaster("check", str(path))
+    assert (checked.status, checked.lines[-1]) == (1, f"{path}: 1 problem")
+    assert reported == [("warning: nothing is polled", Level.WARNING), ("warning: no output", Level.WARNING)]
+
+
+@pytest.mark.usefixtures("reported")
+def test_json_has_each_warning_and_fails_as_the_text_does(busmaster: Command, path: Path) -> None:
+    checked = busmaster("check", "--json", str(path))
+    assert checked.status == 1
+    assert json.loads(checked.out) == {
+        "file": str(path),
+        "ok": False,
+        "problems": [{"file": "line.toml", "line": None, "key": "", "problem": "the port is missing"}],
+        "warnings": ["nothing is polled", "no output"],
+    }
+
+
+def test_completion_of_the_schema_option_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    check.command.make_context("check", ["--schema"], resilient_parsing=True).close()
+    assert capsys.readouterr().out == ""
 
 
 def test_json_has_problems_with_file_line_and_key_and_warnings(busmaster: Command, path: Path) -> None:

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import os
+import pty
 import random
-from collections.abc import Iterator
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import click
 import pytest
 
-from busmaster.app.cli.discover import what_to_try
+from busmaster.app.cli import discover
+from busmaster.app.cli.capturing import capturing
+from busmaster.app.cli.discover import EnterStops, Job, print_plan, what_to_try
 from busmaster.app.config import load
+from busmaster.app.diagnostics.search import Discovery, Found
+from busmaster.app.diagnostics.steps import Step
+from busmaster.capture import Recorder
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, serve_pty, serve_tcp
 from busmaster.registry import find, make_device
 from busmaster.transport.rfc2217 import Rfc2217Port
+from busmaster.transport.serial_port import SerialPort
 from tests.app.cli.conftest import Command, ended_once
+from tests.patience import PATIENCE
 
 HCP2 = ("--protocol", "hcp2", "--nodes", "1-3")
 
@@ -144,3 +159,239 @@ def test_a_port_that_is_not_there_is_an_error_of_the_line(busmaster: Command) ->
     done = busmaster("discover", "/dev/no-such-port", "--protocol", "dc104", "--yes")
     assert done.status == 1
     assert "does not exist" in done.err
+
+
+# what is tried
+
+
+@pytest.mark.parametrize("port", ["/dev/ttyS0", "socket://server:4001", "rfc2217://server:4001"])
+def test_each_protocol_that_is_named_is_tried_once(port: str) -> None:
+    _, tried = what_to_try(port, ["msc", "hcp2", "msc"], (3,))
+    settings = [(step.kind.name, step.settings) for step in tried]
+    assert {name for name, _ in settings} == {"msc", "hcp2"}
+    assert len(set(settings)) == len(settings)
+    assert {step.addresses for step in tried} == {(3,)}
+
+
+def test_all_protocols_are_tried_unless_some_are_named() -> None:
+    _, tried = what_to_try("/dev/ttyS0", [], None)
+    assert {"hcp2", "msc", "mentor", "modbus"} <= {step.kind.name for step in tried}
+
+
+@pytest.mark.parametrize(
+    ("options", "settings"),
+    [
+        ("baudrate=4800", {LineSettings(4800, framing[0], framing[1]) for framing in ((8, "N"), (8, "E"), (8, "O"))}),
+        ("baudrate=4800&bytesize=7", {LineSettings(4800, 7, "N")}),
+        ("baudrate=4800&parity=E", {LineSettings(4800, 8, "E")}),
+        ("baudrate=4800&stopbits=2", {LineSettings(4800, 8, "N", 2)}),
+    ],
+)
+def test_a_rate_of_the_port_is_the_only_one_and_so_is_a_framing_with_it(
+    options: str, settings: set[LineSettings]
+) -> None:
+    _, tried = what_to_try(f"/dev/ttyS0?{options}", ["modbus"], None)
+    assert {step.settings for step in tried if step.settings} == settings
+
+
+def plan(port: str, *tried: Step) -> None:
+    print_plan(Job(SerialPort(port, baudrate=9600), tried))
+
+
+def test_the_plan_counts_reads_settings_and_names_each_protocol(capfd: pytest.CaptureFixture[str]) -> None:
+    hcp2, msc = find("hcp2"), find("msc")
+    fast, slow = LineSettings(57600), LineSettings(9600)
+    plan("COM1", Step(fast, hcp2, (1,)))
+    plan("COM1", Step(fast, hcp2, (1, 2)), Step(slow, hcp2, (1, 2)), Step(slow, msc, (3,), (4,)))
+    one, longest, many, _, rest = capfd.readouterr().err.splitlines()
+    assert one == ("busmaster: COM1: listen for 3 s; then 1 read, at 57600 8N1, in Host Comms Protocol 2")
+    assert longest == "busmaster: at most 3 s if no node replies; nothing is written to any node"
+    assert many == (
+        "busmaster: COM1: listen for 3 s; then 5 reads, at 2 settings of the line, in Host Comms Protocol 2, "
+        f"{msc.profile.title}"
+    )
+    assert rest == "busmaster: if a node replies, the other addresses of its protocol are tried too"
+
+
+# the command, where a search has these results
+
+FOUND = Discovery(LineSettings(9600), found=[Found(find("hcp2"), 3, (0.002,), "element 1: 0", False)])
+
+
+@pytest.fixture
+def searched(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The searches that were begun, each a port and a recorder. One node is found."""
+    begun: list[Any] = []
+
+    def until_ended(_: object, job: Job, recorder: Recorder | None) -> Discovery:
+        begun.append((job.port, recorder))
+        return FOUND
+
+    monkeypatch.setattr(discover, "until_ended", until_ended)
+    return begun
+
+
+@pytest.mark.parametrize("agreed", [True, False])
+def test_a_user_at_a_terminal_is_asked_and_only_yes_begins_the_search(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, searched: list[Any], agreed: bool
+) -> None:
+    asked: list[tuple[str, bool]] = []
+
+    def confirm(question: str, err: bool = False) -> bool:
+        asked.append((question, err))
+        return agreed
+
+    monkeypatch.setattr(click, "confirm", confirm)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    done = busmaster("discover", "/dev/ttyS0", *HCP2)
+    assert asked == [("Send these reads, if no other master is active?", True)]
+    assert len(searched) == agreed
+    assert done.status == (0 if agreed else 1)
+    assert done.out.startswith("# What answered on /dev/ttyS0" if agreed else "")
+    assert ("busmaster: nothing was sent\n" in done.err) is not agreed
+
+
+def test_yes_asks_nothing_and_a_file_gets_the_result(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, searched: list[Any], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    path, capture = tmp_path / "line.toml", tmp_path / "line.pcapng"
+    given: list[dict[str, Any]] = []
+
+    def noted(file: str | None, **fields: Any) -> Any:
+        given.append(fields)
+        return capturing(file, **fields)
+
+    monkeypatch.setattr(discover, "capturing", noted)
+    monkeypatch.setattr(discover, "lasting", lambda port: replace(port, path="/dev/serial/by-id/adapter"))
+    done = busmaster("discover", "/dev/ttyS0?echo=1", *HCP2, "--yes", "-o", str(path), "--capture", str(capture))
+    assert (done.status, done.out) == (0, "")
+    assert done.err.endswith(f"busmaster: written to {path}: `busmaster run {path}` polls it\n")
+    assert [node.address for node in load(path).nodes.values()] == [3]
+    assert load(path).port.name == "/dev/serial/by-id/adapter"
+    [(_, recorder)] = searched
+    assert recorder.path == str(capture)
+    assert given == [{"port": "/dev/ttyS0", "protocol": "", "echo": True}]
+
+
+def test_a_file_that_appears_during_the_search_is_kept(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "line.toml"
+
+    def until_ended(*_: object) -> Discovery:
+        path.write_text("mine")
+        return FOUND
+
+    monkeypatch.setattr(discover, "until_ended", until_ended)
+    done = busmaster("discover", "/dev/ttyS0", *HCP2, "--yes", "-o", str(path))
+    assert (done.status, path.read_text()) == (1, "mine")
+    assert "File exists" in done.err
+
+
+class FakeSearch:
+    """A search with these results, which notes what it did."""
+
+    talk = ""
+    result = Discovery()
+    looked = False
+
+    def __init__(self, wire: object, port: object, report: object, progress: object, offered: Callable[[], Any]):
+        self.offered = offered
+
+    async def listen(self, tried: object) -> str:
+        return self.talk
+
+    async def look(self, tried: object) -> Discovery:
+        FakeSearch.looked = True
+        return self.result
+
+
+@asynccontextmanager
+async def nothing_opened(*_: object) -> AsyncIterator[None]:
+    yield None
+
+
+@pytest.mark.parametrize(
+    ("talk", "result", "told"),
+    [
+        ("a master polls in msc", FOUND, ["a master polls in msc; nothing was sent. `busmaster monitor` shows it; "]),
+        ("", Discovery(), ["no node replied; check power"]),
+        (
+            "",
+            Discovery(found=FOUND.found, not_asked={"msc": (9, 10), "hcp2": (0, 9)}),
+            ["not tried: msc 9-10", "not tried: hcp2 0, 9"],
+        ),
+    ],
+)
+def test_a_search_reports_another_master_silence_and_what_was_not_tried(
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    talk: str,
+    result: Discovery,
+    told: list[str],
+) -> None:
+    monkeypatch.setattr(discover, "opened", nothing_opened)
+    monkeypatch.setattr(discover, "Search", FakeSearch)
+    monkeypatch.setattr(FakeSearch, "talk", talk)
+    monkeypatch.setattr(FakeSearch, "result", result)
+    monkeypatch.setattr(FakeSearch, "looked", False)
+    job = Job(SerialPort("COM1", baudrate=9600), [Step(None, find("hcp2"), (1,))])
+    found = asyncio.run(discover.discover(job, None))
+    assert FakeSearch.looked is not bool(talk)
+    assert (found is not None) == (bool(result.found) and not talk)
+    said = capfd.readouterr().err.splitlines()
+    assert [line.startswith(f"busmaster: {text}") for line, text in zip(said, told, strict=True)] == [True] * len(told)
+
+
+# Enter
+
+
+def test_enter_stops_a_search_and_the_shell_does_not_get_the_line(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    master, slave = pty.openpty()
+
+    async def story() -> None:
+        loop = asyncio.get_running_loop()
+        async with EnterStops() as stops:
+            pressed, again = stops.offered(), stops.offered()
+            assert not pressed()
+            os.write(master, b"\n")
+            async with asyncio.timeout(PATIENCE):
+                while not pressed():  # noqa: ASYNC110  a callback of the loop makes it true
+                    await asyncio.sleep(0.001)
+            assert again()
+        assert not loop.remove_reader(slave), "it is not watched any more"
+        os.set_blocking(slave, False)
+        with pytest.raises(BlockingIOError):
+            os.read(slave, 1)
+
+    with open(slave, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        asyncio.run(story())
+    os.close(master)
+    assert capfd.readouterr().err == "busmaster: press Enter to stop and keep the nodes found so far\n"
+
+
+def test_without_a_terminal_nothing_is_offered(capfd: pytest.CaptureFixture[str]) -> None:
+    async def story() -> None:
+        async with EnterStops() as stops:
+            assert stops.offered()() is False
+
+    asyncio.run(story())
+    assert capfd.readouterr().err == ""
+
+
+def test_the_search_can_be_stopped_by_enter(monkeypatch: pytest.MonkeyPatch) -> None:
+    searches: list[FakeSearch] = []
+
+    class Kept(FakeSearch):
+        async def look(self, tried: object) -> Discovery:
+            searches.append(self)
+            return FOUND
+
+    monkeypatch.setattr(discover, "opened", nothing_opened)
+    monkeypatch.setattr(discover, "Search", Kept)
+    asyncio.run(discover.discover(Job(SerialPort("COM1", baudrate=9600), []), None))
+    assert isinstance(searches[0].offered.__self__, EnterStops)  # type: ignore[attr-defined]  # a bound method

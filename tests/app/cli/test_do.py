@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import pytest
 
-from busmaster.app.cli.do import RecordedNode
+from busmaster import Priority
+from busmaster.app.cli.do import RecordedNode, options_of
 from busmaster.app.cli.read import plain_lines
+from busmaster.app.service.authorisation import WriteRequest
 from busmaster.bus.bus import Bus
+from busmaster.bus.handle import Action
 from busmaster.bus.limits import Limit
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer
@@ -254,6 +260,137 @@ def test_each_write_of_an_action_is_checked_before_the_first_is_sent() -> None:
 
     on_a_bus(story, EmulatedMint(1))
     assert len(refused) == 1
+
+
+class Kept:
+    """A node that keeps what is requested of it, and with what options."""
+
+    label = "drive"
+    profile = Hcp2Controller.profile
+
+    def __init__(self) -> None:
+        self.given: list[tuple[Any, dict[str, Any]]] = []
+
+    def check(self, *commands: Any, stop: bool | None = None) -> None:
+        self.given.append((commands, {"stop": stop}))
+
+    async def request(self, command: Any, /, **options: Any) -> str:
+        self.given.append((command, options))
+        return "done"
+
+    @asynccontextmanager
+    async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Kept]:
+        self.given.append(("exclusive", {"max_hold": max_hold}))
+        yield self
+
+
+def recorded(node: Kept) -> tuple[RecordedNode, list[WriteRequest]]:
+    """The node as an action of a file has it, and the writes that were begun on it."""
+    begun: list[WriteRequest] = []
+
+    def begin(request: WriteRequest) -> nullcontext[None]:
+        begun.append(request)
+        return nullcontext()
+
+    line = SimpleNamespace(
+        authorisation=SimpleNamespace(begin=begin),
+        file=SimpleNamespace(nodes={"drive": SimpleNamespace(points=())}),
+    )
+    handle = SimpleNamespace(items=lambda: ())
+    return RecordedNode(node, line, "drive", handle, "busmaster do move"), begun  # type: ignore[arg-type]
+
+
+def test_a_node_of_a_file_sends_each_request_with_its_options_and_records_the_writes() -> None:
+    node = Kept()
+    ours, begun = recorded(node)
+    read: Any
+    write: Any
+    read, write, other = hcp2.Read(10), hcp2.Write(10, (5.0,)), hcp2.Write(11, (6.0,))
+
+    async def story() -> None:
+        assert await ours.request(read, stops_seen=3, priority=Priority.URGENT) == "done"
+        assert begun == []
+        assert await ours.request(write, touches=other, stops_seen=4, stop=True, priority=Priority.URGENT) == "done"
+        ours.check(write, stop=True)
+        async with ours.exclusive(max_hold=2.5) as held:
+            await held.request(other)
+
+    asyncio.run(story())
+    assert node.given == [
+        (read, {"stops_seen": 3, "priority": Priority.URGENT}),
+        (write, {"touches": other, "stops_seen": 4, "stop": True, "priority": Priority.URGENT}),
+        ((write,), {"stop": True}),
+        ("exclusive", {"max_hold": 2.5}),
+        (other, {"touches": None, "stops_seen": None, "stop": False}),
+    ]
+    assert [(one.interface, one.by, one.name, one.value) for one in begun] == [
+        ("command line", "busmaster do move", "drive/raw command", str(write)),
+        ("command line", "busmaster do move", "drive/raw command", str(other)),
+    ]
+
+
+MOVE = Action("move", run=None, check=None, numbers=("AXIS", "DISTANCE..."), time="within", least="at_least")  # type: ignore[arg-type]
+STOP = Action("stop", run=None, check=None, numbers=("AXIS",), time="timeout")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("action", "values", "times", "options"),
+    [
+        (MOVE, (1,), (None, None), {}),
+        (MOVE, (1, 2.5, -3), (4.0, None), {"within": 4.0}),
+        (MOVE, (1, 2), (4.0, 0.5), {"within": 4.0, "at_least": 0.5}),
+        (STOP, (1,), (2.0, None), {"timeout": 2.0}),
+    ],
+)
+def test_times_are_arguments_of_the_action_by_its_names(
+    action: Action, values: tuple[float, ...], times: tuple[float | None, float | None], options: dict[str, float]
+) -> None:
+    assert options_of(action, "move", values, *times) == options
+
+
+@pytest.mark.parametrize(
+    ("action", "values", "complaint"),
+    [
+        (MOVE, (), "0 numbers do not fit; write: move AXIS DISTANCE..."),
+        (STOP, (1, 2), "2 numbers do not fit; write: move AXIS"),
+        (STOP, (), "0 numbers do not fit; write: move AXIS"),
+    ],
+)
+def test_an_action_takes_as_many_numbers_as_it_names(action: Action, values: tuple[float, ...], complaint: str) -> None:
+    with pytest.raises(click.UsageError) as refused:
+        options_of(action, "move", values, None, None)
+    assert refused.value.message == complaint
+
+
+def test_a_misspelt_option_behind_a_number_is_not_a_number(busmaster: Command) -> None:
+    ran = busmaster("do", "2@PORT", "execute", "1", "--wihtin", "1", "--protocol", "hcp")
+    assert ran.status == 2
+    assert "no such option '--wihtin'" in ran.err
+
+
+def test_a_reply_in_json_has_the_node_by_the_name_of_the_file_and_the_names_of_bits(
+    busmaster: Command, file: Path, drive: TcpServer
+) -> None:
+    ran = busmaster("do", f"drive@{file}", "enable", "--json")
+    assert ran.status == 0
+    assert without_time(ran.out) == {
+        "node": "drive",
+        "action": "enable",
+        "ok": True,
+        "value": 192,
+        "names": ["HARDWARE_ENABLE", "ENABLED"],
+    }
+    assert audit(file) == [("busmaster do enable", "drive/command_word", 128, "written")]
+
+
+def test_numbers_that_cannot_be_sent_are_refused_before_the_port_is_opened(
+    busmaster: Command, file: Path, drive: TcpServer
+) -> None:
+    file.write_text(file.read_text().replace("microflex", "msc").replace("57600", "9600"))
+    drive.close()
+    ran = busmaster("do", f"drive@{file}", "set-flag", "256")
+    assert (ran.status, ran.out) == (2, "")
+    assert "256" in ran.err
 
 
 def test_each_value_of_a_run_is_printed_with_the_precision_of_its_point() -> None:

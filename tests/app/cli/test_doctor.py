@@ -20,12 +20,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import pytest
 import serial
 
+from busmaster.app.cli import doctor
 from busmaster.app.cli.arguments import Connection
 from busmaster.app.cli.doctor import patient_of
+from busmaster.app.cli.progress import Bar
 from busmaster.app.diagnostics import adapters, diagnosis, examination
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
@@ -42,6 +45,7 @@ from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import identity
+from busmaster.transport.serial_port import SerialPort
 from tests.app.cli.conftest import Command, without_time
 from tests.app.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged
@@ -657,3 +661,96 @@ def test_no_more_than_some_nodes_are_tried_at_each_of_the_other_settings() -> No
 @pytest.mark.parametrize(("nodes", "named"), [(None, False), ((), True), ((3, 4), True)])
 def test_nodes_are_named_only_if_the_user_has_named_them(nodes: tuple[int, ...] | None, named: bool) -> None:
     assert patient_of(Connection("/dev/ttyUSB0", "hcp2"), nodes).named is named
+
+
+# What the options are for
+
+
+def connection(*options: Any) -> Connection:
+    return Connection("/dev/ttyS0", *options)
+
+
+def test_rate_echo_and_window_of_the_options_are_those_of_the_examination() -> None:
+    plain = patient_of(connection("mentor"), (1,))
+    assert plain.endpoint == SerialPort("/dev/ttyS0", baudrate=9600, bytesize=7, parity="E")
+    assert (plain.timings, plain.addresses) == (None, (1,))
+    given = patient_of(connection("mentor", 4800, True, 0.25), None)
+    assert given.endpoint == SerialPort("/dev/ttyS0", baudrate=4800, bytesize=7, parity="E", echo=True)
+    assert given.timings == find("mentor").profile.timings.with_window(0.25)
+    assert given.addresses == tuple(find("mentor").profile.addresses)
+    assert plain.progress is given.progress is Bar
+
+
+def test_without_a_protocol_the_port_has_the_usual_settings_or_those_of_the_options() -> None:
+    plain, given = patient_of(connection(""), None), patient_of(connection("", 4800, True), None)
+    assert plain.endpoint == SerialPort("/dev/ttyS0", baudrate=9600)
+    assert given.endpoint == SerialPort("/dev/ttyS0", baudrate=4800, echo=True)
+    assert plain.progress is given.progress is Bar
+
+
+@pytest.fixture
+def patients(monkeypatch: pytest.MonkeyPatch) -> list[Patient]:
+    """The examinations that were begun. Each has three findings, two of which are not in order."""
+    begun: list[Patient] = []
+
+    def until_ended(_: object, patient: Patient, report: Callable[[Finding], None], recorder: object) -> None:
+        begun.append(patient)
+        for finding in (
+            Finding("open", True, "opened", "use another cable"),
+            Finding("echo", False, "an echo", "add --echo"),
+            Finding("silence", True, "silent"),
+            Finding("node 1", False, "no reply", "check the wires"),
+        ):
+            report(finding)
+
+    monkeypatch.setattr(doctor, "until_ended", until_ended)
+    return begun
+
+
+def test_every_option_of_the_doctor_reaches_its_examination(
+    busmaster: Command, patients: list[Patient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captured: list[dict[str, object]] = []
+
+    def noted(path: str | None, **fields: object) -> contextlib.AbstractContextManager[None]:
+        captured.append({"path": path, **fields})
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr(doctor, "capturing", noted)
+    options = ("--protocol", "mentor", "--nodes", "2,3", "--baud", "4800", "--echo", "--timeout", "250")
+    busmaster("doctor", "/dev/ttyS0", *options, "--capture", "line.pcapng")
+    busmaster("doctor", "/dev/ttyS0", "--baud", "4800", "--echo")
+    of_nodes, of_port = patients
+    assert of_nodes.endpoint == SerialPort("/dev/ttyS0", baudrate=4800, bytesize=7, parity="E", echo=True)
+    assert (of_nodes.addresses, of_nodes.named) == ((2, 3), True)
+    assert of_nodes.timings == find("mentor").profile.timings.with_window(0.25)
+    assert of_port.endpoint == SerialPort("/dev/ttyS0", baudrate=4800, echo=True)
+    assert captured == [
+        {"path": "line.pcapng", "port": "/dev/ttyS0", "protocol": "mentor", "echo": True},
+        {"path": None, "port": "/dev/ttyS0", "protocol": "", "echo": True},
+    ]
+
+
+@pytest.mark.usefixtures("patients")
+def test_each_finding_has_its_mark_and_advice_and_those_to_fix_are_counted(busmaster: Command) -> None:
+    done = busmaster("doctor", "/dev/ttyS0")
+    assert (done.status, done.err) == (1, "busmaster: /dev/ttyS0: 2 things to fix\n")
+    assert done.lines == [
+        "note  open        opened",
+        "                  -> use another cable",
+        "FAIL  echo        an echo",
+        "                  -> add --echo",
+        "ok    silence     silent",
+        "FAIL  node 1      no reply",
+        "                  -> check the wires",
+    ]
+
+
+@pytest.mark.usefixtures("patients")
+def test_findings_in_json_have_all_their_fields_and_the_time_of_day(busmaster: Command) -> None:
+    done = busmaster("doctor", "/dev/ttyS0", "--json")
+    assert done.status == 1
+    assert [without_time(line) for line in done.lines][1:3] == [
+        {"topic": "echo", "ok": False, "what": "an echo", "advice": "add --echo"},
+        {"topic": "silence", "ok": True, "what": "silent", "advice": ""},
+    ]

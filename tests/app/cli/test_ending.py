@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import os
 import signal
@@ -9,13 +10,16 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import anyio
+import click
 import pytest
 
+from busmaster.app.cli import ending as module
 from busmaster.app.cli import main
 from busmaster.app.cli.emulate import serve_for
-from busmaster.app.cli.ending import SIGNALS, Ending
+from busmaster.app.cli.ending import SIGNALS, Ending, until_ended
 from busmaster.emulator.serve import TcpServer
 from tests.app.cli.conftest import ENVIRONMENT, ROOT, Command, started
 from tests.patience import PATIENCE
@@ -59,6 +63,95 @@ def test_a_signal_outside_a_loop_unwinds_the_thread_once(ending: Ending) -> None
         os.kill(os.getpid(), signal.SIGINT)
     os.kill(os.getpid(), signal.SIGINT)
     assert ending.number == signal.SIGINT
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_each_signal_of_users_and_supervisors_unwinds_with_its_status(ending: Ending, number: signal.Signals) -> None:
+    raised = KeyboardInterrupt if number == signal.SIGINT else SystemExit
+    with pytest.raises(raised) as unwound:
+        os.kill(os.getpid(), number)
+    if isinstance(unwound.value, SystemExit):
+        assert unwound.value.code == 128 + number
+    assert {*SIGNALS} >= {signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU}
+
+
+def test_a_signal_that_comes_again_after_its_patience_ends_the_process_at_once(
+    ending: Ending, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended: list[int] = []
+    clock = [100.0]
+    monkeypatch.setattr(module, "os", SimpleNamespace(_exit=ended.append))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    with pytest.raises(SystemExit):
+        ending._heard(signal.SIGTERM, None)
+    clock[0] = 100.0 + ending.patience - 0.1
+    ending._heard(signal.SIGTERM, None)
+    assert ended == []
+    clock[0] = 100.0 + ending.patience
+    ending._heard(signal.SIGTERM, None)
+    assert ended == [143]
+
+
+def test_a_signal_that_is_ignored_at_the_start_stays_ignored() -> None:
+    before = signal.signal(signal.SIGQUIT, signal.SIG_IGN)
+    try:
+        with Ending():
+            assert signal.getsignal(signal.SIGQUIT) is signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) is not signal.SIG_IGN
+        assert signal.getsignal(signal.SIGQUIT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGQUIT, before)
+
+
+def test_a_process_that_shuts_down_after_a_signal_ignores_further_ones() -> None:
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    try:
+        with pytest.raises(KeyboardInterrupt), Ending():
+            os.kill(os.getpid(), signal.SIGINT)
+        assert {signal.getsignal(number) for number in SIGNALS} == {signal.SIG_IGN}
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_a_signal_before_the_loop_runs_ends_it_before_its_work(ending: Ending) -> None:
+    """As one that is received while the loop is made."""
+    worked: list[bool] = []
+
+    async def work() -> None:
+        worked.append(True)
+
+    def make() -> asyncio.AbstractEventLoop:
+        ending._heard(signal.SIGTERM, None)
+        return asyncio.new_event_loop()
+
+    with pytest.raises(SystemExit) as ended:
+        ending.run(work, loop_factory=make)
+    assert (ended.value.code, worked) == (143, [])
+
+
+def test_a_signal_after_the_loop_has_ended_unwinds_the_thread_again(ending: Ending) -> None:
+    async def work() -> None:
+        pass
+
+    ending.run(work)
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("with_ending", [True, False])
+def test_what_a_command_runs_gets_its_arguments_and_its_loop(with_ending: bool) -> None:
+    made: list[asyncio.AbstractEventLoop] = []
+
+    def make() -> asyncio.AbstractEventLoop:
+        made.append(asyncio.new_event_loop())
+        return made[-1]
+
+    async def work(*values: int) -> tuple[tuple[int, ...], bool]:
+        return values, asyncio.get_running_loop() is made[-1]
+
+    with Ending() as ending, click.Context(click.Command("c"), obj=ending if with_ending else None):
+        assert until_ended(work, 1, 2, 3, 4, loop_factory=make) == ((1, 2, 3, 4), True)
 
 
 def test_without_a_signal_the_result_comes_back_and_the_handlers_are_as_before() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from busmaster.app.cli import items
+from busmaster.ext import Bit, Item
 from busmaster.registry import find, kinds
 from tests.app.cli.conftest import Command
 
@@ -110,6 +111,56 @@ def test_a_protocol_that_documents_nothing_says_what_an_item_is(
     shown = busmaster("items", "dc104")
     assert (shown.status, shown.out) == (0, "")
     assert shown.err == "busmaster: dc104: its documents define no items; use a parameter, 1 to 255\n"
+
+
+MADE_UP = (
+    Item(
+        item="speed",
+        number="7",
+        unit="rpm",
+        access="read",
+        meaning="how quickly it turns",
+        bits=(
+            Bit(number=0, name="FAST", meaning="very much so", severity="warning"),
+            Bit(number=1, name="SLOW", meaning=""),
+        ),
+    ),
+    Item(item="torque", number="", meaning="how hard it pulls"),
+)
+"""With everything, and with next to nothing."""
+
+
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The documents of dc104 define these items."""
+    monkeypatch.setattr(items, "find", lambda name: replace(find(name), documented=MADE_UP))
+
+
+@pytest.mark.usefixtures("made_up")
+@pytest.mark.parametrize("word", ["SPEED", "7", "rpm", "read", "turns", "fast", "very MUCH", "warning", "slow"])
+def test_a_word_is_found_in_every_text_of_an_item_and_its_bits(busmaster: Command, word: str) -> None:
+    rows = [json.loads(line)["item"] for line in busmaster("items", "dc104", word, "--json").lines]
+    assert rows == ["speed"]
+
+
+@pytest.mark.usefixtures("made_up")
+def test_json_has_null_for_each_fact_that_is_not_defined(busmaster: Command) -> None:
+    speed, torque = (json.loads(line) for line in busmaster("items", "dc104", "--json").lines)
+    assert speed["bits"] == [
+        {"bit": 0, "name": "FAST", "meaning": "very much so", "severity": "warning"},
+        {"bit": 1, "name": "SLOW", "meaning": "", "severity": None},
+    ]
+    assert (torque["number"], torque["unit"], torque["access"], torque["keyword"]) == (None, None, None, None)
+
+
+@pytest.mark.usefixtures("made_up")
+@pytest.mark.parametrize("option", [(), ("--json",)])
+def test_words_that_no_item_has_are_wrong_usage_with_the_nearest_item_of_the_first(
+    busmaster: Command, option: tuple[str, ...]
+) -> None:
+    shown = busmaster("items", "dc104", "sped", "torqe", *option)
+    assert (shown.status, shown.out) == (2, "")
+    assert "dc104 has no item with 'sped torqe'; did you mean 'speed'?" in shown.err
 
 
 def test_the_help_of_items_says_where_more_is_said(busmaster: Command) -> None:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import random
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from busmaster.app.cli import late
+from busmaster.app.cli.late import advice, late_nodes
+from busmaster.app.cli.output import Level
+from busmaster.bus.node import Health
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty, serve_tcp
+from busmaster.errors import NoReply
+from busmaster.events import MaxReplyDelayRaised, NodeChanged, RepliesLate
 from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Command
 
@@ -69,6 +79,93 @@ def test_a_write_that_is_confirmed_late_says_what_to_try(busmaster: Command, slo
     assert (done.status, done.out) == (0, "1 ok\n")
     assert "node 2: late reply, 1" in done.err
     assert "; try --timeout 2" in done.err
+
+
+@dataclass
+class Late:
+    """A bus with these events, after which it is silent."""
+
+    happened: Sequence[object]
+
+    async def events(self) -> AsyncIterator[object]:
+        for event in self.happened:
+            yield event
+        await asyncio.Event().wait()
+
+
+def node(address: int) -> Any:
+    return SimpleNamespace(address=address, label=f"node {address}")
+
+
+def test_the_advice_is_a_window_half_as_long_again_in_steps_of_50_ms() -> None:
+    assert advice(0.13) == "late reply, 130 ms after the request; try --timeout 200"
+    assert advice(0.19) == "late reply, 190 ms after the request; try --timeout 300"
+    assert advice(0.21, in_file=True) == (
+        "late reply, 210 ms after the request; set timing = { window = 0.35 } in its section of the file"
+    )
+
+
+def test_each_node_that_is_late_has_its_advice_once_with_the_latest_reply(monkeypatch: pytest.MonkeyPatch) -> None:
+    notes: list[tuple[str, Level]] = []
+    monkeypatch.setattr(late, "note", lambda text, level=Level.INFO: notes.append((text, level)))
+    happened = [
+        RepliesLate(node(1), 0.11, 0.1),
+        NodeChanged(node(9), Health.UP, Health.UNKNOWN, False),
+        MaxReplyDelayRaised(node(2), 0.21, 0.21),
+        RepliesLate(node(1), 0.13, 0.1),
+    ]
+
+    async def story() -> None:
+        async with late_nodes(Late(happened), in_file=True) as found:  # type: ignore[arg-type]
+            await asyncio.sleep(0)
+            first = len(asyncio.all_tasks())
+            found.print_advice()
+            found.print_advice()
+            assert len(notes) == 2, "once for each"
+        for _ in range(3):
+            await asyncio.sleep(0)
+        assert len(asyncio.all_tasks()) == first - 1, "it does not listen any more"
+
+    asyncio.run(story())
+    in_file = "in its section of the file"
+    assert notes == [
+        (f"node 1: late reply, 130 ms after the request; set timing = {{ window = 0.2 }} {in_file}", Level.WARNING),
+        (f"node 2: late reply, 210 ms after the request; set timing = {{ window = 0.35 }} {in_file}", Level.WARNING),
+    ]
+
+
+def test_an_error_is_explained_by_the_reply_that_comes_after_it_and_reported_only_there(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    async def story() -> None:
+        bus = Late([RepliesLate(node(1), 0.2, 0.1)])
+        async with late_nodes(bus) as found:  # type: ignore[arg-type]
+            error, other, nameless = NoReply("no reply"), NoReply("no reply"), NoReply("no reply")
+            error.address, other.address = 1, 2
+            for one in (error, other, nameless):
+                await found.explain(one, 0.001)
+            assert error.hint == advice(0.2)
+            assert other.hint == nameless.hint == NoReply.hint
+
+    asyncio.run(story())
+    assert capfd.readouterr().err == ""
+
+
+def test_events_of_the_last_moment_are_reported(capfd: pytest.CaptureFixture[str]) -> None:
+    async def story() -> None:
+        came = asyncio.Event()
+
+        class Quiet:
+            async def events(self) -> AsyncIterator[object]:
+                await came.wait()
+                yield RepliesLate(node(1), 0.2, 0.1)
+                await asyncio.Event().wait()
+
+        async with late_nodes(Quiet()):  # type: ignore[arg-type]
+            came.set()
+
+    asyncio.run(story())
+    assert capfd.readouterr().err.startswith("busmaster: node 1: late reply, 200 ms")
 
 
 @pytest.mark.slow

@@ -46,6 +46,14 @@ def test_with_write_the_file_is_changed_keeps_its_mode_and_is_right(busmaster: C
     assert os.listdir(path.parent) == [path.name]
 
 
+def test_only_the_lines_that_change_are_counted(busmaster: Command, path: Path) -> None:
+    text = OLD.partition("[nodes.winder]")[2]
+    path.write_text(f"{OLD}[nodes.other]{text.replace('address = 5', 'address = 6')}")
+    wrote = busmaster("migrate", str(path), "--write")
+    assert (wrote.status, wrote.out) == (0, f"{path}: 2 lines changed\n")
+    assert path.read_text().count("max_reply_delay = 0.3") == 2
+
+
 @pytest.mark.parametrize("text", ["[nodes", "\xff"])
 def test_what_is_no_toml_is_an_error_with_its_line(busmaster: Command, path: Path, text: str) -> None:
     path.write_bytes(text.encode("latin-1"))

@@ -18,7 +18,9 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import NameOID
 from opcua import ua
 
+from busmaster.app.interfaces import opcua
 from busmaster.app.interfaces.opcua import read_trusted
+from busmaster.app.interfaces.opcua_access import Rules
 from busmaster.emulator.serve import TcpServer
 from tests.app.cli.conftest import Command, busmaster, owner, serve, started
 from tests.app.interfaces.opcua_client import other_client
@@ -169,3 +171,73 @@ def test_what_would_open_more_than_is_meant_is_wrong_usage(
     ran = busmaster("opcua", "slitter", *arguments)
     assert ran.status == 2
     assert complaint in ran.err
+
+
+LINE = ("opcua", "unix:/nobody")
+
+
+class Served:
+    """What the last command served, and where."""
+
+    def __init__(self) -> None:
+        self.line: Any = None
+        self.rules = Rules()
+        self.listen = ("", 0)
+        self.certificate: tuple[str, str] | None = None
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> Served:
+    """Nothing is served."""
+    last = Served()
+
+    async def serve(
+        line: Any, rules: Rules, listen: tuple[str, int], opened: Any, report: Any, certificate: tuple[str, str] | None
+    ) -> None:
+        last.line, last.rules, last.listen, last.certificate = line, rules, listen, certificate
+        opened("opc.tcp://127.0.0.1:4840/")
+
+    monkeypatch.setattr(opcua, "serve", serve)
+    return last
+
+
+def test_by_default_points_are_only_read_by_programs_of_this_machine(busmaster: Command, served: Served) -> None:
+    ran = busmaster(*LINE)
+    assert (ran.status, ran.err) == (0, "busmaster: serving OPC UA at opc.tcp://127.0.0.1:4840/\n")
+    assert (served.listen, served.rules, served.certificate) == (("127.0.0.1", 4840), Rules(), None)
+    assert served.line.read_only is False
+    assert busmaster(*LINE, "--read-only").status == 0
+    assert served.line.read_only is True
+
+
+def test_each_option_reaches_the_rules_and_the_server(busmaster: Command, served: Served, tmp_path: Path) -> None:
+    tokens, trusted = tmp_path / "tokens", tmp_path / "trusted"
+    tokens.write_text(f"scada {TOKEN}\nhmi {TOKEN[::-1]}\n")
+    tokens.chmod(0o600)
+    own, key = certificate(trusted, "client")
+    options = (
+        *("--allow", "winder/*", "--allow", "oven/set", "--token-file", str(tokens), "--bind", "0.0.0.0:4841"),
+        *("--certificate", own, "--key", key, "--trusted", str(trusted)),
+    )
+    assert busmaster(*LINE, *options).status == 0
+    assert (served.listen, served.certificate) == (("0.0.0.0", 4841), (own, key))
+    assert served.rules.allow == ("winder/*", "oven/set")
+    assert set(served.rules.secrets) == {"scada", "hmi"}
+    assert served.rules.trusted == read_trusted(str(trusted))
+    assert (served.rules.is_signed, served.rules.is_local) == (True, False)
+
+
+def test_a_key_without_a_certificate_is_wrong_usage(busmaster: Command, served: Served) -> None:
+    ran = busmaster(*LINE, "--key", __file__)
+    assert (ran.status, served.line) == (2, None)
+    assert "--certificate and --key need each other; give both" in ran.err
+
+
+@pytest.mark.parametrize("missing", ["asyncua", "msgspec", "websockets"])
+def test_a_missing_library_is_named_with_its_extra(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    monkeypatch.setattr("busmaster.app.cli.opcua.find_spec", lambda name: None if name == missing else object())
+    ran = busmaster(*LINE)
+    assert ran.status == 2
+    assert "pip install 'busmaster[opcua]'" in ran.err

@@ -1,0 +1,109 @@
+"""The view of a line that this process owns: how its end is understood, and the terminal given back."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from typing import Any
+
+import anyio
+import pytest
+
+from busmaster.app.cli import drawing
+from busmaster.app.cli.drawing import LEAVE_SCREEN, draw, end_view, restore_terminal, terminal_state
+
+
+class Process:
+    """A view that ends with this status, when it is waited for or terminated."""
+
+    def __init__(self, status: int, *, deaf: bool = False) -> None:
+        self.status, self.deaf = status, deaf
+        self.returncode: int | None = None
+        self.done: list[str] = []
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.deaf and "kill" not in self.done:
+            raise subprocess.TimeoutExpired("top", timeout or 0.0)
+        self.returncode = self.status
+        return self.status
+
+    def terminate(self) -> None:
+        self.done.append("terminate")
+
+    def kill(self) -> None:
+        self.done.append("kill")
+
+
+@pytest.mark.parametrize(
+    ("status", "result", "restored"),
+    [(0, 0, False), (130, 130, False), (1, 1, False), (2, 1, False), (-signal.SIGKILL, 1, True)],
+)
+def test_only_a_person_ends_it_well_and_a_view_that_was_killed_does_not_keep_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, status: int, result: int, restored: bool
+) -> None:
+    commands: list[list[str]] = []
+    given_back: list[object] = []
+
+    def start(command: list[str]) -> Process:
+        commands.append(command)
+        return Process(status)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(drawing, "terminal_state", lambda: ["as before"])
+    monkeypatch.setattr(drawing, "restore_terminal", given_back.append)
+    assert anyio.run(draw, "unix:/a") == result
+    assert given_back == [["as before"]] * restored
+    assert commands == [[sys.executable, "-m", "busmaster", "top", "unix:/a", "--of-owner"]]
+
+
+def test_a_view_that_does_not_end_is_killed() -> None:
+    prompt, deaf = Process(0), Process(-9, deaf=True)
+    end_view(prompt)  # type: ignore[arg-type]
+    end_view(deaf)  # type: ignore[arg-type]
+    assert prompt.done == ["terminate"]
+    assert deaf.done == ["terminate", "kill"]
+    assert deaf.returncode == -9
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, Any]]:
+    """A pseudo-terminal as standard input: its other end, and its file."""
+    master, slave = pty.openpty()
+    with open(slave, "r+b", buffering=0) as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        yield master, file
+    os.close(master)
+
+
+def test_a_terminal_gets_its_settings_and_its_page_back(
+    terminal: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master, file = terminal
+    monkeypatch.setattr(sys, "stdout", file)  # not in the fixture: pytest sets it again before the test
+    before = terminal_state()
+    assert before is not None
+    changed = termios.tcgetattr(file.fileno())
+    changed[3] &= ~(termios.ECHO | termios.ICANON | termios.ISIG)
+    termios.tcsetattr(file.fileno(), termios.TCSANOW, changed)
+    restore_terminal(before)
+    assert termios.tcgetattr(file.fileno()) == before
+    os.set_blocking(master, False)
+    assert os.read(master, 1000) == LEAVE_SCREEN
+
+
+def test_without_a_terminal_there_is_no_state_and_nothing_to_give_back(
+    terminal: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = terminal_state()
+    with open(os.devnull, "r+b", buffering=0) as nowhere:
+        monkeypatch.setattr(sys, "stdin", nowhere)
+        monkeypatch.setattr(sys, "stdout", nowhere)
+        assert terminal_state() is None
+        restore_terminal(before)  # it is gone meanwhile: no error
+        restore_terminal(None)
+    assert terminal_state() is None, "a stream that is closed"
