@@ -100,7 +100,8 @@ class Refusals:
     def note_login(self, interface: str, peer: str, count: int = 1) -> None:
         """Count failed logins of a peer, and report them."""
         self.logins[interface] += count
-        self._report(interface, lambda counts: failed_text(interface, counts)).note(peer, count)
+        # The key is not the name alone: an interface can have the name TOO_FAST.
+        self._report(f"{interface} logins", lambda counts: failed_text(interface, counts)).note(peer, count)
 
     def begin(self, interface: str, kind: str) -> None:
         """Count a kind of refusals of an interface from 0 on, if it is not counted yet."""

@@ -185,6 +185,7 @@ class Service:
         ext.line_of(self.bus).on_groups.remove(self._note_groups)
         if self._groups_timer is not None:
             self._groups_timer.cancel()
+            self._groups_timer = None  # or no list would be sent any more if the bus is served again
         self.authorisation.on_access.remove(self._notify_access)
         self.authorisation.refusals.on_report.remove(self._report)
         await self.line.safe_writes.close()

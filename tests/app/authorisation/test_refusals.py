@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 
 import pytest
 
 from busmaster import bounds
-from busmaster.app.service.refusals import Logins, Refusals, failed_text, is_interface_name, pause_after, peer_of
+from busmaster.app.service.refusals import (
+    Logins,
+    Refusals,
+    failed_text,
+    is_interface_name,
+    pause_after,
+    peer_of,
+    wait_text,
+)
+from busmaster.testing import run_in_virtual_time
 
 HERE, ELSEWHERE = "10.0.0.1", "10.0.0.2"
 
@@ -123,6 +133,67 @@ def test_refusals_of_an_interface_are_counted_under_the_name_that_it_reports() -
     refusals.at_interfaces["interface3", "connections"] = 2
     refusals.at_interfaces["interface4", "requests"] = 4
     assert (refusals.total("connections"), refusals.total("requests")) == (7, 4)
+
+
+def test_names_of_interfaces_are_bounded_for_refusals_that_were_not_begun_too_and_a_count_is_kept() -> None:
+    async def run() -> None:
+        refusals = Refusals()
+        for number in range(20):
+            refusals.note(f"interface{number}", "logins", HERE)
+            refusals.note(f"interface{number}", "requests", HERE, 2)
+            refusals.begin(f"interface{number}", "logins")  # it restarts, and its refusals stay counted
+            refusals.begin(f"interface{number}", "requests")
+        assert len(refusals.logins) == 17  # of the service, of 15 interfaces, and of others
+        assert (refusals.logins["interface0"], refusals.logins["others"]) == (1, 5)
+        assert refusals.at_interfaces["interface0", "requests"] == 2
+        assert refusals.at_interfaces["others", "requests"] == 10
+        assert (refusals.total("requests"), refusals.total("connections")) == (40, 0)
+
+    run_in_virtual_time(run())
+
+
+def test_each_kind_of_refusal_has_a_report_of_its_own_with_its_peers() -> None:
+    async def run() -> None:
+        first, second = list[str](), list[str]()
+        refusals = Refusals()
+        refusals.on_report.extend([first.append, second.append])
+        for role in ("read", "write", "read", "read"):
+            refusals.note_connection(role)
+        for peer in ("user 1001", "192.0.2.1", "192.0.2.1"):
+            refusals.note_rate(peer)
+        refusals.note("web", "requests", HERE, 3)
+        refusals.note("web", "requests", HERE, 2)
+        refusals.note("web", "requests", ELSEWHERE)
+        refusals.note("web", "connections", HERE)
+        refusals.note("web", "logins", HERE, 2)
+        refusals.note("unknown", "logins", HERE)
+        places, again = "because no place was free", "because the program connects again and again"
+        status = "`busmaster status` shows how many programs use the line"
+        at_once = [
+            f"1 connection was refused, {places}: 1 of role read. {status}",
+            f"1 connection was refused, {again}: 1 from user 1001",
+            f"3 requests were refused at web: 3 from {HERE}",
+            f"1 connection was refused at web: 1 from {HERE}",
+            f"2 failed logins at web: 2 from {HERE}",
+            f"1 failed login at unknown: 1 from {HERE}",
+        ]
+        assert first == at_once
+        await asyncio.sleep(61)
+        assert sorted(first[len(at_once) :]) == [  # all are due at the same time
+            f"2 connections were refused, {again}: 2 from 192.0.2.1",
+            f"3 connections were refused, {places}: 2 of role read, 1 of role write. {status}",
+            f"3 requests were refused at web: 2 from {HERE}, 1 from {ELSEWHERE}",
+        ]
+        assert second == first
+        assert refusals.connections == {"read": 3, "write": 1, "unknown": 3}
+        assert refusals.logins == {"service": 0, "web": 2, "unknown": 1}
+
+    run_in_virtual_time(run())
+
+
+def test_a_peer_waits_for_a_second_at_least_by_its_text() -> None:
+    assert wait_text(0.2).endswith("try again in 1 s")
+    assert wait_text(29.6).endswith("try again in 30 s")
 
 
 @pytest.mark.parametrize(

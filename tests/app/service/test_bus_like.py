@@ -156,6 +156,19 @@ def test_the_list_of_groups_is_sent_once_in_a_while_however_often_it_changes(
     on_a_served_line(tmp_path, story)
 
 
+def test_a_service_that_ended_before_the_list_of_groups_was_sent_sends_it_when_it_serves_again(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        point = Hcp2Controller(line.bus, 5).point("1")
+        line.bus.poll_group("first", period=60, points=[point])
+        await line.service.__aexit__(None, None, None)
+        await line.service.__aenter__()
+        async with connect(line.address) as remote:
+            line.bus.poll_group("second", period=60, points=[point])
+            await until(lambda: [group.name for group in remote.groups] == ["first", "second"])
+
+    on_a_line(tmp_path, story)
+
+
 async def first(group: RemoteGroup) -> object:
     return await anext(aiter(group))
 

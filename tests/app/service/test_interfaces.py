@@ -27,6 +27,7 @@ from busmaster.app.service.tcp import listening_error
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, LineDown
 from tests.app.service.lines import Raw, Served, served, until
+from tests.app.service.test_bad_clients import UPGRADE
 from tests.patience import PATIENCE
 
 LOOPBACK = ("127.0.0.1", 0)
@@ -107,6 +108,18 @@ def test_who_may_write_a_part_of_a_node_stops_it_with_a_write_that_is_let_throug
     on_a_port(tmp_path, story)
 
 
+def test_a_program_stops_no_node_of_which_it_may_write_nothing(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as remote:
+            controller, own = Hcp2Controller(remote, 6), Hcp2Controller(line.bus, 6).node
+            await controller.read(1)
+            controller.node.note_stop()
+            await remote.statistics()
+            assert own.stops == 0
+
+    on_a_port(tmp_path, story)
+
+
 def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("busmaster.app.service.refusals.FREE_LOGINS", 9)  # it is not slowed down yet
 
@@ -122,6 +135,17 @@ def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path, monke
         assert await refused(address, additional_headers=several) == 401
         assert line.service.clients == ()
         assert line.service.refused == 9
+
+    on_a_port(tmp_path, story)
+
+
+def test_a_token_of_bytes_that_are_no_text_is_refused_as_any_other(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        host, port = address.removeprefix("tcp://").split(":")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(UPGRADE.replace(b"Upgrade: ", b"Authorization: Bearer \xff\xfe\r\nUpgrade: ", 1))
+        assert (await reader.readline()).startswith(b"HTTP/1.1 401")
+        writer.close()
 
     on_a_port(tmp_path, story)
 

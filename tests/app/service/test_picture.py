@@ -6,7 +6,7 @@ from itertools import permutations
 
 import pytest
 
-from busmaster.app.service.picture import Picture
+from busmaster.app.service.picture import Picture, matching
 from tests.app.service.pictures import FRAME, GROUP, node, row, tell
 
 
@@ -67,3 +67,125 @@ def test_what_a_later_owner_says_besides_is_passed_over() -> None:
     picture = tell(Picture(), row(1, colour="red"), nodes=(node(1, mood="calm"),), weather="fine")
     picture.receive("forecast", {"set": 9})
     assert [one.name for one in picture.rows] == ["node 1 outputs"]
+
+
+def test_a_point_that_stays_keeps_what_is_known_of_it_until_its_new_value_arrives() -> None:
+    picture = tell(Picture(), row(1, value=5, asked=1.0), row(2, value=6, asked=1.0, alarm="high"))
+    held = [
+        row(1, value=None, asked=2.0, error="no reply", quality="bad")[1],
+        row(2, value=6, asked=2.0, alarm="high")[1],
+    ]
+    picture.receive("values", {"set": 1, "first": 0, "values": held})
+    [first, second] = [row(1)[0], row(2)[0]]
+    picture.receive("rows", {"set": 2, "first": 0, "rows": [second, first]})
+    picture.receive("values", {"set": 2, "first": 0, "values": [None, None]})
+    known = [(one.name, one.value, one.quality, one.asked, one.error, one.alarm) for one in picture.rows]
+    assert known == [
+        ("node 2 outputs", 6, "good", 2.0, "", "high"),
+        ("node 1 outputs", 5, "bad", 1.0, "no reply", ""),
+    ]
+
+
+@pytest.mark.parametrize("other", [{"address": 3}, {"protocol": "msc"}])
+def test_a_point_of_the_same_name_at_another_node_begins_anew(other: dict[str, object]) -> None:
+    picture = tell(Picture(), row(1, value=5, asked=1.0))
+    point, _ = row(1, **other)
+    picture.receive("rows", {"set": 2, "first": 0, "rows": [point]})
+    assert [(one.value, len(one.past)) for one in picture.rows] == [(None, 0)]
+
+
+def test_a_cycle_with_the_same_value_is_one_more_in_the_past_and_texts_and_errors_are_gaps() -> None:
+    picture = tell(Picture(), row(value=5, asked=1.0))
+    for asked, value, error in ((2.0, 5, ""), (3.0, "on", ""), (4.0, 7, "no reply"), (5.0, 6.5, "")):
+        _, held = row(value=value, asked=asked, error=error)
+        picture.receive("values", {"set": 1, "first": 0, "values": [held]})
+    assert list(picture.rows[0].past) == [(1.0, 5), (2.0, 5), (3.0, None), (4.0, None), (5.0, 6.5)]
+
+
+def test_an_alarm_and_an_error_that_are_over_are_not_shown_any_more() -> None:
+    picture = tell(Picture(), row(asked=1.0, alarm="high"))
+    assert picture.rows[0].alarm == "high"
+    picture.receive("values", {"set": 1, "first": 0, "values": [row(asked=2.0, error="no reply", quality="bad")[1]]})
+    assert (picture.rows[0].alarm, picture.rows[0].error, picture.rows[0].quality) == ("", "no reply", "bad")
+    picture.receive("values", {"set": 1, "first": 0, "values": [row(asked=3.0)[1]]})
+    assert (picture.rows[0].error, picture.rows[0].quality) == ("", "good")
+
+
+def test_parts_that_arrive_in_another_order_are_shown_in_the_order_of_the_line() -> None:
+    picture = Picture()
+    for first in (2, 0):
+        points = [row(first + number)[0] for number in (1, 2)]
+        picture.receive("rows", {"set": 1, "first": first, "rows": points})
+        picture.receive("groups", {"first": first, "groups": [{**GROUP, "name": f"group {first + n}"} for n in (1, 2)]})
+        picture.receive("nodes", {"first": first, "nodes": [node(first + number) for number in (1, 2)]})
+    assert (picture.groups, picture.nodes) == ([], {}), "without a frame their number is not known"
+    picture.receive("frame", {**FRAME, "groups": 4, "nodes": 4, "points": 4})
+    assert [one.address for one in picture.rows] == [1, 2, 3, 4]
+    assert [group.name for group in picture.groups] == ["group 1", "group 2", "group 3", "group 4"]
+    assert [address for _, address in picture.nodes] == [1, 2, 3, 4]
+
+
+def test_points_of_one_name_are_told_apart_though_they_are_in_different_parts() -> None:
+    picture = Picture()
+    for number, asked in ((1, 1.0), (2, 2.0)):
+        for first, value in ((0, 5), (1, 6)):
+            point, held = row(value=value, asked=asked)
+            picture.receive("rows", {"set": number, "first": first, "rows": [point]})
+            picture.receive("values", {"set": number, "first": first, "values": [held]})
+    assert [[value for _, value in one.past] for one in picture.rows] == [[5, 5], [6, 6]]
+
+
+def test_a_write_makes_all_values_of_its_place_stale_that_were_requested_before_it() -> None:
+    picture = tell(
+        Picture(),
+        row(1, asked=1.0),
+        row(1, "axis0.position", asked=1.0, quality="late"),
+        row(1, "other", asked=3.0),
+        row(1, "gone", asked=1.0, quality="bad", error="no reply"),
+        row(2, asked=1.0),
+    )
+    picture.receive("touched", {"protocol": "hcp2", "address": 1, "when": 2.0, "items": None, "all": False})
+    expected = ["stale", "stale", "good", "bad", "good"]
+    assert [one.quality for one in picture.rows] == expected
+    tell(picture, row(1, asked=1.5), row(1, "axis0.position", asked=2.5))
+    assert [one.quality for one in picture.rows] == ["stale", "good"], "the first was read before the write"
+
+
+def test_when_the_owner_is_gone_no_value_is_good_and_no_node_is_up() -> None:
+    picture = tell(Picture(), row(1, value=5), row(2, value=6), since=1000.0)
+    picture.receive("nodes", {"first": 2, "nodes": [node(3)]})
+    picture.receive("frame", {**FRAME, "groups": 1, "nodes": 3, "points": 2, "since": 1000.0})
+    picture.lose("the owner has ended")
+    assert [(one.value, one.quality, one.error) for one in picture.rows] == [
+        (5, "bad", "the owner has ended"),
+        (6, "bad", "the owner has ended"),
+    ]
+    assert [one.health for one in picture.nodes.values()] == ["offline"] * 3
+    assert picture.frame is not None
+    assert (picture.frame.state, picture.frame.why, picture.frame.since) == ("offline", "the owner has ended", None)
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("", [1, 2, 9]),
+        ("NODE position", [1, 2, 9]),
+        ("Winder", [2]),
+        ("2/axis0", [2]),
+        ("slow", [9]),
+        ("kn", [1]),
+        ("suspect", [2]),
+        ("no REPLY", [9]),
+        ("up position", [1]),
+        ("winder slow", []),
+    ],
+)
+def test_rows_are_found_by_words_of_all_that_is_shown_of_them(words: str, found: list[int]) -> None:
+    winder, held = row(2, "axis0.position")
+    rows = (
+        row(1, "axis0.Position", unit="kN"),
+        (winder | {"node": "node Winder"}, held),
+        row(9, "axis0.position", group="slow", error="No reply", quality="bad"),
+    )
+    picture = tell(Picture(), *rows, nodes=(node(1), node(2, "suspect"), node(9, "down")))
+    assert [one.address for one in matching(picture.rows, picture.nodes, words)] == found
