@@ -14,7 +14,8 @@ from dataclasses import replace
 import pytest
 
 from busmaster.app.service.authorisation import FRESH, Authorisation, WriteRequest, outcome_of
-from busmaster.app.service.record import Outcome, WriteRecord
+from busmaster.app.service.record import LONGEST_SHOWN, Outcome, WriteRecord, cut, this_user
+from busmaster.app.service.values import write_fields
 from busmaster.bounds import MOST_AT_ONCE
 from busmaster.bus.bus import Bus
 from busmaster.contract.timing import ReplyTiming, Timings
@@ -323,3 +324,79 @@ def test_a_user_without_a_name_is_on_record_by_number(monkeypatch: pytest.Monkey
         assert (records[0].user, records[0].process) == ("12345", os.getpid())
 
     at_the_authorisation(story)
+
+
+ENTRY = WriteRecord(
+    time=1_700_000_000.1234567,
+    interface="mqtt",
+    by="a topic",
+    user="op",
+    process=17,
+    point="winder/speed",
+    before=0.0,
+    value=12.5,
+    outcome=Outcome.UNCONFIRMED,
+    error="no reply",
+    took=0.01449,
+    id="job 7",
+)
+
+
+@pytest.mark.parametrize(
+    ("entry", "text"),
+    [
+        (
+            ENTRY,
+            "winder/speed = 12.5 (before: 0.0) unconfirmed in 0.014 s by mqtt a topic [job 7], op 17: no reply",
+        ),
+        (
+            ENTRY._replace(before=None, value="on", outcome=Outcome.WRITTEN, error="", took=1.0, id=""),
+            "winder/speed = 'on' written in 1.000 s by mqtt a topic, op 17",
+        ),
+    ],
+)
+def test_an_entry_is_one_line_of_what_is_known_of_the_write(entry: WriteRecord, text: str) -> None:
+    assert entry.text == text
+
+
+def test_only_a_write_that_was_confirmed_is_ok() -> None:
+    assert [outcome for outcome in Outcome if ENTRY._replace(outcome=outcome).ok] == [Outcome.WRITTEN]
+
+
+def test_an_entry_as_json_has_null_for_what_there_is_not() -> None:
+    entry = {
+        "time": 1_700_000_000.123457,
+        "interface": "mqtt",
+        "by": "a topic",
+        "user": "op",
+        "process": 17,
+        "point": "winder/speed",
+        "before": 0,
+        "value": 12.5,
+        "outcome": "unconfirmed",
+        "error": "no reply",
+        "took": 0.01449,
+        "id": "job 7",
+    }
+    assert write_fields(ENTRY) == entry
+    assert write_fields(ENTRY._replace(error="", id="", before=None, value=frozenset({5, 1}))) == {
+        **entry,
+        "error": None,
+        "id": None,
+        "before": None,
+        "value": [1, 5],
+    }
+
+
+def test_a_long_text_is_cut_and_its_length_is_kept() -> None:
+    assert cut("x" * LONGEST_SHOWN) == "x" * LONGEST_SHOWN
+    assert cut("x" * LONGEST_SHOWN + "y") == "x" * LONGEST_SHOWN + "... (201 characters)"
+
+
+@pytest.mark.parametrize("error", [KeyError("uid not found"), OSError("No username set in the environment")])
+def test_a_user_without_a_name_is_a_number(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def getuser() -> str:
+        raise error
+
+    monkeypatch.setattr(getpass, "getuser", getuser)
+    assert this_user() == str(os.getuid())

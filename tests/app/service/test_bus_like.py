@@ -25,11 +25,19 @@ from busmaster import (
     connect,
 )
 from busmaster.app.service import service
+from busmaster.app.service.client_messages import PlannedGroupForm, PlannedRead, PlanParams
+from busmaster.app.service.fields import ReplyTimesForm
+from busmaster.app.service.messages import decode_request_params, decode_result, encode
+from busmaster.app.service.plans import encode_groups, encode_plan, groups_of, plan_of
 from busmaster.app.service.remote_group import RemoteGroup
-from busmaster.bounds import MOST_PLANNED_READS
+from busmaster.app.service.reply_times import encode_timings
+from busmaster.app.service.typed import Raw
+from busmaster.bounds import LONGEST_PERIOD, MOST_PLANNED_READS, SHORTEST_PERIOD
 from busmaster.bus.bus_like import GroupLike
 from busmaster.planning import PlannedGroup, PlannedNode
 from busmaster.protocols.hcp2.codec import Write
+from busmaster.protocols.modbus.codec import PROFILE as MODBUS
+from busmaster.protocols.modbus.codec import ReadRegisters
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, raw, until
 
 
@@ -254,6 +262,46 @@ def test_a_plan_of_a_remote_bus_is_that_of_its_owner(tmp_path: Path) -> None:
     on_a_served_line(tmp_path, story)
 
 
+def test_a_planned_group_arrives_at_the_owner_as_it_was_given(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        profile, command = Hcp2Controller.profile, Hcp2Controller(line.bus, 5).point("1").command
+        absent = PlannedNode(profile, ABSENT, PATIENT, reply_time=0.1)
+        merged = PlannedNode(MODBUS.with_default_merge(), 14)
+        groups = [
+            PlannedGroup("m" * 80, LONGEST_PERIOD, [(absent, command)], 0.01, Priority.BACKGROUND),
+            PlannedGroup("short", SHORTEST_PERIOD, [(merged, MODBUS.probe)]),
+        ]
+        params = PlanParams(encode_groups(groups))
+        sent = decode_request_params("plan", Raw(encode(params)))
+        assert groups_of(sent.groups, line.bus) == groups
+        known = PlannedGroup("known", 1.0, [(PlannedNode(profile, 5, PATIENT, reply_time=0.1), command)])
+        [received] = groups_of(encode_groups([known]), line.bus)
+        assert received.reads == [(Node.of(Hcp2Controller(line.bus, 5)).planned(), command)], (
+            "as the line has measured it"
+        )
+        [form] = encode_groups([known])
+        [long] = groups_of([PlannedGroupForm("n" * 1000, form.period, form.reads)], line.bus)
+        assert long.name == "n" * 80
+        learned = ReplyTimesForm(learned=encode_timings(PATIENT))
+        read = PlannedRead("hcp2", ABSENT, form.reads[0].command, learned)
+        [planned] = groups_of([PlannedGroupForm("learned", 1.0, [read])], line.bus)
+        assert planned.reads[0][0].timings == PATIENT
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_plan_arrives_at_the_program_as_the_owner_calculated_it(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        unit = PlannedNode(MODBUS.with_default_merge(), 3)
+        reads = [(unit, ReadRegisters(first)) for first in (1, 2)]
+        plan = await line.bus.plan(PlannedGroup("merged", 0.05, reads), PlannedGroup("more", 0.01, reads[:1]))
+        assert plan.groups[0].merged
+        assert len(set(plan.worst_waits.values())) > 1
+        assert plan_of(decode_result("plan", Raw(encode(encode_plan(plan))))) == plan
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_plan_that_would_hold_up_the_owner_is_refused(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         command = Hcp2Controller(line.bus, 5).point("1").command
@@ -267,8 +315,8 @@ def test_a_plan_that_would_hold_up_the_owner_is_refused(tmp_path: Path) -> None:
             ),
             ([PlannedGroup("one", 0.0, reads)], "0.001 to 86400 s, not 0"),
             ([PlannedGroup("one", 1.0, [])] * 201, "200 groups at most"),
-            ([PlannedGroup("one", 1.0, [], merge=[lambda commands: []])], "merges"),
-            ([PlannedGroup("one", 1.0, [(node, Write(1, (1.0,)))])], "only reads"),
+            ([PlannedGroup("one", 1.0, []), PlannedGroup("two", 1.0, [], merge=[lambda commands: []])], "merges"),
+            ([PlannedGroup("one", 1.0, [reads[0], (node, Write(1, (1.0,)))])], "only reads"),
         ):
             with pytest.raises(InvalidCommand, match=why):
                 await remote.plan(*groups)

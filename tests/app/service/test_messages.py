@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from busmaster import Hcp2Controller, Priority, RemoteBus, bounds
-from busmaster.app.service.client_messages import CancelParams, NoParams, RequestParams, WriteParams
+from busmaster.app.service.client_messages import CancelParams, NodeParams, NoParams, RequestParams, WriteParams
 from busmaster.app.service.client_requests import Reading, client_request_of
 from busmaster.app.service.connection import Connection
 from busmaster.app.service.failures import encode_error, error_of
@@ -42,7 +42,9 @@ from busmaster.app.service.messages import (
     value_of,
 )
 from busmaster.app.service.owner_messages import EventForm
-from busmaster.app.service.reply_times import timings_of
+from busmaster.app.service.reply_times import encode_timings, timings_of
+from busmaster.contract.learning import Learned
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import BacklogFull, InvalidCommand, Refused
 from tests.app.service import schema
 from tests.app.service.lines import Served, on_a_line, on_a_served_line, raw
@@ -224,6 +226,29 @@ def test_reply_times_are_complete_or_learned(timings: dict[str, Any], reason: st
         timings_of(decode("node", {**NODE, "timings": timings}).timings)
     with pytest.raises(schema.ValidationError):
         schema.check("node_params", {**NODE, "timings": timings})
+
+
+READ_TIMES, WRITE_TIMES = ReplyTiming(0.01, 0.02, 0.03, 0.004, 0.005, 0.06), ReplyTiming(0.07, 0.08, 0.09, 0.01)
+TIMES = Timings(READ_TIMES, WRITE_TIMES, ReplyTiming(0.11, 0.12, 0.13, 0.014, 0.015))
+
+
+@pytest.mark.parametrize("times", [None, TIMES, Learned(), Learned(TIMES)])
+def test_reply_times_are_received_as_they_were_sent(times: Timings | Learned | None) -> None:
+    sent = encode(NodeParams("hcp2", 5, encode_timings(times)))
+    assert timings_of(decode_request_params("node", msgspec.Raw(sent)).timings) == times
+
+
+@pytest.mark.parametrize("step", ["read", "write", "packet"])
+@pytest.mark.parametrize("name", ["max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence"])
+def test_a_reply_is_awaited_for_five_seconds_at_most(step: str, name: str) -> None:
+    def times(longest: float) -> dict[str, Any]:
+        return {**TIMINGS, step: {**TIMING, name: longest}}
+
+    for form in (times(bounds.LONGEST_REPLY), {"learned": times(bounds.LONGEST_REPLY)}):
+        assert timings_of(decode("node", {**NODE, "timings": form}).timings)
+    for form in (times(bounds.LONGEST_REPLY + 0.001), {"learned": times(bounds.LONGEST_REPLY + 0.001)}):
+        with pytest.raises(InvalidCommand, match="may have the line wait 5 s for a reply, and no longer"):
+            timings_of(decode("node", {**NODE, "timings": form}).timings)
 
 
 @pytest.mark.parametrize("method", [method for method in PARAMS if PARAMS[method]])

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ import pytest
 from busmaster import RemoteBus, connect
 from busmaster.app.service.client_messages import DemandParams
 from busmaster.app.service.permission import Access, Permission
-from busmaster.app.service.rights import RIGHTS, Role, table
+from busmaster.app.service.reply_times import check_within
+from busmaster.app.service.rights import RIGHTS, Role, line_parts, table
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.points import Point
+from busmaster.contract.learning import Learned
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import BusError, InvalidCommand, NodeDown
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -42,6 +45,10 @@ def as_role(folder: Path, role: Role, story: Story) -> None:
 
 def test_the_documentation_has_the_table() -> None:
     assert "\n".join(table()) in (DOCS / "service.md").read_text()
+
+
+def test_a_role_has_a_part_of_the_line_unless_it_takes_turns_with_the_owner() -> None:
+    assert line_parts() == {"read": 1 / 32, "write": 1 / 2}
 
 
 @pytest.mark.parametrize("role", Role)
@@ -95,6 +102,25 @@ def test_reply_times_beyond_those_of_the_protocol_are_for_admins(
             assert len(line.bus.nodes) == 1
 
     as_role(tmp_path, role, story)
+
+
+@pytest.mark.parametrize("step", ["read", "write", "packet"])
+@pytest.mark.parametrize("name", ["max_reply_delay", "inter_byte_timeout", "driver_release_time", "silence"])
+def test_reply_times_as_long_as_those_of_the_protocol_are_for_all_and_longer_ones_are_not(step: str, name: str) -> None:
+    limits = hcp2.PROFILE.timings
+    documented = getattr(limits, step)
+    assert documented.silence is None
+    limit = documented.max_reply_delay if name == "silence" else getattr(documented, name)
+    for beyond, accepted in ((0.0, True), (0.001, False)):
+        times = replace(limits, **{step: replace(documented, **{name: limit + beyond})})
+        for given in (times, Learned(times)):
+            if accepted:
+                check_within(given, hcp2.PROFILE, 6)
+            else:
+                with pytest.raises(InvalidCommand, match=f"node 6: {name} of .* s is longer than that of hcp2"):
+                    check_within(given, hcp2.PROFILE, 6)
+    check_within(None, hcp2.PROFILE, 6)
+    check_within(Learned(), hcp2.PROFILE, 6)
 
 
 @pytest.mark.parametrize("role", [Role.READ, Role.WRITE])
