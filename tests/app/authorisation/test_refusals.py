@@ -100,6 +100,26 @@ def test_what_is_remembered_of_peers_is_bounded_and_the_oldest_is_forgotten() ->
     assert len(clock.logins._peers[HERE].good) == 16
 
 
+def test_a_peer_that_goes_on_is_not_the_oldest_and_of_its_names_the_oldest_is_forgotten() -> None:
+    clock = Clock()
+    for number in range(17):
+        clock.judge(f"name {number}")
+    for number in range(bounds.MOST_LOGIN_PEERS - 1):
+        clock.judge(None, f"peer {number}")
+    clock.guess(bounds.FREE_LOGINS + 1)
+    clock.judge(None, "one more")
+    assert clock.judge() == 2.0, "it is not forgotten"
+    assert (clock.judge("name 16"), clock.judge("name 1"), clock.judge("name 0")) == (None, None, 2.0)
+
+
+def test_a_failed_login_is_counted_for_the_peer_however_its_address_is_written() -> None:
+    clock = Clock()
+    clock.judge(None, f"::ffff:{HERE}")
+    clock.judge(None, HERE)
+    clock.judge(None, "2001:db8::1:2:3")
+    assert clock.failed == [HERE, HERE, "2001:db8::/64"]
+
+
 @pytest.mark.parametrize(
     ("host", "peer"),
     [

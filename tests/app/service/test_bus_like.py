@@ -26,7 +26,6 @@ from busmaster import (
 )
 from busmaster.app.service import service
 from busmaster.app.service.client_messages import PlannedGroupForm, PlannedRead, PlanParams
-from busmaster.app.service.fields import ReplyTimesForm
 from busmaster.app.service.messages import decode_request_params, decode_result, encode
 from busmaster.app.service.plans import encode_groups, encode_plan, groups_of, plan_of
 from busmaster.app.service.remote_group import RemoteGroup
@@ -34,6 +33,7 @@ from busmaster.app.service.reply_times import encode_timings
 from busmaster.app.service.typed import Raw
 from busmaster.bounds import LONGEST_PERIOD, MOST_PLANNED_READS, SHORTEST_PERIOD
 from busmaster.bus.bus_like import GroupLike
+from busmaster.contract.learning import Learned
 from busmaster.planning import PlannedGroup, PlannedNode
 from busmaster.protocols.hcp2.codec import Write
 from busmaster.protocols.modbus.codec import PROFILE as MODBUS
@@ -282,7 +282,7 @@ def test_a_planned_group_arrives_at_the_owner_as_it_was_given(tmp_path: Path) ->
         [form] = encode_groups([known])
         [long] = groups_of([PlannedGroupForm("n" * 1000, form.period, form.reads)], line.bus)
         assert long.name == "n" * 80
-        learned = ReplyTimesForm(learned=encode_timings(PATIENT))
+        learned = encode_timings(Learned(PATIENT))
         read = PlannedRead("hcp2", ABSENT, form.reads[0].command, learned)
         [planned] = groups_of([PlannedGroupForm("learned", 1.0, [read])], line.bus)
         assert planned.reads[0][0].timings == PATIENT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
+from typing import Any
 
 import pytest
 
@@ -87,7 +88,7 @@ def test_a_point_that_stays_keeps_what_is_known_of_it_until_its_new_value_arrive
 
 
 @pytest.mark.parametrize("other", [{"address": 3}, {"protocol": "msc"}])
-def test_a_point_of_the_same_name_at_another_node_begins_anew(other: dict[str, object]) -> None:
+def test_a_point_of_the_same_name_at_another_node_begins_anew(other: dict[str, Any]) -> None:
     picture = tell(Picture(), row(1, value=5, asked=1.0))
     point, _ = row(1, **other)
     picture.receive("rows", {"set": 2, "first": 0, "rows": [point]})
