@@ -244,11 +244,16 @@ def test_who_may_not_hold_the_line_is_told_so(tmp_path: Path) -> None:
     on_a_port(tmp_path, story)
 
 
-def test_a_token_is_for_tcp_and_is_one_word() -> None:
+@pytest.mark.parametrize("token", ["a-token-of-the-hmi-0001", ""])
+def test_a_token_is_for_tcp(token: str) -> None:
     with pytest.raises(InvalidCommand, match="a token needs tcp://HOST:PORT"):
-        connect("unix:/run/line.sock", token="a-token-of-the-hmi-0001")
+        connect("unix:/run/line.sock", token=token)
+
+
+@pytest.mark.parametrize("token", ["two\r\nwords", "two words", " word", "", "\u00fcber", "a\x7f"])
+def test_a_token_is_one_word_that_a_header_can_have(token: str) -> None:
     with pytest.raises(InvalidCommand, match="without spaces"):
-        connect("tcp://127.0.0.1:7420", token="two\r\nwords")
+        connect("tcp://127.0.0.1:7420", token=token)
 
 
 def test_what_is_said_by_tcp_has_another_mask_each_time_and_in_the_kernel_none(

@@ -3,16 +3,54 @@
 from __future__ import annotations
 
 import asyncio
+import enum
 import json
+from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect
+from busmaster import (
+    Bus,
+    Hcp2Controller,
+    Health,
+    InvalidCommand,
+    MemoryPort,
+    NoReply,
+    Point,
+    Quality,
+    RemoteBus,
+    Sample,
+    Service,
+    Snapshot,
+    connect,
+)
 from busmaster.app.service.messages import encode_json, value_of
+from busmaster.app.service.values import (
+    cycle_fields,
+    event_text,
+    json_line,
+    json_value,
+    name_fields,
+    utc,
+    value_text,
+)
+from busmaster.arbiter.transaction import Timeline
 from busmaster.emulator.line import Line
+from busmaster.events import (
+    AlarmChanged,
+    LineChange,
+    LineChanged,
+    MaxReplyDelayRaised,
+    NodeChanged,
+    PortFailed,
+    RepliesLate,
+)
+from busmaster.ext import Named
+from busmaster.protocols.hcp2.codec import Read
 from busmaster.registry import find, make_device
 from tests.app.service.lines import Served, on_a_served_line, raw
 from tests.patience import PATIENCE
@@ -89,3 +127,127 @@ def test_a_truth_that_is_refused_says_which_number_to_write_and_is_on_record(tmp
         assert await Hcp2Controller(remote, 5).read(10) == 0
 
     on_a_served_line(tmp_path, story)
+
+
+class Mode(enum.Enum):
+    """As an action of a handle returns it."""
+
+    SLOW = 1.0
+    FAST = 2.5
+
+
+class Word(enum.IntFlag):
+    READY = 1
+    FAULT = 4
+
+
+@pytest.mark.parametrize(
+    ("value", "precision", "text"),
+    [
+        (12.345, 2, "12.35"),
+        (-0.004, 2, "0.00"),
+        (-0.4, 0, "0"),
+        (-0.006, 2, "-0.01"),
+        (5, 1, "5.0"),
+        ((1.26, -2.0), 1, "1.3,-2.0"),
+        (Mode.SLOW, None, "1 SLOW"),
+        (Mode.FAST, 0, "2.5 FAST"),
+        (Named(3, "on"), 2, "3 on"),
+        (Word(5), None, "5 READY|FAULT"),
+        (Word(3), None, "3 READY|0x2"),
+        (inf, None, "inf"),
+        (nan, 1, "nan"),
+        ("a text", 2, "a text"),
+    ],
+)
+def test_a_value_is_shown_with_its_digits_and_names(value: Any, precision: int | None, text: str) -> None:
+    assert value_text(value, precision) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "written", "names"),
+    [
+        (Mode.SLOW, 1, {"label": "SLOW"}),
+        (Mode.FAST, 2.5, {"label": "FAST"}),
+        (Named(3, "on"), 3, {"label": "on"}),
+        (Word(3), 3, {"names": ["READY", "0x2"]}),
+        (True, 1, {}),
+        ((True, Mode.SLOW, nan), [1, 1, None], {}),
+        (-inf, None, {}),
+        (2.0**53, 2.0**53, {}),
+        ("a text", "a text", {}),
+    ],
+)
+def test_a_value_in_json_is_a_number_and_its_name_is_beside_it(value: Any, written: Any, names: dict[str, Any]) -> None:
+    said = json_value(value)
+    assert (said, type(said)) == (written, type(written))
+    assert name_fields(value) == names
+
+
+def test_a_line_of_json_has_letters_as_they_are_and_other_objects_as_text() -> None:
+    assert json_line(name="Wickler №", path=Path("a")) == '{"name": "Wickler №", "path": "a"}'
+
+
+def test_a_time_is_written_in_utc_with_as_many_digits_as_are_wanted() -> None:
+    assert utc(1_700_000_000.1239) == "2023-11-14T22:13:20.123Z"
+    assert utc(1_700_000_000.1239, "seconds") == "2023-11-14T22:13:20Z"
+
+
+TIMES = Timeline(10.0, 10.1, None, None, 1, 0, 0.0)
+
+
+def test_a_cycle_in_json_has_its_times_and_every_sample_with_its_error() -> None:
+    controller: Any = type("Controller", (), {"address": 5})()
+    points: list[Point[Any]] = [Point(controller, item, Read(1)) for item in ("1", "2", "3")]
+    good, late, bad = points
+    error = NoReply("no reply within 100 ms", hint="check the wiring", command="read element 3", attempts=2)
+    samples: dict[Point[Any], Sample[Any]] = {
+        good: Sample(2.0, None, 10.0, 10.1, 10.2, Quality.GOOD, TIMES, 0.0),
+        late: Sample(Named(1, "on"), None, 10.0, 10.1, 10.2, Quality.LATE, TIMES, 0.0),
+        bad: Sample(None, error, 10.0, None, 10.2, Quality.BAD, TIMES, 0.0),
+    }
+    snapshot = Snapshot("axes", 7, 10.0, 10.1000001, 10.25, 3, 0.0, samples)
+    fields = cycle_fields(snapshot, lambda moment: moment + 100)
+    assert fields.pop("samples") == {
+        "5/1": {"quality": "good", "value": 2, "error": None, "late": False},
+        "5/2": {"quality": "late", "value": 1, "error": None, "late": True, "label": "on"},
+        "5/3": {
+            "quality": "bad",
+            "value": None,
+            "error": "no reply within 100 ms",
+            "late": False,
+            "hint": "check the wiring",
+        },
+    }
+    assert fields == {"group": "axes", "cycle": 7, "due": 110, "started": 110.1, "finished": 110.25, "missed": 3}
+    assert cycle_fields(replace(snapshot, started=None), float)["started"] is None
+
+
+NODE: Any = SimpleNamespace(label="node 5", address=5)
+ALARM = AlarmChanged(Point(NODE, "pull", Read(1)), "high", 5.0, 6.0, active=True)
+
+
+@pytest.mark.parametrize(
+    ("event", "text"),
+    [
+        (NodeChanged(NODE, Health.UP, Health.DOWN, returning=False), "node 5 is down, was up"),
+        (NodeChanged(NODE, Health.DOWN, Health.UP, returning=True), "node 5 is up, was down"),
+        (NodeChanged(NODE, Health.UNKNOWN, Health.DOWN, returning=False), "node 5 is down, was unknown"),
+        (NodeChanged(NODE, Health.UNKNOWN, Health.UP, returning=False), ""),
+        (
+            MaxReplyDelayRaised(NODE, 0.1404, 0.2236),
+            "node 5 replied after 140 ms; maximum reply delay raised to 224 ms",
+        ),
+        (
+            RepliesLate(NODE, 0.1404, 0.0125),
+            "node 5 replies after 140 ms, later than its reply window of 12.5 ms; its values are marked late",
+        ),
+        (LineChanged(LineChange.NOISY), "the line is noisy"),
+        (LineChanged(LineChange.DOWN, "the adapter is gone"), "the line is down: the adapter is gone"),
+        (ALARM, ALARM.text),
+        (PortFailed("in use"), "cannot connect: in use"),
+        (PortFailed("in use", "end gpsd"), "cannot connect: in use; end gpsd"),
+    ],
+)
+def test_an_event_is_a_sentence(event: Any, text: str) -> None:
+    assert event_text(event) == text
