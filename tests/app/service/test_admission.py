@@ -18,7 +18,7 @@ from busmaster.app.service.client_connection import ClientConnection
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.refusals import LimitedReport, Refusals
 from busmaster.app.service.rights import RIGHTS, Role
-from busmaster.errors import LineDown
+from busmaster.errors import InvalidCommand, LineDown
 from busmaster.testing import run_in_virtual_time
 from tests.app.service.lines import Served, raw, served, until
 from tests.patience import PATIENCE
@@ -129,6 +129,11 @@ def test_one_that_only_sends_the_safe_state_is_admitted_when_all_places_are_take
             await client.ask("hello", versions=[3], safe_only=True)
             # It comes as far as authorisation, which has no safe state of this line.
             assert "has no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
+        assert line.service.tcp_address is not None
+        for address, token in ((line.address, None), (line.service.tcp_address, TOKENS["admin"])):
+            async with connect(address, token=token, safe_only=True) as remote:  # entering requests nothing else
+                with pytest.raises(InvalidCommand, match="has no safe state"):
+                    await remote.enter_safe_state({})
 
     among(tmp_path, story)
 

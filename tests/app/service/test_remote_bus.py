@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from busmaster import Hcp2Controller, MicroFlexDrive, Node, Point, Priority, RemoteBus, connect, errors, ext
+from busmaster import (
+    Hcp2Controller,
+    MentorDrive,
+    MicroFlexDrive,
+    Node,
+    Point,
+    Priority,
+    RemoteBus,
+    ReplyTiming,
+    Timings,
+    connect,
+    errors,
+    ext,
+)
 from busmaster.app.service import link
 from busmaster.app.service.failures import encode_error, error_of
 from busmaster.app.service.link import Link
 from busmaster.app.service.owner_messages import ErrorForm
+from busmaster.bounds import MOST_CHECKED
 from busmaster.errors import (
     BusClosed,
     BusError,
@@ -33,6 +48,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, served, until
 
 RECEIVED = Link.received
+BRIEF = Timings.uniform(ReplyTiming(0.02, 0.02, 0.02, 0.02))
 
 
 def test_a_handle_reads_and_writes_on_another_programs_line(tmp_path: Path) -> None:
@@ -64,6 +80,57 @@ def test_handles_may_be_made_before_the_bus_is_entered(tmp_path: Path) -> None:
                 assert controller.node.label == "winder"
 
     asyncio.run(run())
+
+
+def test_nodes_that_were_used_before_the_bus_was_entered_have_their_settings_and_labels_at_once(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        for address in (5, 6):
+            ext.rename(Node.of(Hcp2Controller(line.bus, address)), f"winder {address}")
+        remote = connect(line.address)
+        known = [Hcp2Controller(remote, address) for address in (5, 6)]
+        new = [Hcp2Controller(remote, address, timings=BRIEF, retries=0) for address in (ABSENT, ABSENT + 1)]
+        async with remote:
+            assert [controller.node.label for controller in known] == ["winder 5", "winder 6"]
+            assert remote.line == "the emulated line"
+            await remote.statistics()
+            there = {node.address: node.planned().timings for node in line.bus.nodes}
+            assert there[ABSENT] == there[ABSENT + 1] == BRIEF
+            for controller in new:
+                with pytest.raises(InvalidCommand, match="other retries"):
+                    Hcp2Controller(line.bus, controller.node.address, timings=BRIEF, retries=3)
+            with pytest.raises(InvalidCommand, match=r"the bus of .*line.sock was already entered; enter it once"):
+                await remote.__aenter__()
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_write_that_was_prepared_is_checked_when_the_bus_is_entered(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        Hcp2Controller(line.bus, 6).point("1").limit(minimum=1, maximum=10)
+        good, bad, stop = hcp2.Write(1, (10.0,)), hcp2.Write(1, (11.0,)), hcp2.Write(1, (0.0,))
+        for commands, is_stop, accepted in (
+            ([good], None, True),
+            ([bad], None, False),
+            ([good] * MOST_CHECKED + [bad], None, False),
+            ([good] * MOST_CHECKED + [good], None, True),
+            ([stop], True, True),
+            ([stop], None, False),
+            ([stop], False, False),
+        ):
+            remote = connect(line.address)
+            Hcp2Controller(remote, 5).node.check(good)
+            Hcp2Controller(remote, 6).node.check(*commands, stop=is_stop)
+            if accepted:
+                async with remote:
+                    Hcp2Controller(remote, 6).node.check(bad)  # the line checks it when it is written
+                    await remote.statistics()
+            else:
+                with pytest.raises(InvalidCommand, match=r"6: .*(maximum of 10|minimum of 1)"):
+                    await remote.__aenter__()
+            await line.alone()
+        assert [outcome for _, outcome in line.audit()] == ["refused"] * 4
+
+    on_a_line(tmp_path, story)
 
 
 @pytest.mark.parametrize("name", [name for name in errors.__all__ if name not in ("Addressed", "InvalidCommand")])
@@ -185,6 +252,10 @@ def test_handles_of_one_node_agree_on_its_timings(tmp_path: Path) -> None:
         first = Hcp2Controller(remote, 5, timings=PATIENT)
         with pytest.raises(InvalidCommand, match="other timings or retries"):
             Hcp2Controller(remote, 5, retries=7)
+        with pytest.raises(InvalidCommand, match="other timings or retries"):
+            Hcp2Controller(remote, 5, timings=BRIEF)
+        with pytest.raises(InvalidCommand, match="other timings or retries"):
+            Hcp2Controller(remote, 5, timings=PATIENT, retries=7)
         Hcp2Controller(remote, 5, timings=PATIENT)
         assert await first.read(1) == await Hcp2Controller(remote, 5).read(1) == 0
 
@@ -486,5 +557,117 @@ def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made
         assert await mine.read(max_age=60) == 7
         group.close()
         assert remote.latest(mine) is None
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_all_that_follow_a_line_are_informed_and_all_streams_end_with_the_connection(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        changed: list[str] = []
+        remote.on_access.extend([lambda: changed.append("first"), lambda: changed.append("second")])
+        touched: list[tuple[str, object]] = []
+        remote.on_touched.append(lambda body: touched.append(("a", body["address"])))
+        remote.on_touched.append(lambda body: touched.append(("b", body["address"])))
+        events = [remote.events() for _ in range(3)]
+        groups = [
+            remote.poll_group(name, period=60, points=[Hcp2Controller(remote, 5).point("1")]) for name in ("one", "two")
+        ]
+        await asyncio.gather(*(group.ready() for group in groups))
+        cycles = [group.subscribe() for group in groups]
+        await Hcp2Controller(line.bus, 6).write(1, 5)
+        seen = [await anext(stream) for stream in events]
+        assert seen[0] is seen[1] is seen[2]
+        await until(lambda: len(touched) == 2)
+        assert touched == [("a", 6), ("b", 6)]
+        line.authorisation.read_only = True
+        line.service._notify_access()
+        await until(lambda: changed == ["first", "second"])
+        [connection] = line.service._clients.values()
+        connection.websocket.abort()
+        for stream in events:
+            assert [event async for event in stream if not isinstance(event, NodeChanged)] == []
+        for stream_of_cycles in cycles:
+            assert len([snapshot async for snapshot in stream_of_cycles]) <= 1
+        assert all(group.over for group in groups)
+        assert not remote._streams
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_events_are_requested_once_however_many_follow_them(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        first, second = remote.events(), remote.events()
+        await Hcp2Controller(remote, 5).read(1)
+        await Hcp2Controller(remote, 6).read(1)
+        await remote.statistics()
+        for stream in (first, second):
+            heard = [await anext(stream) for _ in range(2)]
+            assert [event.node.address for event in heard if isinstance(event, NodeChanged)] == [5, 6]
+        assert line.service.clients[0]._streams.keys() == {0}
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_the_youngest_good_sample_of_all_groups_of_this_program_serves(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point, other = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(remote, 5).point("2")
+        names = ("first", "second", "third")
+        groups = {name: remote.poll_group(name, period=60, points=[point]) for name in names}
+        theirs = line.bus.poll_group("owner", period=60, points=[Hcp2Controller(line.bus, 5).point("2")])
+        await until(lambda: len(remote.groups) == 4)
+        follows = remote.group("owner")
+        for group in (*groups.values(), follows):
+            await group.ready()
+        for name in ("first", "third", "second"):
+            group, before = groups[name], groups[name].latest
+            line.bus.group(group.owners_name).demand()
+            while group.latest in (None, before):  # noqa: ASYNC110  nothing reports it
+                await asyncio.sleep(0.001)
+        latest = groups["second"].latest
+        assert latest is not None
+        assert remote.latest(point) is latest[point]
+        theirs.demand()
+        await until(lambda: follows.latest)
+        assert remote.latest(other) is None, "only of groups of this program"
+
+    on_a_served_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 7])
+def test_a_group_of_many_points_is_sent_in_several_messages(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.remote.POINTS_IN_A_MESSAGE", 2)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        points = [Hcp2Controller(remote, 5).point(str(number + 1)) for number in range(count)]
+        group = remote.poll_group("mine", period=60, phase=7.0, priority=Priority.BACKGROUND, points=points)
+        await group.ready()
+        [own] = line.bus.groups
+        assert [point.key for point in own.points] == [point.key for point in points]
+        planned = own.planned()
+        assert (planned.period, planned.phase, planned.priority) == (60, 7.0, Priority.BACKGROUND)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_that_cannot_be_is_rejected_before_it_is_requested(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        points = [Hcp2Controller(remote, 5).point("1")]
+        drive = MentorDrive(remote, 14)
+        broadcast: Point[Any] = Point(remote.node(drive.node.profile, 0), "1", points[0].command)
+        wrong: list[tuple[dict[str, Any], str]] = [
+            ({"period": "soon"}, "poll group 'mine': a period"),
+            ({"phase": -1.0}, "poll group 'mine': a phase"),
+            ({"priority": 17}, "priority"),
+            ({"points": [*points, Hcp2Controller(line.bus, 5).point("1")]}, "5/1 belongs to another bus"),
+            ({"points": [*points, broadcast]}, "which is the address of all nodes"),
+        ]
+        for given, why in wrong:
+            with pytest.raises(InvalidCommand, match=why):
+                remote.poll_group("mine", **{"period": 60, "points": points, **given})
+        assert remote.groups == ()
+        with pytest.raises(InvalidCommand, match="node 5: another's line only supports the standard hcp2"):
+            remote.node(replace(Hcp2Controller.profile, addresses=range(1, 9)), 5)
 
     on_a_served_line(tmp_path, story)
