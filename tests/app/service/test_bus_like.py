@@ -31,7 +31,7 @@ from busmaster.app.service.plans import encode_groups, encode_plan, groups_of, p
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.app.service.reply_times import encode_timings
 from busmaster.app.service.typed import Raw
-from busmaster.bounds import LONGEST_PERIOD, MOST_PLANNED_READS, SHORTEST_PERIOD
+from busmaster.bounds import LONGEST_PERIOD, LONGEST_REQUEST, MOST_PLANNED_READS, SHORTEST_PERIOD
 from busmaster.bus.bus_like import GroupLike
 from busmaster.contract.learning import Learned
 from busmaster.planning import PlannedGroup, PlannedNode
@@ -273,10 +273,12 @@ def test_a_planned_group_arrives_at_the_owner_as_it_was_given(tmp_path: Path) ->
         ]
         params = PlanParams(encode_groups(groups))
         sent = decode_request_params("plan", Raw(encode(params)))
-        assert groups_of(sent.groups, line.bus) == groups
+        received = groups_of(sent.groups, line.bus)
+        assert received == groups
+        assert received[1].reads[0][0].profile.merge is not None, "it is planned with merged reads, as it is polled"
         known = PlannedGroup("known", 1.0, [(PlannedNode(profile, 5, PATIENT, reply_time=0.1), command)])
-        [received] = groups_of(encode_groups([known]), line.bus)
-        assert received.reads == [(Node.of(Hcp2Controller(line.bus, 5)).planned(), command)], (
+        [measured] = groups_of(encode_groups([known]), line.bus)
+        assert measured.reads == [(Node.of(Hcp2Controller(line.bus, 5)).planned(), command)], (
             "as the line has measured it"
         )
         [form] = encode_groups([known])
@@ -352,6 +354,51 @@ def test_the_owner_refuses_such_a_plan_itself(tmp_path: Path) -> None:
             assert (await client.hear())["id"] == 2
 
     on_a_line(tmp_path, story)
+
+
+def test_plans_of_one_program_are_calculated_one_after_the_other(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with line.service.line.planner._turn:
+            asked = [asyncio.ensure_future(remote.plan()) for _ in range(2)]
+            await until(lambda: line.service.clients[0]._planning)
+            await remote.statistics()
+        first, second = await asyncio.gather(*asked)
+        assert first == second
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_plan_that_does_not_fit_into_a_message_is_refused_before_it_is_sent(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        with pytest.raises(InvalidCommand, match="too long for one message; plan fewer of them at once"):
+            await remote.plan(PlannedGroup("x" * (LONGEST_REQUEST // 2), 1.0, []))
+        assert (await remote.plan(PlannedGroup("x" * (LONGEST_REQUEST // 2 - 100), 1.0, []))).groups
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_is_requested_when_it_is_made_or_named_or_awaited(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = Hcp2Controller(remote, 5).point("1")
+        mine = remote.poll_group("mine", period=60, points=[point])
+        await until(lambda: line.bus.groups)
+        await until(lambda: not remote._tasks)
+        own = [line.bus.poll_group(name, period=0.02, points=[Hcp2Controller(line.bus, 5).point("1")]) for name in "ab"]
+        await until(lambda: len(remote.groups) == 3)
+        named = remote.group("a")
+        await until(lambda: named.latest)
+        [awaited] = [group for group in remote.groups if group.name == "b"]
+        assert awaited.latest is None
+        await awaited.ready()
+        await until(lambda: awaited.latest)
+        for group in (mine, named, awaited):
+            group.close()
+            await group.ready()  # of a closed one nothing is requested
+        await remote.statistics()
+        assert not line.service.clients[0]._streams
+        assert line.bus.groups == tuple(own)
+
+    on_a_served_line(tmp_path, story)
 
 
 def test_a_plan_ends_with_its_program(tmp_path: Path) -> None:

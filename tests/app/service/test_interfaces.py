@@ -23,7 +23,7 @@ from busmaster.app.service import peers
 from busmaster.app.service.frames import NO_MASK, text_frame
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.rights import Role
-from busmaster.app.service.tcp import listening_error
+from busmaster.app.service.tcp import check_listening, is_loopback, is_our_name, listening, listening_error
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, LineDown
 from tests.app.service.lines import Raw, Served, served, until
@@ -146,6 +146,7 @@ def test_a_token_of_bytes_that_are_no_text_is_refused_as_any_other(tmp_path: Pat
         writer.write(UPGRADE.replace(b"Upgrade: ", b"Authorization: Bearer \xff\xfe\r\nUpgrade: ", 1))
         assert (await reader.readline()).startswith(b"HTTP/1.1 401")
         writer.close()
+        assert TOKENS.token_name("\udcff") is None  # as an argument of a command has it
 
     on_a_port(tmp_path, story)
 
@@ -168,6 +169,72 @@ def test_other_languages_name_the_port_by_its_address(tmp_path: Path) -> None:
             assert said["result"]["version"] == 3
 
     on_a_port(tmp_path, story)
+
+
+@pytest.mark.parametrize("form", ["bearer {}", "BEARER {}", "Bearer   {}"])
+def test_the_kind_of_a_token_is_written_in_small_or_large_letters(form: str, tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        known = {"Authorization": form.format(SECRETS["hmi"])}
+        async with connect_websocket(address.replace("tcp://", "ws://"), additional_headers=known):
+            await until(lambda: line.service.strangers)
+
+    on_a_port(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    ("host", "ours"),
+    [
+        ("192.0.2.7", True),
+        ("192.0.2.7:7420", True),
+        ("[::1]", True),
+        ("[2001:db8::7]:7420", True),
+        ("gateway.example", True),
+        ("gateway.example:7420", True),
+        ("this-machine:7420", True),
+        ("plant.example:7420", False),
+        ("[plant.example]:7420", False),
+        ("", False),
+    ],
+)
+def test_a_host_is_ours_by_an_address_by_where_we_listen_and_by_the_name_of_the_machine(
+    host: str, ours: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "this-machine")
+    assert is_our_name(host, ("gateway.example", 7420)) is ours
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
+def test_this_machine_alone_is_served_without_tokens(host: str) -> None:
+    assert is_loopback(host)
+    check_listening((host, 7420), tokens=False)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "gateway.example"])
+def test_other_machines_are_served_if_there_are_tokens(host: str) -> None:
+    assert not is_loopback(host)
+    check_listening((host, 7420), tokens=True)
+
+
+def has_ipv6() -> bool:
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6):
+            return True
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+def test_a_line_is_served_by_ipv6_too(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, access=TOKENS, listen=("::1", 0)) as line:
+            address = line.service.tcp_address
+            assert address is not None
+            assert address.startswith("tcp://[::1]:")
+            async with connect(address, token=SECRETS["hmi"]) as remote:
+                assert await Hcp2Controller(remote, 5).read(1) == 0
+                assert remote.about["tcp"] == address
+
+    asyncio.run(story())
 
 
 def test_without_tokens_whoever_is_on_this_machine_reads_and_writes_nothing(tmp_path: Path) -> None:
@@ -420,6 +487,14 @@ def test_a_program_that_was_busy_while_it_connected_writes_all_the_same(
             await Hcp2Controller(remote, 5).write(1, 3)
 
     on_a_port(tmp_path, story)
+
+
+def test_a_socket_that_listens_does_not_block_and_queues_who_comes() -> None:
+    with listening(LOOPBACK) as opened:
+        assert not opened.getblocking()
+        comers = [socket.create_connection(opened.getsockname(), timeout=PATIENCE) for _ in range(8)]
+        for comer in comers:
+            comer.close()
 
 
 @pytest.mark.parametrize(

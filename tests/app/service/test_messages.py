@@ -217,6 +217,7 @@ def test_parameters_that_are_not_an_object_are_refused(params: str) -> None:
     ("timings", "reason"),
     [
         ({**TIMINGS, "learned": None}, "learned excludes read, write and packet"),
+        ({"packet": TIMING, "learned": None}, "learned excludes read, write and packet"),
         ({"read": TIMING}, "write and packet missing"),
         ({}, "read and write and packet missing"),
     ],

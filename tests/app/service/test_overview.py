@@ -6,14 +6,19 @@ import asyncio
 import os
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from math import nan
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, connect
-from busmaster.app.service import overview
+from busmaster.app.service import overview, remote_overview
+from busmaster.app.service.client_messages import WriteParams
+from busmaster.app.service.link import PendingRequest
 from busmaster.app.service.overview import COUNTED_AT_ONCE, INTERVAL, PART, Part
+from busmaster.app.service.owner_messages import NoBody, StreamMessage
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.picture import Picture
 from busmaster.app.service.remote_overview import RemoteOverview
@@ -25,10 +30,10 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.emulator.line import Line
-from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoReply
+from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
-from tests.app.service.lines import PATIENT, Served, on_a_served_line, raw, until
+from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 from tests.stories import in_virtual_time
 
 
@@ -233,6 +238,67 @@ def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> Non
             await view.details("none", "5/10")
 
     on_a_watched_line(tmp_path, story)
+
+
+def test_a_wish_of_a_person_reaches_the_owner_as_it_was_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
+        [group] = line.bus.groups
+        for paused in (True, False):
+            await view.pause("axes", paused)
+            assert group.paused is paused
+        node = line.bus.nodes[0]
+        for seconds, suspended in ((60.0, True), (0.0, False)):
+            await view.suspend("hcp2", 5, seconds)
+            assert node.suspended is suspended
+        asked: list[WriteParams] = []
+        ask = view._link.ask
+
+        def noted(method: str, params: Any, **options: Any) -> PendingRequest:
+            asked.append(params)
+            return ask(method, params, **options)
+
+        monkeypatch.setattr(view._link, "ask", noted)
+        before = line.bus.now()
+        await view.write("axes", "5/outputs", 5)
+        with pytest.raises(InvalidCommand, match="must be a finite number"):
+            await view.write("axes", "5/10", nan)
+        for params in asked:
+            assert params.options is not None
+            assert params.options.start_within == remote_overview.SOON
+            assert params.requested is not None
+            assert before <= params.requested <= line.bus.now()
+        await view.suspend("hcp2", 5, 3600.5)
+        events = [text for _, text in line.service.line.journal.entries]
+        assert any(text.startswith("node 5 is suspended for 3600") for text in events)
+
+    on_a_watched_line(tmp_path, story)
+
+
+def test_a_write_of_a_person_that_was_sent_when_the_connection_was_lost_is_unconfirmed(tmp_path: Path) -> None:
+    async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
+        absent = Hcp2Controller(line.bus, ABSENT, timings=PATIENT)
+        line.bus.groups[0].pause()
+        line.bus.poll_group("absent", period=60, points=[absent.point("1")]).pause()
+        writing = asyncio.ensure_future(view.write("absent", f"{ABSENT}/1", 1))
+        await line.sent()
+        [connection] = line.service._clients.values()
+        connection.websocket.abort()
+        with pytest.raises(WriteUnconfirmed, match="the write may have been sent"):
+            await writing
+
+    on_a_watched_line(tmp_path, story)
+
+
+@pytest.mark.asyncio
+async def test_a_view_that_its_owner_ends_says_so() -> None:
+    received: list[str] = []
+    link: Any = SimpleNamespace(check=lambda: None)
+    view = RemoteOverview(link, lambda: 0.0, lambda method, body: received.append(method))
+    view.receive("frame", StreamMessage(1, 0, NoBody()))
+    view.receive("ended", StreamMessage(1, 0, NoBody()))
+    assert received == ["frame"]
+    with pytest.raises(BusError, match="shows it no more; see its log"):
+        await view.over()
 
 
 @pytest.mark.slow

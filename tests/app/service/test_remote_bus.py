@@ -27,6 +27,7 @@ from busmaster import (
 )
 from busmaster.app.service import link
 from busmaster.app.service.failures import encode_error, error_of
+from busmaster.app.service.fields import OptionsForm
 from busmaster.app.service.link import Link
 from busmaster.app.service.owner_messages import ErrorForm
 from busmaster.bounds import MOST_CHECKED
@@ -43,8 +44,10 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.events import NodeChanged
+from busmaster.ext import CommandOptions
 from busmaster.protocols.hcp2 import StatusWord
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.modbus.codec import PROFILE as MODBUS
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, served, until
 
 RECEIVED = Link.received
@@ -375,8 +378,10 @@ def test_a_lost_connection_ends_each_request_truthfully(tmp_path: Path) -> None:
         await line.sent()
         [connection] = line.service._clients.values()
         connection.websocket.abort()
-        with pytest.raises(WriteUnconfirmed, match="the write may have been sent"):
+        with pytest.raises(WriteUnconfirmed, match="the write may have been sent") as unconfirmed:
             await writing
+        error = unconfirmed.value
+        assert (error.label, error.address, error.command) == ("node 9", ABSENT, "write element 1 = 1")
         with pytest.raises(LineDown, match="node 5: the connection to the program that owns the line was lost"):
             await reading
         with pytest.raises(LineDown, match="connect again"):
@@ -669,5 +674,145 @@ def test_a_group_that_cannot_be_is_rejected_before_it_is_requested(tmp_path: Pat
         assert remote.groups == ()
         with pytest.raises(InvalidCommand, match="node 5: another's line only supports the standard hcp2"):
             remote.node(replace(Hcp2Controller.profile, addresses=range(1, 9)), 5)
+
+    on_a_served_line(tmp_path, story)
+
+
+class Requested:
+    """The requests and notifications that a program sends to the owner from now on, by their method."""
+
+    def __init__(self, remote: RemoteBus, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._all: list[tuple[str, Any]] = []
+        ask = remote.link.ask
+
+        def noted(method: str, params: Any, **options: Any) -> link.PendingRequest:
+            self._all.append((method, params))
+            return ask(method, params, **options)
+
+        notify = remote.link.notify
+
+        def notified(method: str, params: Any) -> None:
+            self._all.append((method, params))
+            notify(method, params)
+
+        monkeypatch.setattr(remote.link, "ask", noted)
+        monkeypatch.setattr(remote.link, "notify", notified)
+
+    def of(self, method: str) -> list[Any]:
+        return [params for asked, params in self._all if asked == method]
+
+
+def test_a_node_and_events_are_requested_once_and_points_a_few_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.remote.POINTS_IN_A_MESSAGE", 2)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        requested = Requested(remote, monkeypatch)
+        controllers = [Hcp2Controller(remote, 5) for _ in range(3)]
+        for _ in range(2):
+            remote.events()
+        points = [controllers[0].point(str(number + 1)) for number in range(7)]
+        await remote.poll_group("mine", period=60, points=points).ready()
+        assert len(requested.of("node")) == len(requested.of("events")) == 1
+        assert [len(params.points) for method in ("gather", "poll") for params in requested.of(method)] == [2, 2, 2, 1]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_all_that_a_caller_chose_is_in_the_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        requested = Requested(remote, monkeypatch)
+        node = Hcp2Controller(remote, 5).node
+        options: CommandOptions = {
+            "priority": Priority.URGENT,
+            "start_within": 50.0,
+            "finish_within": 60.0,
+            "retries": 3,
+            "idempotent": True,
+        }
+        write, read = hcp2.Write(1, (0.0,)), hcp2.Read(1)
+        form, touches = ({"command": "write", "element": 1, "values": (0.0,)}, {"command": "read", "element": 2})
+        before = remote.now()
+        await node.request(write, touches=hcp2.Read(2), stops_seen=0, stop=True, **options)
+        async with node.exclusive(max_hold=4.5) as held:
+            await held.request(write, touches=hcp2.Read(2), stops_seen=0, stop=True, **options)
+        await node.request(write)
+        await node.request(read)
+        await node.request(read, retries=2)
+        own, in_sequence, plain, plain_read, read_with_options = requested.of("request")
+        for params, sequence in ((own, None), (in_sequence, 1)):
+            assert (params.protocol, params.address, params.command, params.touches) == ("hcp2", 5, form, touches)
+            assert (params.stops_seen, params.stop, params.sequence) == (0, True, sequence)
+            assert params.options == OptionsForm(Priority.URGENT, 50.0, 60.0, 3, True)
+            assert before <= params.requested <= remote.now()
+        assert plain.requested >= before, "a write is refused if it is old when it arrives"
+        assert (plain.options, plain.stop, plain.sequence) == (None, False, None)
+        assert plain_read.requested is None
+        assert read_with_options.requested >= before
+        assert [params.max_hold for params in requested.of("hold")] == [4.5]
+        with pytest.raises(InvalidCommand, match="verify is only available for the write methods of a handle"):
+            await node.request(write, verify=True)  # type: ignore[call-arg]  # only a handle has it
+        with pytest.raises(InvalidCommand, match="the safe state is sent by the program that owns the line"):
+            await node.request(write, safe=True)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_node_of_another_line_counts_its_stops_at_once_and_has_merged_reads(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        node = Hcp2Controller(remote, 5).node
+        node.note_stop()
+        assert node.stops == 1, "what was decided before it is superseded already here"
+        assert node.line == "the emulated line"
+        unit = remote.node(MODBUS, 3)
+        assert unit.profile.merge is not None
+
+        def merge(*_: object) -> list[Any]:
+            return []
+
+        unit.merge_reads(merge)
+        assert unit.profile.merge is merge
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_the_nodes_are_those_of_the_owner_whose_protocol_is_installed_and_those_of_this_program(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        Hcp2Controller(line.bus, 5)
+        async with connect(line.address) as remote:
+            own = Hcp2Controller(remote, 6).node
+            Hcp2Controller(remote, 5)
+            foreign = {"protocol": "of-a-plugin", "address": 1, "label": "node 1", "health": "up"}
+            remote.about = {**remote.about, "nodes": [foreign, *remote.about["nodes"]]}
+            assert [node.address for node in remote.nodes] == [5, 6]
+            assert remote.nodes[1] is own
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_sample_is_not_latest_if_it_failed_or_was_requested_before_the_last_write(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = Hcp2Controller(remote, 5).point("1")
+        absent = Hcp2Controller(remote, ABSENT, timings=BRIEF, retries=0).point("1")
+        group = remote.poll_group("mine", period=60, points=[point, absent])
+        await group.ready()
+        [own] = line.bus.groups
+        for _ in range(2):
+            before = group.latest
+            own.demand()
+            while group.latest in (None, before):  # noqa: ASYNC110  nothing reports it
+                await asyncio.sleep(0.001)
+            sample = remote.latest(point)
+            assert sample is not None
+            assert remote.latest(absent) is None
+            await Hcp2Controller(line.bus, 5).write(1, 5)
+            await until(lambda: remote.latest(point) is None)
+        assert sample is not None
+        assert sample.started is not None
+        remote._touched["hcp2", 5] = (sample.started + sample.finished) / 2
+        assert remote.latest(point) is None
+        remote._touched["hcp2", 5] = sample.started - 0.001
+        assert remote.latest(point) is sample
 
     on_a_served_line(tmp_path, story)

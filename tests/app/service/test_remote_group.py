@@ -10,7 +10,8 @@ from typing import Any, NoReturn
 import pytest
 
 from busmaster import Hcp2Controller, Point, Quality, RemoteBus
-from busmaster.app.service.owner_messages import NoBody, StreamMessage
+from busmaster.app.service.owner_messages import NoBody, PointsBody, SnapshotBody, StreamMessage
+from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.errors import GarbledReply
 from tests.app.service.lines import Served, on_a_served_line
@@ -34,13 +35,14 @@ def test_a_value_that_the_programs_own_point_cannot_decode_is_bad_and_the_others
     on_a_served_line(tmp_path, story)
 
 
+def no_point(*_: object) -> NoReturn:
+    raise AssertionError("no points were sent")
+
+
 @pytest.mark.asyncio
 async def test_a_consumer_counts_the_cycles_that_its_program_was_too_slow_for() -> None:
-    def find(*_: object) -> NoReturn:
-        raise AssertionError("no points were sent")
-
     opening = asyncio.ensure_future(asyncio.sleep(0))
-    group = RemoteGroup("axes", (), period=0.02, find=find, begin=lambda _: (1, opening), end=lambda _: None)
+    group = RemoteGroup("axes", (), period=0.02, find=no_point, begin=lambda _: (1, opening), end=lambda _: None)
     first = group.subscribe()
     group.receive("points", StreamMessage(1, 3, None))
     second = group.subscribe()
@@ -49,3 +51,32 @@ async def test_a_consumer_counts_the_cycles_that_its_program_was_too_slow_for() 
     group.receive("ended", StreamMessage(1, 5, NoBody()))
     assert group.over
     await asyncio.gather(opening, return_exceptions=True)
+
+
+@pytest.mark.asyncio
+async def test_only_cycles_of_the_points_that_were_sent_last_are_taken() -> None:
+    opening = asyncio.ensure_future(asyncio.sleep(0))
+    group = RemoteGroup("axes", (), period=0.02, find=no_point, begin=lambda _: (1, opening), end=lambda _: None)
+    consumer = group.subscribe(buffer=2)
+    for number, cycles in ((1, (1, 2)), (2, (1, 2, 1, 2))):
+        group.receive("points", StreamMessage(1, 0, PointsBody(number, [])))
+        for of_set in cycles:
+            group.receive("snapshot", StreamMessage(1, 0, SnapshotBody(of_set, of_set, 0.0, 0.0, 0.0, 0, 0.0, [])))
+    assert group.latest is not None
+    assert group.latest.cycle == 2
+    assert [(await anext(consumer)).cycle for _ in range(2)] == [2, 2]
+    assert consumer.dropped == 1, "it keeps two"
+    await asyncio.gather(opening)
+
+
+def test_a_follower_of_exchanges_receives_exchanges_alone() -> None:
+    received: list[Any] = []
+    ended: list[bool] = []
+    stream = RemoteExchanges(received.append, lambda: ended.append(True))
+    stream.receive("exchanges", StreamMessage(1, 0, {"now": 1}))
+    stream.receive("ended", StreamMessage(1, 0, NoBody()))
+    assert received == [{"now": 1}]
+    stream.end()
+    assert ended == []
+    stream.close()
+    assert ended == [True]

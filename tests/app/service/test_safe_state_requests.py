@@ -22,7 +22,8 @@ from busmaster.app.service.safe import SafeStateRequests
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, NoReply, Superseded, WriteUnconfirmed
 from busmaster.registry import make_device
-from tests.app.service.lines import PATIENT, until
+from tests.app.service.lines import PATIENT, raw, until
+from tests.app.service.test_requests import READ
 from tests.patience import PATIENCE
 
 TEXT = """
@@ -136,13 +137,60 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
         monkeypatch.setattr(SafeStateRequests, "_send", hold)
         asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
         await until(lambda: service.line.safe_writes.under_way)
+        assert service.clients[0].requests.sends_safe_state, "it keeps its place for that long"
         with pytest.raises(BacklogFull, match="1 requests of this program have no reply yet"):
             await Hcp2Controller(remote, 5).read(10)
         meant.set()
         assert await asking == {"winder/speed": None}
+        assert [client.requests.sends_safe_state for client in service.clients] == [False]
         assert await Hcp2Controller(remote, 5).read(10) == 0
 
     on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_its_number_is_that_of_no_other_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    send = SafeStateRequests._send
+
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        go_on = asyncio.Event()
+
+        async def hold(requests: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
+            await go_on.wait()
+            return await send(requests, state, by)
+
+        monkeypatch.setattr(SafeStateRequests, "_send", hold)
+        served: Any = service
+        for method in ("safe", "request"):
+            params = {"writes": {"winder/speed": 0}} if method == "safe" else READ
+            async with raw(served) as client:
+                await client.say(id=7, method="safe", params={"writes": {"winder/speed": 0}})
+                await client.say(id=7, method=method, params=params)
+                assert "request 7 is already in progress" in (await client.hear())["error"]["message"]
+        go_on.set()
+        await until(lambda: records)
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_it_is_sent_again_when_it_is_requested_again_and_at_once_only_once(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        for count in (1, 2):
+            both = await asyncio.gather(*(remote.enter_safe_state({"winder/speed": 0}) for _ in range(2)))
+            assert both == [{"winder/speed": None}] * 2
+            assert not service.line.safe_writes.under_way
+            assert len(records) == count
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_a_part_of_it_is_another_safe_state(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        for other, shown in (({}, "nothing"), ({"winder/speed": 0}, "winder/speed = 0.0")):
+            with pytest.raises(InvalidCommand, match=f"gone/speed = 0, not {shown}; reload its file"):
+                await remote.enter_safe_state(other)
+        assert records == []
+
+    on_a_line(tmp_path, TEXT + BOTH, story)
 
 
 def test_ordinary_requests_that_wait_do_not_keep_it_from_the_line(
