@@ -1,0 +1,218 @@
+"""The service of a line: its options, what it reports of the line, to which clients, and what it leaves behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import connect as connect_websocket
+
+from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect, ext
+from busmaster.app.service.authorisation import Authorisation
+from busmaster.app.service.permission import Access, Permission, digest_of
+from busmaster.app.service.picture import Picture
+from busmaster.app.service.rights import Role
+from busmaster.emulator.line import Line
+from busmaster.errors import LineDown
+from busmaster.registry import make_device
+from tests.app.service.lines import Raw, Served, on_a_line, on_a_served_line, raw, served, until
+from tests.app.service.test_bad_clients import UPGRADE
+from tests.patience import PATIENCE
+
+SECRET = "a-token-of-the-hmi-0001"
+TOKENS = Access(tokens={"hmi": Permission("token hmi", Role.WRITE)}, secrets={"hmi": digest_of(SECRET)})
+
+
+def test_its_options_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False))) as bus:
+            for share in (0.1, 10):  # the least and the most
+                service = Service(bus, name="slitter", mode=0o660, group=os.getgid(), share=share, title="Slitter 2")
+                async with service, connect("slitter") as remote:
+                    path = service.address.removeprefix("unix:")
+                    assert path.endswith("/slitter.sock")
+                    assert stat.S_IMODE(os.stat(path).st_mode) == 0o660
+                    assert service.tcp_address is None
+                    picture = Picture()
+                    await remote.overview(picture.receive)
+                    while picture.frame is None:
+                        await remote.statistics()
+                    assert picture.frame.title == "Slitter 2"
+            with pytest.raises(InvalidCommand, match="name"):
+                Service(bus, name="../slitter")
+
+    asyncio.run(run())
+
+
+def test_it_reports_the_line_and_what_was_refused_to_each_program(tmp_path: Path) -> None:
+    async def story(line: Served, first: RemoteBus) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        await own.read(1)
+        Hcp2Controller(line.bus, 6)
+        line.bus.poll_group("axes", period=60, points=[own.point("1")])
+        refusals = line.authorisation.refusals
+        refusals.note_connection("read")
+        for kind, count in (("connections", 2), ("requests", 5), ("logins", 7)):
+            refusals.note("web", kind, "192.0.2.1", count)
+        refusals.note_login("service", "192.0.2.1")
+        line.authorisation.read_only = True
+        async with connect(line.address) as remote:
+            about = remote.about
+            endpoint = line.bus.endpoint
+            assert endpoint.settings is not None
+            assert (about["baudrate"], about["framing"]) == (endpoint.settings.baudrate, endpoint.settings.framing)
+            assert (about["echo"], about["process"], about["tcp"]) == (endpoint.echo, os.getpid(), None)
+            assert (about["clients"], about["read_only"], about["state"]) == (2, True, "ready")
+            assert (about["refused_connections"], about["refused_requests"], about["failed_logins"]) == (3, 5, 8)
+            assert [(node["address"], node["health"]) for node in about["nodes"]] == [(5, "up"), (6, "unknown")]
+            assert [(group["name"], group["period"]) for group in about["groups"]] == [("axes", 60)]
+            assert abs(about["now"] - line.bus.now()) < PATIENCE
+        await until(lambda: len(line.service.clients) == 1)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_every_program_is_informed_of_stops_writes_groups_and_its_permission(tmp_path: Path) -> None:
+    async def story(line: Served, first: RemoteBus) -> None:
+        async with connect(line.address) as second:
+            programs, own = (first, second), Hcp2Controller(line.bus, 5)
+            nodes = [Hcp2Controller(remote, 5).node for remote in programs]
+            touched: list[list[Mapping[str, Any]]] = [[], []]
+            for remote, heard in zip(programs, touched, strict=True):
+                remote.on_touched.append(heard.append)
+                await remote.statistics()
+            await own.write(1, 1)
+            await asyncio.gather(*(remote.statistics() for remote in programs))
+            assert touched == [[], []], "a program that follows nothing has no values that could be stale"
+            for remote in programs:
+                remote.events()
+                await remote.statistics()
+            await own.write(1, 2)
+            await until(lambda: all(touched))
+            assert [[(body["protocol"], body["address"], body["all"]) for body in heard] for heard in touched] == [
+                [("hcp2", 5, False)]
+            ] * 2
+            own.node.note_stop()
+            await until(lambda: [node.stops for node in nodes] == [1, 1])
+            line.bus.poll_group("axes", period=60, points=[own.point("1")])
+            await until(lambda: all(remote.groups for remote in programs))
+            line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
+            await until(lambda: all(remote.about["read_only"] for remote in programs))
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_writes_that_a_program_has_not_received_yet_are_all_reported(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        points = [Hcp2Controller(line.bus, address).point(item) for address in (5, 6) for item in ("1", "2")]
+        line.bus.poll_group("axes", period=60, points=points)
+        remote.events()
+        await remote.statistics()
+        touched: list[tuple[object, object]] = []
+        remote.on_touched.append(lambda body: touched.append((body["address"], body["items"])))
+        [client] = line.service.clients
+        connection = line.service._clients[client].websocket
+        connection.full = True
+        for point in points:
+            await point.write(5)
+        connection.full = False
+        line.service._clients[client].writable()
+        await until(lambda: len(touched) == 4)
+        assert touched == [(5, ["1"]), (5, ["2"]), (6, ["1"]), (6, ["2"])]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_nothing_of_it_stays_on_the_bus_and_its_clients_are_disconnected(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, [], paced=False))) as bus:
+            line, authorisation = ext.line_of(bus), Authorisation(bus)
+            path = tmp_path / "line.sock"
+            before = [list(hooks) for hooks in (line.on_stop, line.on_touched, line.on_groups, authorisation.on_access)]
+            service = Service(bus, authorisation=authorisation, path=path, listen=("127.0.0.1", 0))
+            async with service:
+                remote = await connect(service.address).__aenter__()
+                stranger, writer = await asyncio.open_unix_connection(path)
+                await until(lambda: service.strangers)
+                address = service.tcp_address
+            assert await stranger.read() == b""
+            writer.close()
+            with pytest.raises(LineDown, match="has ended"):
+                await remote.statistics()
+            assert service.clients == ()
+            assert not path.exists()
+            assert address is not None
+            with pytest.raises(LineDown, match="no program serves"):
+                await connect(address).__aenter__()
+            hooks = [list(hooks) for hooks in (line.on_stop, line.on_touched, line.on_groups, authorisation.on_access)]
+            assert hooks == before
+            assert not authorisation.refusals.on_report
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("versions", [[3], [99, 3], [3, 99]])
+def test_one_common_version_is_enough(versions: list[int], tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line, hello=False) as client:
+            assert (await client.ask("hello", versions=versions))["result"]["version"] == 3
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("hosts", [b"", b"Host: localhost\r\nHost: localhost\r\n", b"Host: " + b"x" * 200 + b"\r\n"])
+def test_a_request_names_this_server_once(hosts: bytes, tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        reader, writer = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
+        writer.write(UPGRADE.replace(b"Host: localhost\r\n", hosts))
+        answer = await reader.read()
+        assert answer.startswith(b"HTTP/1.1 403")
+        assert b"x" * 41 not in answer
+        writer.close()
+        assert line.service.refused == 1
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("host", [b"localhost", b"localhost:80", b"busmaster"])
+def test_its_names_are_accepted_with_and_without_a_port(host: bytes, tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        reader, writer = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
+        writer.write(UPGRADE.replace(b"localhost", host))
+        assert (await reader.readline()).startswith(b"HTTP/1.1 101")
+        writer.close()
+
+    on_a_line(tmp_path, story)
+
+
+def test_who_shows_no_token_has_not_failed_to_log_in(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, access=TOKENS, listen=("127.0.0.1", 0)) as line:
+            assert line.service.tcp_address is not None
+            for _ in range(20):  # more than failed logins are free
+                with pytest.raises(LineDown, match="requires a token"):
+                    await connect(line.service.tcp_address).__aenter__()
+            assert line.authorisation.refusals.logins == {"service": 0}
+
+    asyncio.run(run())
+
+
+def test_a_token_that_is_withdrawn_before_the_first_message_is_not_admitted(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, access=TOKENS, listen=("127.0.0.1", 0)) as line:
+            assert line.service.tcp_address is not None
+            known = {"Authorization": f"Bearer {SECRET}"}
+            address = line.service.tcp_address.replace("tcp://", "ws://")
+            async with connect_websocket(address, additional_headers=known) as connection:
+                line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
+                said = await Raw(connection).ask("hello", versions=[3])
+                assert said["error"]["message"] == "this token is not valid any more"
+            assert line.service.clients == ()
+
+    asyncio.run(run())
