@@ -750,7 +750,11 @@ def test_all_that_a_caller_chose_is_in_the_request(tmp_path: Path, monkeypatch: 
         assert (plain.options, plain.stop, plain.sequence) == (None, False, None)
         assert plain_read.requested is None
         assert read_with_options.requested >= before
-        assert [params.max_hold for params in requested.of("hold")] == [4.5]
+        with pytest.raises(ValueError, match="of the caller"):
+            async with node.exclusive(max_hold=5.0):
+                raise ValueError("of the caller")
+        assert [(params.sequence, params.max_hold) for params in requested.of("hold")] == [(1, 4.5), (2, 5.0)]
+        assert [params.sequence for params in requested.of("release")] == [1, 2]
         with pytest.raises(InvalidCommand, match="verify is only available for the write methods of a handle"):
             await node.request(write, verify=True)  # type: ignore[call-arg]  # only a handle has it
         with pytest.raises(InvalidCommand, match="the safe state is sent by the program that owns the line"):

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,8 +14,9 @@ import pytest
 from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
 from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.fields import shortened
-from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS
-from busmaster.errors import BacklogFull
+from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, encode_value
+from busmaster.app.service.requests import Requests
+from busmaster.errors import BacklogFull, BusError, InvalidCommand, WriteUnconfirmed
 from busmaster.ext import CommandOptions
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
 from tests.patience import PATIENCE
@@ -133,6 +135,11 @@ def test_a_group_of_the_owner_has_all_its_points_there_too(tmp_path: Path) -> No
             if len(snapshot.samples) == 3:
                 break
         assert [point.key for point in theirs.points] == ["5/1", "6/1", "6/2"]
+        group.remove(own[3])
+        group.add(Hcp2Controller(line.bus, 6).point("3"))
+        async for snapshot in theirs:
+            if [point.key for point in snapshot] == ["5/1", "6/1", "6/3"]:
+                break
 
     on_a_served_line(tmp_path, story)
 
@@ -208,3 +215,81 @@ def test_r12_the_times_of_a_request_that_has_waited_are_shorter_by_that() -> Non
     assert shortened(given, 0.5) == {"start_within": 0.5, "finish_within": 1.5, "retries": 3}
     assert shortened(given, 1.5) == {"start_within": 0.0, "finish_within": 0.5, "retries": 3}
     assert shortened({}, 1.5) == {}
+
+
+class Replies:
+    """Requests of a program whose replies are kept."""
+
+    def __init__(self) -> None:
+        self.answers: list[tuple[int, Any]] = []
+        self.errors: list[tuple[int, Exception]] = []
+        sender: Any = SimpleNamespace(peer="a program")
+        line: Any = None
+        self.requests = Requests(
+            sender,
+            line,
+            lambda number, value: self.answers.append((number, value)),
+            lambda number, error: self.errors.append((number, error)),
+        )
+
+    def end(self, value: Any = None, error: BaseException | None = None, **state: bool) -> None:
+        """End a request, as its node does."""
+        node = SimpleNamespace(label="node 5", address=5, line="line")
+        command = SimpleNamespace(writes=state.pop("writes", False))
+        request: Any = SimpleNamespace(
+            given_up=state.get("given_up"), sent=state.get("sent"), node=node, command=command
+        )
+        self.requests._under_way[7] = request
+        self.requests._ended(7, request, value, error)
+        self.requests.check_number(7)  # it is free again
+
+
+@pytest.mark.parametrize(
+    ("writes", "sent", "kind"),
+    [(True, True, WriteUnconfirmed), (True, False, BusError), (False, True, BusError), (False, False, BusError)],
+)
+def test_a_bug_of_a_protocol_is_reported_as_what_it_is_for_the_request(
+    writes: bool, sent: bool, kind: type[BusError], caplog: pytest.LogCaptureFixture
+) -> None:
+    replies = Replies()
+    replies.end(error=ValueError("odd"), writes=writes, sent=sent)
+    [(number, error)] = replies.errors
+    assert (number, type(error)) == (7, kind)
+    assert isinstance(error, BusError)
+    assert error.what == "the program that owns the line failed: ValueError: odd"
+    assert (error.label, error.address) == ("node 5", 5)
+    assert error.command
+    assert [record.getMessage() for record in caplog.records] == ["a request of a program failed"]
+    assert caplog.records[0].exc_info is not None
+
+
+def test_a_request_that_its_program_gave_up_gets_no_reply(caplog: pytest.LogCaptureFixture) -> None:
+    replies = Replies()
+    replies.end(5.0, given_up=True)
+    replies.end(error=ValueError("odd"), given_up=True)
+    replies.end(error=NoReply("no reply"), given_up=True)
+    assert (replies.answers, replies.errors, caplog.records) == ([], [], [])
+    replies.end(frozenset({1}))
+    assert replies.answers == [(7, encode_value(frozenset({1})))]
+
+
+@pytest.mark.asyncio
+async def test_a_safe_state_that_could_not_be_sent_to_its_end_is_reported() -> None:
+    async def fail(error: BaseException) -> dict[str, Any]:
+        raise error
+
+    replies = Replies()
+    for number, error in enumerate((asyncio.CancelledError(), InvalidCommand("not this"), ValueError("odd"))):
+        sending: asyncio.Task[dict[str, Any]] = asyncio.ensure_future(fail(error))
+        await asyncio.wait([sending])
+        replies.requests._under_way[number] = None
+        assert replies.requests.sends_safe_state
+        assert replies.requests.unfinished == ()
+        replies.requests._safe_sent(number, sending)
+        assert not replies.requests.sends_safe_state
+    assert [(number, type(error)) for number, error in replies.errors] == [
+        (0, WriteUnconfirmed),
+        (1, InvalidCommand),
+        (2, ValueError),
+    ]
+    assert replies.answers == []

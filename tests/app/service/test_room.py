@@ -23,7 +23,7 @@ from busmaster.errors import NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport.pump import Pump
-from tests.app.service.lines import Served, on_a_line, on_a_served_line, raw
+from tests.app.service.lines import Served, on_a_line, on_a_served_line, raw, until
 
 NODE = cast("Requester", SimpleNamespace(label="node 5", line="line", address=5))
 COMMAND = hcp2.Read(1)
@@ -78,8 +78,9 @@ def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch
         room = full(monkeypatch)
         with pytest.raises(
             NotStarted, match="the time of the request is over, and 1 requests of this program have no reply yet"
-        ):
+        ) as caught:
             await room.wait(RequestOptions(start_within=0.5), NODE, COMMAND)
+        assert (caught.value.label, caught.value.command) == ("node 5", str(COMMAND))
         gone = asyncio.ensure_future(room.wait(ORDINARY, NODE, COMMAND))
         await asyncio.sleep(0)
         gone.cancel()
@@ -177,3 +178,72 @@ async def test_many_readers_of_a_stream_get_a_message_a_few_in_each_turn_of_the_
     assert gone.turn is None, "one that has left gets no message"
     for reader in readers[:-1]:
         source.leave(reader, 1)
+
+
+class News(Broadcast):
+    """A source of which messages are sent when a test says so."""
+
+    def __init__(self) -> None:
+        self.begun = self.ended = 0
+        self.messages: asyncio.Queue[bytes | Exception] = asyncio.Queue()
+        super().__init__(self._count_end)
+
+    def _count_end(self) -> None:
+        self.ended += 1
+
+    async def _bodies(self) -> AsyncGenerator[tuple[str, Raw], None]:
+        self.begun += 1
+        while not isinstance(message := await self.messages.get(), Exception):
+            yield "news", Raw(message)
+        if not isinstance(message, StopIteration):
+            raise message
+
+
+class NewsReader:
+    """A client that keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.received: list[tuple[int, str]] = []
+
+    def notify(self, stream: int, method: str, body: Raw) -> None:
+        self.received.append((stream, bytes(body).decode()))
+
+    def notify_surely(self, stream: int, method: str, body: Raw, part: int = 0) -> None:
+        self.received.append((stream, method))
+
+
+@pytest.mark.asyncio
+async def test_a_source_runs_once_for_all_its_readers_until_the_last_has_left() -> None:
+    news, first, second = News(), NewsReader(), NewsReader()
+    for reader, stream in ((first, 1), (first, 2), (second, 1)):
+        news.join(reader, stream)
+    news.messages.put_nowait(b"1")
+    await until(lambda: second.received)
+    news.leave(first, 1)
+    news.leave(first, 9)  # there is none
+    news.messages.put_nowait(b"2")
+    await until(lambda: len(second.received) == 2)
+    assert first.received == [(1, "1"), (2, "1"), (2, "2")]
+    assert (news.begun, news.ended) == (1, 0)
+    news.leave(first, 2)
+    news.leave(second, 1)
+    assert news.ended == 1
+    assert news._task is not None
+    await asyncio.wait([news._task])
+    assert news._task.cancelled()
+    assert second.received == [(1, "1"), (1, "2")]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(("end", "logged"), [(StopIteration(), []), (ValueError("odd"), ["a stream ended"])])
+async def test_a_source_that_ends_or_fails_informs_all_its_readers(
+    end: Exception, logged: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    news, first, second = News(), NewsReader(), NewsReader()
+    for reader, stream in ((first, 1), (first, 2), (second, 1)):
+        news.join(reader, stream)
+    news.messages.put_nowait(end)
+    await until(lambda: second.received)
+    assert (first.received, second.received) == ([(1, "ended"), (2, "ended")], [(1, "ended")])
+    assert news.ended == 1
+    assert [record.getMessage() for record in caplog.records] == logged
