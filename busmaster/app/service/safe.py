@@ -10,6 +10,7 @@ from busmaster.app.service.authorisation import Authorisation, SafeWrites
 from busmaster.app.service.failures import bus_error_of, error_data
 from busmaster.app.service.fields import BusErrorData
 from busmaster.app.service.peers import Peer
+from busmaster.app.service.values import number_text
 from busmaster.errors import BusError, InvalidCommand
 
 SafeResult: TypeAlias = dict[str, BusErrorData | None]
@@ -70,4 +71,4 @@ def outcomes_of(decoded: SafeResult) -> dict[str, BusError | None]:
 
 
 def _text(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {value}" for name, value in values.items()) or "nothing"
+    return ", ".join(f"{name} = {number_text(value)}" for name, value in values.items()) or "nothing"

@@ -158,6 +158,20 @@ def test_of_urgent_requests_too_only_so_many_may_be_unanswered(tmp_path: Path, m
     on_a_served_line(tmp_path, story)
 
 
+def test_a_request_with_options_has_no_place_of_the_urgent_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 3)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with busy(line):
+            reads = (Hcp2Controller(remote, 5).read(1, retries=1, priority=Priority.COMMAND) for _ in range(5))
+            ended = await asyncio.gather(*reads, return_exceptions=True)
+        assert [type(end) for end in ended if isinstance(end, Exception)] == [BacklogFull] * 2
+
+    on_a_served_line(tmp_path, story)
+
+
 async def asked(client: Raw, number: int, method: str, **params: Any) -> dict[str, Any]:
     """Return the answer to a question, whatever news come before it."""
     await client.say(method=method, params=params, id=number)
