@@ -179,6 +179,7 @@ def test_it_is_sent_again_when_it_is_requested_again_and_at_once_only_once(tmp_p
             assert both == [{"winder/speed": None}] * 2
             assert not service.line.safe_writes.under_way
             assert len(records) == count
+        await Hcp2Controller(remote, 5).write(10, 200)  # the line goes on
 
     on_a_line(tmp_path, TEXT + SAFE, story)
 
