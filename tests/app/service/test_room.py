@@ -81,6 +81,12 @@ def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch
         ) as caught:
             await room.wait(RequestOptions(start_within=0.5), NODE, COMMAND)
         assert (caught.value.label, caught.value.command) == ("node 5", str(COMMAND))
+        loop = asyncio.get_running_loop()
+        for options in (RequestOptions(finish_within=0.5), RequestOptions(start_within=0.5, finish_within=5.0)):
+            began = loop.time()
+            with pytest.raises(NotStarted):
+                await room.wait(options, NODE, COMMAND)
+            assert loop.time() - began == 0.5
         gone = asyncio.ensure_future(room.wait(ORDINARY, NODE, COMMAND))
         await asyncio.sleep(0)
         gone.cancel()

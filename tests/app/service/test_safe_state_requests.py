@@ -184,6 +184,21 @@ def test_it_is_sent_again_when_it_is_requested_again_and_at_once_only_once(tmp_p
     on_a_line(tmp_path, TEXT + SAFE, story)
 
 
+@pytest.mark.asyncio
+async def test_it_is_cancelled_when_the_owner_ends_which_sends_it_itself() -> None:
+    authorisation: Any = None
+    requests = SafeStateRequests(authorisation)
+    await requests.close()  # there is none
+    sending: Any = asyncio.ensure_future(asyncio.Event().wait())
+    requests._sending = sending
+    await asyncio.sleep(0)
+    assert requests.under_way
+    async with asyncio.timeout(PATIENCE):
+        await requests.close()
+    assert sending.cancelled()
+    assert not requests.under_way
+
+
 def test_a_part_of_it_is_another_safe_state(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         for other, shown in (({}, "nothing"), ({"winder/speed": 0}, "winder/speed = 0")):
