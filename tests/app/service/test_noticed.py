@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import hashlib
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -114,9 +114,12 @@ def test_a_write_to_all_makes_the_samples_of_each_node_stale(tmp_path: Path) -> 
             bus.groups[0].demand()
             snapshot = await anext(cycles)
             assert point.node.latest(point) is snapshot[point]
+            touched: list[Mapping[str, object]] = []
+            remote.on_touched.append(touched.append)
             await MentorDrive(bus, 14).write_all("1.17", 20)
             await MentorDrive(remote, 14).read("1.18")  # what was told before has come
             assert point.node.latest(point) is None
+            assert [(body["all"], body["items"]) for body in touched] == [(True, None)]
 
     asyncio.run(run())
 

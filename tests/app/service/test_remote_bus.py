@@ -422,6 +422,8 @@ def test_an_owner_that_ends_tells_what_became_of_each_request(tmp_path: Path) ->
                 waiting = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 1))
                 await until(lambda: ext.line_statistics(line.bus).backlog)
                 await line.service.__aexit__(None, None, None)
+                assert line.service.clients == ()
+                assert len(line.records) == 2, "what became of them is known when the service has ended"
                 with pytest.raises(WriteUnconfirmed, match="the program that owns the line ends"):
                     await writing
                 with pytest.raises(BusClosed, match="the program that owns the line ends"):

@@ -199,6 +199,23 @@ async def test_it_is_cancelled_when_the_owner_ends_which_sends_it_itself() -> No
     assert not requests.under_way
 
 
+def test_who_waits_for_it_when_the_owner_ends_is_informed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def hold(*_: object) -> dict[str, Any]:
+        await asyncio.Event().wait()
+        return {}
+
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        monkeypatch.setattr(SafeStateRequests, "_send", hold)
+        asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
+        await until(lambda: service.line.safe_writes.under_way)
+        await service.__aexit__(None, None, None)
+        with pytest.raises(WriteUnconfirmed, match="the program that owns the line ends"):
+            await asking
+        await service.__aenter__()  # for its context to leave
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
 def test_a_part_of_it_is_another_safe_state(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         for other, shown in (({}, "nothing"), ({"winder/speed": 0}, "winder/speed = 0")):

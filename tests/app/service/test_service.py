@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import socket
 import stat
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.picture import Picture
 from busmaster.app.service.rights import Role
-from busmaster.emulator.line import Line
+from busmaster.bus.meaning import Meaning
+from busmaster.emulator.line import Echo, Line
 from busmaster.errors import LineDown
 from busmaster.registry import make_device
 from tests.app.service.lines import Raw, Served, on_a_line, on_a_served_line, raw, served, until
@@ -141,6 +144,8 @@ def test_nothing_of_it_stays_on_the_bus_and_its_clients_are_disconnected(tmp_pat
                 stranger, writer = await asyncio.open_unix_connection(path)
                 await until(lambda: service.strangers)
                 address = service.tcp_address
+            assert service.strangers == 0
+            assert not bus._streams
             assert await stranger.read() == b""
             writer.close()
             with pytest.raises(LineDown, match="has ended"):
@@ -214,5 +219,83 @@ def test_a_token_that_is_withdrawn_before_the_first_message_is_not_admitted(tmp_
                 said = await Raw(connection).ask("hello", versions=[3])
                 assert said["error"]["message"] == "this token is not valid any more"
             assert line.service.clients == ()
+
+    asyncio.run(run())
+
+
+def test_the_name_of_the_user_is_known_and_the_socket_given_to_its_group_before_a_program_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[int, int]] = []
+    found: list[bool] = []
+
+    async def find() -> None:
+        await asyncio.sleep(0)
+        found.append(True)
+
+    async def run() -> None:
+        monkeypatch.setattr("busmaster.app.service.service.find_name", lambda _: asyncio.ensure_future(find()))
+        monkeypatch.setattr(os, "chown", lambda _, user, group: given.append((user, group)))
+        async with (
+            Bus(MemoryPort(Line(Hcp2Controller.profile.line, []))) as bus,
+            Service(bus, path=tmp_path / "line.sock", group=4711),
+        ):
+            assert found == [True]
+            assert given == [(-1, 4711)]
+
+    asyncio.run(run())
+
+
+def test_a_service_that_cannot_serve_one_of_its_sockets_serves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    servers: list[asyncio.Server] = []
+    serve = Service._serve_at
+
+    async def serve_once(service: Service, opened: socket.socket) -> asyncio.Server:
+        if servers:
+            opened.close()
+            raise OSError("no more of them")
+        servers.append(await serve(service, opened))
+        return servers[-1]
+
+    async def run() -> None:
+        monkeypatch.setattr(Service, "_serve_at", serve_once)
+        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, []))) as bus:
+            with pytest.raises(OSError, match="no more of them"):
+                await Service(bus, path=tmp_path / "line.sock", listen=("127.0.0.1", 0)).__aenter__()
+        assert [server.is_serving() for server in servers] == [False]
+        assert os.listdir(tmp_path) == []
+
+    asyncio.run(run())
+
+
+def test_events_and_refusals_from_its_start_on_are_kept_for_those_who_look_later(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = replace(Hcp2Controller(line.bus, 5).point("11"), meaning=Meaning(high=5))
+        await point.write(6)
+        line.bus.poll_group("axes", period=60, points=[point]).demand()
+        await until(lambda: line.service.line.journal.entries)
+        line.authorisation.refusals.note_rate("user 1001")
+        picture = Picture()
+        await remote.overview(picture.receive)
+        await until(lambda: picture.frame)
+        assert picture.frame is not None
+        texts = [text for _, text in picture.frame.events]
+        assert texts[0] == "5/11 = 6 is above its high of 5"
+        assert any(text.endswith("connects again and again: 1 from user 1001") for text in texts)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_line_whose_adapter_has_an_echo_says_so(tmp_path: Path) -> None:
+    async def run() -> None:
+        line = Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False, echo=Echo())
+        async with (
+            Bus(MemoryPort(line)) as bus,
+            Service(bus, path=tmp_path / "line.sock") as service,
+            connect(service.address) as remote,
+        ):
+            assert remote.about["echo"] is True
 
     asyncio.run(run())
