@@ -34,6 +34,7 @@ from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoRep
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
+from tests.patience import PATIENCE
 from tests.stories import in_virtual_time
 
 
@@ -233,7 +234,7 @@ def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> Non
         assert (told["high"], told["low"], told["command"]) == (40, None, "read element 10")
         times = told["timeline"]
         assert times["queued"] <= times["started"] < times["first_byte"] <= times["last_byte"]
-        assert times["started"] - 0.02 < told["due"] <= times["started"]
+        assert times["started"] - PATIENCE < told["due"] <= times["started"]
         with pytest.raises(InvalidCommand, match="no poll group 'none'"):
             await view.details("none", "5/10")
 
