@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import connect as connect_websocket
 
-from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect, ext
+from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, bounds, connect, ext
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.picture import Picture
@@ -299,3 +299,18 @@ def test_a_line_whose_adapter_has_an_echo_says_so(tmp_path: Path) -> None:
             assert remote.about["echo"] is True
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize(("origin", "named"), [("192.0.2.1", "1 from 192.0.2.1"), (4_000_001, "1 from user 4000001")])
+def test_connections_that_come_too_fast_are_counted_and_reported(origin: str | int, named: str, tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        told: list[str] = []
+        line.service.report = told.append
+        most = bounds.FREE_CONNECTIONS + bounds.MOST_DELAYED
+        delays = [line.service.delay(origin, 17) for _ in range(most + 1)]
+        assert [number for number, delay in enumerate(delays) if delay is None] == [most]
+        assert line.service.refused == 1
+        assert line.authorisation.refusals.connections == {"unknown": 1}
+        assert [text.rpartition(": ")[2] for text in told] == [named]
+
+    on_a_line(tmp_path, story)
