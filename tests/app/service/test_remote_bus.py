@@ -822,3 +822,30 @@ def test_a_sample_is_not_latest_if_it_failed_or_was_requested_before_the_last_wr
         assert remote.latest(point) is sample
 
     on_a_served_line(tmp_path, story)
+
+
+def test_an_ordinary_request_waits_for_its_place_and_gives_it_back_and_others_need_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", 1)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        node, read = Hcp2Controller(remote, 5).node, hcp2.Read(1)
+        for priority in (Priority.COMMAND, Priority.URGENT):
+            await node.request(read, priority=priority)
+            assert remote.room._free == 1
+        assert remote.room.take()
+        await node.request(read, priority=Priority.URGENT)
+        async with node.exclusive(max_hold=5.0) as held:
+            await held.request(read)
+        requested = Requested(remote, monkeypatch)
+        waiting = asyncio.ensure_future(node.request(read, start_within=50.0))
+        await until(lambda: remote.room._waiting)
+        remote._ahead += 10.0  # seconds that it waits
+        remote.room.give_back()
+        await waiting
+        [params] = requested.of("request")
+        assert params.options.start_within <= 40.0
+        assert remote.room._free == 1
+
+    on_a_served_line(tmp_path, story)
