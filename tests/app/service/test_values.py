@@ -158,6 +158,7 @@ class Word(enum.IntFlag):
         (inf, None, "inf"),
         (nan, 1, "nan"),
         ("a text", 2, "a text"),
+        (frozenset({16, 8, 1}), None, "1,8,16"),
     ],
 )
 def test_a_value_is_shown_with_its_digits_and_names(value: Any, precision: int | None, text: str) -> None:
@@ -176,6 +177,7 @@ def test_a_value_is_shown_with_its_digits_and_names(value: Any, precision: int |
         (-inf, None, {}),
         (2.0**53, 2.0**53, {}),
         ("a text", "a text", {}),
+        (frozenset({16, 8, 1}), [1, 8, 16], {}),
     ],
 )
 def test_a_value_in_json_is_a_number_and_its_name_is_beside_it(value: Any, written: Any, names: dict[str, Any]) -> None:
