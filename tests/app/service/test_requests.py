@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import AsyncIterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,11 +12,14 @@ from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
+from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, bounds
 from busmaster.app.service.authorisation import FRESH
+from busmaster.app.service.client import MOST_FAILED
 from busmaster.app.service.fields import shortened
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, encode_value
+from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.requests import Requests
+from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, WriteUnconfirmed
 from busmaster.ext import CommandOptions
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
@@ -307,3 +311,201 @@ async def test_a_safe_state_that_could_not_be_sent_to_its_end_is_reported() -> N
         (2, ValueError),
     ]
     assert replies.answers == []
+
+
+# checks and reports
+
+
+def test_a_check_reports_the_first_refused_write_of_several_and_writes_nothing(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        Hcp2Controller(line.bus, 5).element(1).limit(minimum=5, maximum=10)
+        node = {"protocol": "hcp2", "address": 5}
+        right, wrong, zero = (write(value)["command"] for value in (7.0, 11.0, 0.0))
+        async with raw(line) as client:
+            assert (await client.ask("check", **node, commands=[right, READ["command"], right]))["result"] is None
+            assert (await client.ask("check", **node, commands=[]))["result"] is None
+            assert line.records == []
+            said = await client.ask("check", **node, commands=[right, wrong])
+            assert "maximum of 10" in said["error"]["message"]
+            assert line.audit() == [("5/write element 1 = 11", "refused")]
+            assert "maximum of 10" in line.records[0].error
+            assert "minimum of 5" in (await client.ask("check", **node, commands=[zero]))["error"]["message"]
+            assert (await client.ask("check", **node, commands=[zero], stop=True))["result"] is None
+            said = await client.ask("check", **node, commands=[right], stop=True)
+            assert "is not a stop" in said["error"]["message"]
+            line.authorisation.read_only = True
+            said = await client.ask("check", **node, commands=[READ["command"], right])
+            assert said["error"]["message"] == "node 5: this line is read-only"
+            assert line.records[-1].error == "node 5: this line is read-only"
+        assert (await line.bus.statistics()).exchanges == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_refusals_that_another_process_reports_are_counted_and_unusable_ones_are_ignored(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        refusals = line.authorisation.refusals
+        reports: list[str] = []
+        refusals.on_report.append(reports.append)
+        async with raw(line) as client:
+
+            async def report(interface: str, kind: str, **peers: int) -> None:
+                await client.say(method="refusals", params={"interface": interface, "kind": kind, "peers": peers})
+                assert "result" in await client.ask("now")
+
+            await report("web", "logins")
+            assert refusals.logins == {"service": 0, "web": 0}  # from 0 on, for metrics
+            unusable = {"no": 0, "too many": MOST_FAILED + 1, "x" * (bounds.LONGEST_SENDER + 1): 7, "\x1b[2J": 7}
+            await report("web", "logins", **{"10.0.0.1": 3, "y" * bounds.LONGEST_SENDER: MOST_FAILED}, **unusable)
+            assert refusals.logins["web"] == MOST_FAILED + 3
+            assert reports[0].startswith("3 failed logins at web: 3 from 10.0.0.1")
+            await report("modbus-tcp", "requests", **{"10.0.0.1": 2})
+            for name, kind in (("service", "logins"), ("Web page", "logins"), ("web", "murders")):
+                await report(name, kind, **{"10.0.0.1": 2})
+            assert refusals.logins == {"service": 0, "web": MOST_FAILED + 3}
+            assert refusals.at_interfaces == {("modbus-tcp", "requests"): 2}
+            await report("opcua", "connections", **{f"peer {n}": 1 for n in range(bounds.MOST_REPORTED + 9)})
+            assert refusals.at_interfaces["opcua", "connections"] == bounds.MOST_REPORTED + 1
+
+    on_a_line(tmp_path, story)
+
+
+# what changes how the line is polled
+
+
+def test_a_pause_and_a_suspension_are_noted_with_the_program_until_they_end(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        line.bus.poll_group("axes", period=60, points=[Hcp2Controller(line.bus, 5).point("1")])
+        node = {"protocol": "hcp2", "address": 5}
+        async with raw(line) as client:
+            assert (await client.ask("pause", group="axes", paused=True))["result"] is None
+            assert [group.paused for group in line.bus.groups] == [True]
+            assert (await client.ask("pause", group="axes", paused=False))["result"] is None
+            assert [group.paused for group in line.bus.groups] == [False]
+            assert (await client.ask("suspend", **node, **{"for": 60.0}))["result"] is None
+            assert [one.suspended for one in line.bus.nodes] == [True]
+            assert (await client.ask("suspend", **node, **{"for": 0}))["result"] is None
+            assert [one.suspended for one in line.bus.nodes] == [False]
+            for wrong in ({"protocol": "mentor", "address": 5}, {"protocol": "hcp2", "address": 6}):
+                said = await client.ask("suspend", **wrong, **{"for": 60.0})
+                assert "is not on this line; check protocol and address" in said["error"]["message"]
+            [program] = line.service.clients
+        assert [text for _, text in line.service.line.journal.entries if " by " in text] == [
+            f"{what} by {program.peer}"
+            for what in ("axes is paused", "axes is resumed", "node 5 is suspended for 60 s", "node 5 is resumed")
+        ]
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_pauses_a_group_only_if_it_may_write_to_each_of_its_nodes(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        points = [Hcp2Controller(line.bus, address).point("1") for address in (5, 6)]
+        group = line.bus.poll_group("axes", period=60, points=points)
+        async with raw(line) as client:
+            for allowed, paused in (((), False), ((5,), False), ((6,), False), ((5, 6), True)):
+                only = {("hcp2", address): None for address in allowed}
+                line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.WRITE, only)})
+                said = await asked(client, 2, "pause", group="axes", paused=True)
+                assert ("error" not in said, group.paused) == (paused, paused)
+
+    on_a_line(tmp_path, story)
+
+
+# limits of one program
+
+
+def test_a_program_has_so_many_poll_groups_and_each_ends_with_its_stream(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        access = Access(users={os.getuid(): Permission("user me", Role.READ)})
+        line.authorisation.access = access
+        most = RIGHTS[Role.READ].groups
+        async with raw(line) as client:
+            for stream in range(most):
+                assert "result" in await asked(client, 1, "poll", **polled(stream, name=f"{stream}"))
+            said = await asked(client, 1, "poll", **polled(most))
+            assert f"one program has {most} poll groups at most" in said["error"]["message"]
+            await client.say(method="end", params={"stream": 0})
+            assert "result" in await asked(client, 1, "poll", **polled(most, name="again"))
+            assert len(line.bus.groups) == most
+            [program] = line.service.clients
+            names = [group.name for group in line.bus.groups]
+            assert names[0] == f"1 ({program.peer.short}-{program._number})"
+        await line.alone()
+        assert line.bus.groups == ()
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_poll_group_has_the_phase_of_its_program_and_the_beginning_of_its_name(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            assert "result" in await asked(client, 1, "poll", **polled(7, name="n" * 99, phase=12.5, priority=3))
+            [group] = line.bus.groups
+            assert group.name.startswith(f"{'n' * 40} (")
+            assert (group.planned().phase, group.planned().priority) == (12.5, Priority.BACKGROUND)
+
+    on_a_line(tmp_path, story)
+
+
+def test_points_that_were_gathered_are_polled_together_and_are_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.client.MOST_POLLED_POINTS", 3)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_POLLED", 2)
+
+    def points(*elements: int, command: str = "read", **more: Any) -> list[dict[str, Any]]:
+        node = {"protocol": "hcp2", "address": 5}
+        return [{**node, "item": f"{n}", "command": {"command": command, "element": n, **more}} for n in elements]
+
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for element in (1, 2):
+                assert "result" in await asked(client, 1, "gather", stream=7, points=points(element))
+            said = await asked(client, 1, "gather", stream=7, points=points(3, 4))
+            assert "a poll group of a program has 3 points at most" in said["error"]["message"]
+            assert "result" in await asked(client, 1, "gather", stream=8, points=points(1, 2, 3))
+            said = await asked(client, 1, "gather", stream=9, points=points(1))
+            assert "one program has 2 poll groups at most" in said["error"]["message"]
+            await client.say(method="end", params={"stream": 8})
+            said = await asked(client, 1, "gather", stream=9, points=points(1, command="write", values=[1.0]))
+            assert "a poll group reads: it writes nothing" in said["error"]["message"]
+            assert "result" in await asked(client, 1, "poll", **polled(7, points=points(3)))
+            assert [point.item for point in line.bus.groups[0].points] == ["1", "2", "3"]
+            assert "result" in await asked(client, 1, "gather", stream=9, points=points(1))
+            assert "result" in await asked(client, 1, "gather", stream=10, points=points(1))  # the first is a group now
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_has_so_many_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.client.MOST_STREAMS", 2)
+
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            assert (await asked(client, 1, "events", stream=1))["result"] == {}
+            assert (await asked(client, 1, "events", stream=2))["result"] == {}
+            said = await asked(client, 1, "events", stream=3)
+            assert "one program has 2 streams at most" in said["error"]["message"]
+            await client.say(method="end", params={"stream": 1})
+            assert "error" in await asked(client, 1, "events", stream=2)
+            assert (await asked(client, 1, "exchanges", stream=1))["result"] == {}
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_names_so_many_nodes_and_known_ones_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.client.MOST_NODES", 2)
+
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for address in (5, 6, 5):
+                said = await client.ask("node", protocol="hcp2", address=address)
+                assert said["result"] == {"label": f"node {address}", "health": "unknown"}
+            said = await client.ask("node", protocol="hcp2", address=7)
+            assert "one program names 2 nodes at most" in said["error"]["message"]
+            assert (await client.ask("request", **READ))["result"] == 0
+            assert (await client.ask("node", protocol="hcp2", address=5))["result"]["health"] == "up"
+            assert "result" in await client.ask("node", protocol="hcp2", address=6, retries=2)
+
+    on_a_line(tmp_path, story)
