@@ -14,6 +14,7 @@ from dataclasses import replace
 import pytest
 
 from busmaster.app.service.authorisation import FRESH, Authorisation, WriteRequest, outcome_of
+from busmaster.app.service.permission import Access
 from busmaster.app.service.record import LONGEST_SHOWN, Outcome, WriteRecord, cut, this_user
 from busmaster.app.service.values import write_fields
 from busmaster.bounds import MOST_AT_ONCE
@@ -35,6 +36,7 @@ from busmaster.errors import (
     VerifyFailed,
     WriteUnconfirmed,
 )
+from busmaster.ext import Command
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import make_device
@@ -400,3 +402,95 @@ def test_a_user_without_a_name_is_a_number(error: Exception, monkeypatch: pytest
 
     monkeypatch.setattr(getpass, "getuser", getuser)
     assert this_user() == str(os.getuid())
+
+
+@pytest.mark.parametrize("error", [OverflowError("too large"), TypeError("no number"), ZeroDivisionError("no scale")])
+def test_a_value_that_cannot_be_encoded_is_refused_with_the_reason_and_raises_nothing(error: Exception) -> None:
+    def encode(_: object) -> Command[None]:
+        raise error
+
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        point = replace(controller.point("1"), encode=encode)
+        record = await authorisation.write(replace(request(controller, 1), point=point, id="a1"))
+        assert (record.outcome, record.error) == (Outcome.REFUSED, f"the value cannot be sent: {error}")
+        assert records == [record]
+        assert (record.id, record.interface, record.by, record.value) == ("a1", "mqtt", "a test", 1)
+        assert (await authorisation.write(request(controller, 1))).ok
+
+    at_the_authorisation(story)
+
+
+NOT_DURABLE = "the value was written, but its audit entry is not on the disk: "
+
+
+@pytest.mark.parametrize(
+    ("reason", "outcome", "error"),
+    [
+        ("", Outcome.WRITTEN, ""),
+        ("disk full", Outcome.UNCONFIRMED, "the value was written, but its audit entry is not on the disk: disk full"),
+        (
+            "x" * 300,
+            Outcome.UNCONFIRMED,
+            f"{'the value was written, but its audit entry is not on the disk: ':x<200}...",
+        ),
+    ],
+    ids=["", "short", "long"],
+)
+def test_a_write_whose_entry_is_not_on_the_disk_is_unconfirmed_with_the_reason(
+    reason: str, outcome: Outcome, error: str
+) -> None:
+    async def durable() -> str:
+        return reason
+
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        def record(entry: WriteRecord) -> Awaitable[str]:
+            records.append(entry)
+            return durable()
+
+        authorisation.record = record
+        ended = await authorisation.write(request(controller, 1))
+        assert (ended.outcome, ended.error.partition(" (")[0]) == (outcome, error)
+        assert [entry.outcome for entry in records] == [Outcome.WRITTEN]  # as the other outputs have it
+
+    at_the_authorisation(story)
+
+
+def test_each_function_that_waits_for_other_roles_or_tokens_is_called() -> None:
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        called: list[str] = []
+        authorisation.on_access += [lambda: called.append("first"), lambda: called.append("second")]
+        authorisation.take_secrets({"hmi": b"1"})
+        authorisation.take_secrets({"logger": b"2"})
+        assert authorisation.access.secrets == {"logger": b"2"}
+        authorisation.access = Access(secrets={"hmi": b"3"})
+        assert called == ["first", "second"] * 3
+
+    at_the_authorisation(story)
+
+
+def test_a_command_that_expired_before_1970_has_expired() -> None:
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        for expires, arrived in ((0.0, None), (-1.0, authorisation.bus.now())):
+            record = await authorisation.write(replace(request(controller, 1), expires=expires, arrived=arrived))
+            assert record.error == "the command has expired; nothing was sent"
+
+    at_the_authorisation(story)
+
+
+@pytest.mark.parametrize(("value", "shown"), [(-1e99, -1e99), (-1e101, "-1e+101"), (1e100, "1e+100"), ("on", "'on'")])
+def test_a_number_that_is_too_large_is_on_record_as_text(value: object, shown: object) -> None:
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        assert authorisation.refuse(replace(request(controller, 1), value=value), "no").value == shown
+
+    at_the_authorisation(story)
+
+
+def test_an_entry_has_the_time_of_the_wall_clock_and_the_user() -> None:
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        await asyncio.sleep(1000)  # of virtual time
+        before = authorisation.bus.wall_time()
+        record = await authorisation.write(request(controller, 1))
+        assert before <= record.time <= authorisation.bus.wall_time()
+        assert record.user == this_user()
+
+    at_the_authorisation(story)

@@ -7,14 +7,16 @@ import os
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed
 
 from busmaster import Hcp2Controller, bounds, connect
-from busmaster.app.service.admission import ConnectionRate, connecting_peer, stranger_to_close
+from busmaster.app.service.admission import Admission, ConnectionRate, connecting_peer, stranger_to_close
 from busmaster.app.service.client_connection import ClientConnection
+from busmaster.app.service.messages import Malformed
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.refusals import LimitedReport, Refusals
 from busmaster.app.service.rights import RIGHTS, Role
@@ -344,3 +346,52 @@ def test_a_program_that_has_to_wait_is_let_in_all_the_same(tmp_path: Path) -> No
         await crowd.come(Role.WRITE)
 
     among(tmp_path, story)
+
+
+class Seat:
+    """A client, and its connection, as far as admission looks at them."""
+
+    def __init__(self, role: Role, *, in_safe_place: bool = False, sends: bool = False) -> None:
+        self.permission = Permission("user me", role)
+        self.in_safe_place = in_safe_place
+        self.requests = SimpleNamespace(sends_safe_state=sends)
+        self.websocket = self
+        self.aborted = False
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+def test_programs_that_are_sending_the_safe_state_keep_their_places_and_idle_ones_do_not() -> None:
+    async def run() -> None:
+        refusals = Refusals()
+        admission, me = Admission(refusals), Permission("user me", Role.ADMIN)
+        others = [Seat(Role.ADMIN) for _ in range(bounds.MOST_CLIENTS + bounds.RESERVED_FOR_ADMINS)]
+        safe = [Seat(Role.ADMIN, in_safe_place=True, sends=True) for _ in range(bounds.RESERVED_FOR_SAFE)]
+
+        def admit(seats: list[Seat], permission: Permission = me, *, safe_only: bool = True) -> bool:
+            clients: Any = {seat: seat for seat in seats}
+            return admission.admit(permission, clients, safe_only=safe_only)
+
+        assert admit(others[1:] + safe) is False  # an ordinary place is free
+        assert admit(others + safe[1:]) is True
+        assert refusals.connections == {}
+        with pytest.raises(Malformed, match=f"{len(safe)} programs are already sending the safe state; wait for them"):
+            admit(others + safe)
+        assert refusals.connections == {"safe": 1}
+        assert not any(seat.aborted for seat in others + safe)
+        safe[-1].requests.sends_safe_state = False
+        assert admit(others + safe) is True
+        assert [seat.aborted for seat in safe] == [*[False] * (len(safe) - 1), True]
+        places = bounds.MOST_CLIENTS + bounds.RESERVED_FOR_ADMINS
+        for permission, safe_only in ((me, False), (Permission("user me", Role.READ), True)):
+            with pytest.raises(Malformed, match="places for role"):
+                admit(others, permission, safe_only=safe_only)
+        with pytest.raises(Malformed) as refused:
+            admit(others, safe_only=False)
+        assert str(refused.value) == (
+            f"all {places} places for role admin are taken; {bounds.RESERVED_FOR_WRITERS} more are for role write"
+        )
+        assert refusals.connections == {"safe": 1, "admin": 2, "read": 1}
+
+    run_in_virtual_time(run())

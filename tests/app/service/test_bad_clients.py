@@ -24,8 +24,10 @@ from busmaster.app.service.client_messages import ClientMessage, NoParams
 from busmaster.app.service.folder import Owner, ServedSocket, find_owner, line_name, owners, runtime_folder, socket_path
 from busmaster.app.service.messages import encode_request
 from busmaster.app.service.outbox import Outbox
+from busmaster.app.service.owner_messages import TouchedParams
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.typed import Raw
+from busmaster.bus.node import Node
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.protocols.modbus.handle import ModbusUnit
@@ -587,5 +589,53 @@ def test_a_program_learns_how_many_messages_of_a_stream_it_was_too_slow_for(tmp_
             line.service._clients[visitor].writable()
             heard = [await client.hear() for _ in range(bounds.MOST_UNREAD)]
             assert {message["params"]["stream"] for message in heard} == {7}
+
+    on_a_line(tmp_path, story)
+
+
+def test_messages_that_wait_replace_only_earlier_ones_of_the_same_subject(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        nodes = [Node.of(Hcp2Controller(line.bus, address)) for address in (5, 6, 7)]
+        for node in nodes:
+            node.note_stop()  # before the program names it
+        async with raw(line) as client:
+            for address in (5, 6):
+                assert "result" in await client.ask("node", protocol="hcp2", address=address)
+            [program] = line.service.clients
+            connection = line.service._clients[program]
+            connection.websocket.full = True
+            for _ in range(bounds.MOST_UNREAD + 3):
+                program.notify(7, "exchanges", Raw(b'{"now": 0, "left_out": 0, "exchanges": []}'))
+            for set_ in (1, 2):
+                program.notify_surely(7, "rows", Raw(b'{"set": %d, "first": 0, "rows": []}' % set_), 0)
+                program.notify_surely(7, "rows", Raw(b'{"set": %d, "first": 50, "rows": []}' % set_), 1)
+                program.notify_surely(7, "values", Raw(b'{"set": %d, "first": 0, "values": []}' % set_), 0)
+                program.notify_surely(8, "rows", Raw(b'{"set": %d, "first": 0, "rows": []}' % set_), 0)
+                for address in (5, 6):
+                    program.notify_touched(TouchedParams("hcp2", address, float(set_), True, None), address)
+                for node in nodes:
+                    node.note_stop()
+                line.authorisation.read_only = set_ == 2
+                program.notify_access()
+            connection.websocket.full = False
+            connection.writable()
+            heard = [await client.hear() for _ in range(bounds.MOST_UNREAD + 9)]
+            assert "result" in await client.ask("now")  # and nothing else has arrived
+            assert program.dropped[7] == 3
+            await client.say(method="end", params={"stream": 7})
+            assert "result" in await client.ask("now")
+            assert program.dropped[7] == 0  # for a later stream of this number
+        exchanges = [message["params"]["dropped"] for message in heard if message["method"] == "exchanges"]
+        assert exchanges == [0] * (bounds.MOST_UNREAD - 2) + [1, 2]
+        params = [message["params"] for message in heard[bounds.MOST_UNREAD :]]
+        assert [(one["stream"], one["dropped"], one["body"]["set"], one["body"]["first"]) for one in params[:4]] == [
+            (7, 3, 2, 0),
+            (7, 3, 2, 50),
+            (7, 3, 2, 0),
+            (8, 0, 2, 0),
+        ]
+        assert [(one["address"], one["when"]) for one in params[4:6]] == [(5, 2.0), (6, 2.0)]
+        assert [(one["address"], one["stops"]) for one in params[6:8]] == [(5, 2), (6, 2)]
+        assert params[8] == {"read_only": True}
 
     on_a_line(tmp_path, story)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
@@ -13,11 +14,13 @@ from typing import Any
 
 import pytest
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, connect
+from busmaster import Bus, Hcp2Controller, MemoryPort, MicroFlexDrive, Quality, RemoteBus, Sample, connect, ext
 from busmaster.app.service import overview, remote_overview
+from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client_messages import WriteParams
+from busmaster.app.service.fields import NonFinite
 from busmaster.app.service.link import PendingRequest
-from busmaster.app.service.overview import COUNTED_AT_ONCE, INTERVAL, PART, Part
+from busmaster.app.service.overview import COUNTED_AT_ONCE, INTERVAL, PART, EventLog, Overview, Part
 from busmaster.app.service.owner_messages import NoBody, StreamMessage
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.picture import Picture
@@ -33,6 +36,7 @@ from busmaster.emulator.line import Line
 from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
+from busmaster.statistics import Timeline
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 from tests.stories import in_virtual_time
@@ -423,3 +427,207 @@ async def test_the_time_for_which_a_group_was_paused_is_no_period() -> None:
         assert max(group.recent_periods) < 0.2
         assert group.statistics().jitter.highest < 0.1
         assert group.statistics().missed == 0
+
+
+# the messages of a picture
+
+
+class Screen:
+    """A client of an overview that keeps the latest message of each part."""
+
+    def __init__(self) -> None:
+        self.latest: dict[tuple[str, int], Any] = {}
+        self.count = 0
+
+    def notify(self, stream: int, method: str, body: Any) -> None:
+        raise AssertionError("a picture is not dropped")
+
+    def notify_surely(self, stream: int, method: str, body: Any, part: int = 0) -> None:
+        self.latest[method, part] = json.loads(bytes(body))
+        self.count += 1
+
+    def parts(self, method: str) -> list[Any]:
+        """Return the messages of a method in the order of their parts."""
+        return [body for (name, _), body in sorted(self.latest.items()) if name == method]
+
+
+def overview_of(bus: Bus) -> Overview:
+    return Overview(bus, Authorisation(bus), EventLog(bus), lambda: "the winder", lambda: None)
+
+
+@in_virtual_time
+async def test_each_part_names_its_place_and_a_screen_that_joins_later_gets_all_parts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(overview, "PART", 2)
+    monkeypatch.setattr(overview, "MOST_POINTS", 9)
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        points: list[Point[Any]] = [Hcp2Controller(bus, 1).point(str(element)) for element in range(1, 6)]
+        for name in ("a", "b", "c", "d", "e", "f"):
+            bus.poll_group(name, period=0.1, points=points if name in "ab" else points[:1])
+        for address in range(2, 8):
+            bus.node(hcp2.PROFILE, address)
+        pictures, first, second = overview_of(bus), Screen(), Screen()
+        pictures.join(first, 1)
+        await asyncio.sleep(2.0)
+        pictures.join(second, 1)
+        await asyncio.sleep(2.0)
+        for screen in (first, second):
+            rows, values = screen.parts("rows"), screen.parts("values")
+            assert [(body["first"], len(body["rows"])) for body in rows] == [(0, 2), (2, 2), (4, 1), (5, 2), (7, 2)]
+            assert [(body["first"], len(body["values"])) for body in values] == [(0, 2), (2, 2), (4, 1), (5, 2), (7, 2)]
+            assert {value[0] for body in values for value in body["values"]} == {0.0}
+            groups, nodes = screen.parts("groups"), screen.parts("nodes")
+            assert [(body["first"], len(body["groups"])) for body in groups] == [(0, 5), (5, 1)]
+            assert [(body["first"], len(body["nodes"])) for body in nodes] == [(0, 5), (5, 2)]
+            assert [one["address"] for body in nodes for one in body["nodes"]] == [1, 2, 3, 4, 5, 6, 7]
+            [frame] = screen.parts("frame")
+            assert (frame["points"], frame["left_out"], frame["groups"], frame["nodes"]) == (9, 5, 6, 7)
+            assert {body["set"] for body in (*rows, *values, frame)} == {1}
+        assert second.latest == {**first.latest, ("frame", 0): second.latest["frame", 0]}
+        sent = first.count
+        bus.group("a").close()
+        await asyncio.sleep(0.5)
+        assert {body["set"] for body in (*first.parts("rows")[:3], *first.parts("frame"))} == {2}
+        assert first.count > sent
+        for screen in (first, second):
+            pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
+async def test_unchanged_values_and_rows_are_sent_once() -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        group = polled(bus, "axes", "1", address=1, period=0.1)
+        await anext(aiter(group))
+        group.pause()
+        await asyncio.sleep(1.0)
+        pictures, screen = overview_of(bus), Screen()
+        pictures.join(screen, 1)
+        await asyncio.sleep(1.0)
+        seen: list[str] = []
+        screen.notify_surely = lambda stream, method, body, part=0: seen.append(method)  # type: ignore[method-assign]
+        await asyncio.sleep(5.0)
+        assert set(seen) == {"frame", "groups", "nodes"}
+        assert seen.count("frame") == pytest.approx(5.0 / INTERVAL, abs=1)
+        assert seen.count("groups") == pytest.approx(5.0 / 0.6, abs=2)  # the first picture after COUNTED_EVERY
+        pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
+async def test_the_counts_of_a_group_and_a_node_are_those_of_their_statistics() -> None:
+    devices = [make_device("hcp2", 1), make_device("microflex", 3)]
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, devices))) as bus:
+        group = polled(bus, "axes", "1", "2", address=1, period=0.1)
+        absent = Hcp2Controller(bus, 2)
+        await asyncio.gather(absent.read(1), return_exceptions=True)
+        drive = MicroFlexDrive(bus, 3)
+        await asyncio.sleep(2.05)
+        group.pause()
+        await asyncio.sleep(1.0)
+        counts, known = group.statistics(), overview._encode_groups(bus, 0).groups[0]
+        assert (known.name, known.period, known.paused, known.cycles) == ("axes", 0.1, True, counts.cycles)
+        assert (known.missed, known.achieved, known.jitter) == (counts.missed, counts.achieved, counts.jitter.p99)
+        for node, one in zip(bus.nodes, overview._encode_nodes(bus, 0).nodes, strict=True):
+            of_node = node.statistics()
+            assert (one.label, one.protocol, one.address, one.health) == (
+                node.label,
+                "hcp2",
+                node.address,
+                node.health.value,
+            )
+            assert (one.requests, one.failed, one.late) == (of_node.attempts, of_node.fruitless, of_node.late)
+            assert (one.p50, one.p99) == (of_node.latency.p50, of_node.latency.p99)
+        assert [one.kind for one in overview._encode_nodes(bus, 0).nodes] == ["hcp2", "hcp2", "microflex"]
+        row = overview._encode_point(group, drive.point("command_word"))
+        assert (row.protocol, row.kind, row.address) == ("hcp2", "microflex", 3)
+        Node.of(absent).suspend(60.0)
+        assert overview.health_text(Node.of(absent)) == "suspended"
+
+
+@in_virtual_time
+async def test_the_frame_has_the_cause_and_the_time_of_a_lost_line() -> None:
+    port = MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))
+    async with Bus(port) as bus:
+        await Hcp2Controller(bus, 1).read(1)
+        pictures = overview_of(bus)
+        pictures._journal.note("first")
+        pictures._journal.note("second")
+        frame = pictures._frame()
+        settings = bus.endpoint.settings
+        assert settings is not None
+        assert (frame.title, frame.settings) == ("the winder", f"{settings.baudrate} {settings.framing}")
+        assert (frame.state, frame.since, frame.why, frame.read_only) == ("ready", None, "", False)
+        assert [text for _, text in frame.events] == ["first", "second"]
+        assert (frame.elapsed, frame.losses) == (ext.line_statistics(bus).elapsed, 0)
+        pictures._authorisation.read_only = True
+        assert pictures._frame().read_only
+        node = bus.nodes[0]
+        node.suspend(60.0)
+        assert overview.health_text(node) == "suspended"
+        await pictures._journal.close()
+
+
+@pytest.mark.parametrize(
+    ("value", "meaning", "shown"),
+    [
+        (1.25, Meaning(precision=1), 1.25),
+        (7, Meaning(), 7),
+        (None, Meaning(), None),
+        (True, Meaning(), "1"),
+        ("text", Meaning(), "text"),
+        ((1.25, 2.0), Meaning(precision=1), "1.2,2.0"),
+    ],
+)
+def test_a_number_is_shown_as_it_is_and_anything_else_as_text(value: Any, meaning: Meaning, shown: Any) -> None:
+    point = replace(Hcp2Controller(Bus(MemoryPort(Line(hcp2.PROFILE.line))), 1).point("1"), meaning=meaning)
+    found = overview.shown(point, value)
+    assert (type(found), found) == (type(shown), shown)
+
+
+@in_virtual_time
+async def test_details_have_only_the_limits_of_the_places_of_their_point() -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        controller = Hcp2Controller(bus, 1)
+        controller.point("10").limit(minimum=-1, maximum=50, max_step=5)
+        controller.point("12").limit(writable=False)
+        point = replace(controller.point("10"), meaning=Meaning(low=-3.5, high=40))
+        other = replace(controller.point("11"), meaning=Meaning(labels={0: "off", 1: "run"}))
+        group = bus.poll_group("axes", period=60.0, points=[point, other])
+        before = overview.encode_details(bus, group, point)
+        assert (before.sample, before.hint, before.timeline, before.due) == (None, "", None, None)
+        snapshot = await anext(aiter(group))
+        details = overview.encode_details(bus, group, point)
+        assert [(limit.minimum, limit.maximum, limit.max_step, limit.writable) for limit in details.limits] == [
+            (-1, 50, 5, True)
+        ]
+        assert (details.low, details.high, details.labels) == (-3.5, 40, {})
+        sample = snapshot[point]
+        assert details.sample is not None
+        assert details.timeline is not None
+        assert (details.sample.value, details.sample.requested, details.due) == (0, sample.started, sample.due)
+        assert (details.timeline.queued, details.timeline.attempts) == (sample.timeline.queued, 1)
+        labelled = overview.encode_details(bus, group, other)
+        assert (labelled.limits, labelled.labels) == ([], {"0": "off", "1": "run"})
+        assert overview.encode_details(bus, group, replace(controller.point("12"))).limits[0].writable is False
+        await controller.write(10, 1)
+        stale = overview.encode_details(bus, group, point).sample
+        assert stale is not None
+        assert stale.quality != details.sample.quality  # as it is at present
+
+
+def test_a_sample_that_was_never_sent_has_the_time_of_its_end() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line)))
+    point = Hcp2Controller(bus, 1).point("1")
+    error = NoReply("no reply within 5 ms", hint="look at the cable")
+    sample: Sample[Any] = Sample(
+        None, error, 1.0, None, 2.0, Quality.BAD, Timeline(1.0, None, None, None, 0, 0, 0.0), 0.0
+    )
+    shown = overview._encode_value(bus, point, sample)
+    assert shown is not None
+    assert (shown.value, shown.requested, shown.error, shown.alarm) == (None, 2.0, "no reply within 5 ms", "")
+    assert overview._encode_value(bus, point, None) is None
+    endless = overview._encode_value(bus, point, sample._replace(value=float("inf"), error=None, started=1.5))
+    assert endless is not None
+    assert (endless.value, endless.requested, endless.error) == (NonFinite("inf"), 1.5, "")
