@@ -10,7 +10,14 @@ from typing import Any, NamedTuple
 import pytest
 
 from busmaster import Hcp2Controller, RemoteBus
-from busmaster.app.service.exchanges import MOST_BYTES, MOST_KEPT, RECEIVED_AT_ONCE, Listener, encode_exchange
+from busmaster.app.service.exchanges import (
+    LONGEST_RESULT,
+    MOST_BYTES,
+    MOST_KEPT,
+    RECEIVED_AT_ONCE,
+    Listener,
+    encode_exchange,
+)
 from busmaster.app.service.messages import encode
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.errors import NoReply
@@ -166,3 +173,64 @@ def test_what_closes_an_exchange_belongs_to_it() -> None:
     one.end(Verdict.OK, None, 1.2)
     passages, _ = listener.take()
     assert [len(passage.transmissions) for passage in passages] == [3, 1]
+
+
+def test_each_field_of_an_attempt_is_reported_and_a_long_result_is_cut() -> None:
+    one = Attempt("hcp2", 5, hcp2.Write(1, (2.5,)), PATIENT)
+    one.purpose, one.transaction, one.number, one.late, one.quiet_time = "axes", 7, 3, True, 0.25
+    listener = Listener()
+    listener.transmitted(1.5, b"ask", one)
+    listener.received(1.75, b"x" * (MOST_BYTES + 50), one)
+    assert listener.take() == ([], 0)  # it has not ended
+    one.end(Verdict.OK, "r" * (LONGEST_RESULT + 1), 2.5)
+    [[exchange], _] = listener.take()
+    reported = json.loads(encode(encode_exchange(exchange)))
+    check("ExchangeForm", reported)
+    told = Told(*reported)
+    assert reported[0] == [[1_500_000, "master", b"ask".hex()], [1_750_000, "node", b"x".hex() * (MOST_BYTES - 3)]]
+    assert (told.bytes, told.ended, told.quiet_time) == (3 + MOST_BYTES + 50, 2_500_000, 250_000)
+    assert (told.protocol, told.address, told.command, told.writes) == ("hcp2", 5, "write element 1 = 2.5", True)
+    assert (told.purpose, told.request, told.attempt, told.verdict, told.late) == ("axes", 7, 3, "ok", True)
+    assert told.result == f"{'r' * LONGEST_RESULT}..."
+
+
+@pytest.mark.parametrize(
+    ("result", "text"),
+    [(None, ""), (0.0, "0"), ("r" * LONGEST_RESULT, "r" * LONGEST_RESULT)],
+    ids=["none", "0", "long"],
+)
+def test_the_result_of_an_attempt_is_text(result: object, text: str) -> None:
+    listener, one = Listener(), attempt()
+    listener.transmitted(1.0, b"ask", one)
+    one.end(Verdict.OK, result, 1.2)
+    [[exchange], _] = listener.take()
+    assert Told(*json.loads(encode(encode_exchange(exchange)))).result == text
+
+
+def test_an_exchange_that_is_left_out_by_none_is_kept_and_later_bytes_begin_another() -> None:
+    listener = Listener()
+    attempts = [attempt() for _ in range(MOST_KEPT)]
+    for number, one in enumerate(attempts):
+        listener.transmitted(float(number), b"x", one)
+        one.end(Verdict.OK, None, float(number))
+    exchanges, left_out = listener.take()
+    assert (len(exchanges), left_out) == (MOST_KEPT, 0)
+    listener.received(1000.0, b"late", None)
+    listener.transmitted(1001.0, b"ack", None)
+    [late], _ = listener.take()
+    assert [one.sender for one in late.transmissions] == ["node", "master"]
+
+
+def test_what_the_master_sends_is_put_in_order_a_few_at_a_time() -> None:
+    listener, one = Listener(), attempt()
+    for number in range(2 * RECEIVED_AT_ONCE):
+        listener.transmitted(float(number), b"x", one)
+        assert len(listener._received) < RECEIVED_AT_ONCE
+    assert [exchange.bytes for exchange in listener._exchanges] == [2 * RECEIVED_AT_ONCE]
+    listener = Listener()
+    listener.transmitted(0.0, b"the end of an earlier exchange", None)
+    listener.received(0.1, b"?", None)
+    listener.transmitted(0.2, b"ask", one)
+    one.end(Verdict.OK, None, 1.2)
+    [exchange], _ = listener.take()
+    assert exchange.attempt is one

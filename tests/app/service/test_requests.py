@@ -21,7 +21,7 @@ from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, WriteUnconfirmed
-from busmaster.ext import CommandOptions
+from busmaster.ext import CommandOptions, Hold
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 
@@ -356,7 +356,7 @@ def test_refusals_that_another_process_reports_are_counted_and_unusable_ones_are
             await report("web", "logins")
             assert refusals.logins == {"service": 0, "web": 0}  # from 0 on, for metrics
             unusable = {"no": 0, "too many": MOST_FAILED + 1, "x" * (bounds.LONGEST_SENDER + 1): 7, "\x1b[2J": 7}
-            await report("web", "logins", **{"10.0.0.1": 3, "y" * bounds.LONGEST_SENDER: MOST_FAILED}, **unusable)
+            await report("web", "logins", **unusable, **{"10.0.0.1": 3, "y" * bounds.LONGEST_SENDER: MOST_FAILED})
             assert refusals.logins["web"] == MOST_FAILED + 3
             assert reports[0].startswith("3 failed logins at web: 3 from 10.0.0.1")
             await report("modbus-tcp", "requests", **{"10.0.0.1": 2})
@@ -467,10 +467,11 @@ def test_points_that_were_gathered_are_polled_together_and_are_limited(
             assert "result" in await asked(client, 1, "gather", stream=8, points=points(1, 2, 3))
             said = await asked(client, 1, "gather", stream=9, points=points(1))
             assert "one program has 2 poll groups at most" in said["error"]["message"]
+            assert "result" in await asked(client, 1, "gather", stream=7, points=points(3))
             await client.say(method="end", params={"stream": 8})
             said = await asked(client, 1, "gather", stream=9, points=points(1, command="write", values=[1.0]))
             assert "a poll group reads: it writes nothing" in said["error"]["message"]
-            assert "result" in await asked(client, 1, "poll", **polled(7, points=points(3)))
+            assert "result" in await asked(client, 1, "poll", **polled(7, points=[]))
             assert [point.item for point in line.bus.groups[0].points] == ["1", "2", "3"]
             assert "result" in await asked(client, 1, "gather", stream=9, points=points(1))
             assert "result" in await asked(client, 1, "gather", stream=10, points=points(1))  # the first is a group now
@@ -507,5 +508,53 @@ def test_a_program_names_so_many_nodes_and_known_ones_again(tmp_path: Path, monk
             assert (await client.ask("request", **READ))["result"] == 0
             assert (await client.ask("node", protocol="hcp2", address=5))["result"]["health"] == "up"
             assert "result" in await client.ask("node", protocol="hcp2", address=6, retries=2)
+            for address in range(10, 20):
+                assert "error" in await client.ask("node", protocol="hcp2", address=address)
+            [program] = line.service.clients
+            assert len(program._refused) == 2
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_sequence_that_has_begun_is_not_begun_again_under_its_number(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for address in (5, 6):
+                hold = {"sequence": 1, "protocol": "hcp2", "address": address, "max_hold": bounds.LONGEST_HOLD}
+                await client.say(method="hold", params=hold)
+            assert (await client.ask("request", **READ, sequence=1))["result"] == 0
+            said = await client.ask("request", **{**READ, "address": 6}, sequence=1)
+            assert "no sequence 1 was begun for it" in said["error"]["message"]
+            [program] = line.service.clients
+            held = program._holds[1]
+            assert isinstance(held, Hold)
+            for _ in range(2):
+                await client.say(method="release", params={"sequence": 1})
+            assert (await client.ask("request", **READ))["result"] == 0
+            assert held.over
+            await client.say(method="hold", params=hold)
+            assert (await client.ask("request", **{**READ, "address": 6}, sequence=1))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    ("method", "params"), [("subscribe", {"group": "axes"}), ("events", {}), ("overview", {}), (None, {})]
+)
+def test_a_program_with_a_stream_is_notified_of_values_that_a_write_makes_stale(
+    tmp_path: Path, method: str | None, params: dict[str, Any]
+) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        line.bus.poll_group("axes", period=60.0, points=[own.point("1")])
+        async with raw(line) as client:
+            if method is not None:
+                assert "result" in await asked(client, 1, method, stream=1, **params)
+            await own.write(1, 2.5)
+            await client.say(method="now", params={}, id=2)
+            heard: list[Any] = []
+            while (message := await client.hear()).get("id") != 2:
+                heard += [message["params"]["items"]] if message.get("method") == "touched" else []
+        assert heard == ([] if method is None else [["1"]])
 
     on_a_line(tmp_path, story)
