@@ -103,8 +103,13 @@ def test_a_write_that_took_long_to_come_is_not_sent(tmp_path: Path) -> None:
             write = {"command": "write", "element": 1, "values": [1]}
             said = await client.ask("request", **{**READ, "command": write}, requested=line.bus.now() - 2 * PATIENCE)
             assert said["error"]["data"]["error"] == "NotStarted"
-            assert re.search(r"the request arrived \d+\.\d s after the program made it", said["error"]["message"])
+            found = re.search(r"the request arrived (\d+\.\d) s after the program made it", said["error"]["message"])
+            assert found is not None
+            assert 2 * PATIENCE <= float(found[1]) < 4 * PATIENCE
             assert "the line is busy" not in said["error"]["message"]
+            data = said["error"]["data"]
+            assert data["hint"].endswith("the requesting program, or the owner of the line, was stopped meanwhile")
+            assert (data["label"], data["command"]) == ("node 5", "write element 1 = 1")
         assert [outcome for _, outcome in line.audit()] == ["not started"]
 
     on_a_line(tmp_path, story)

@@ -6,20 +6,27 @@ import asyncio
 import contextlib
 import os
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, bounds
+from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, bounds, ext
 from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.client import MOST_FAILED
-from busmaster.app.service.fields import shortened
+from busmaster.app.service.client_messages import RequestParams, WriteParams
+from busmaster.app.service.client_requests import Reading, Writing, client_request_of
+from busmaster.app.service.encoding import protocol_of
+from busmaster.app.service.fields import OptionsForm, shortened
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, encode_value
 from busmaster.app.service.permission import Access, Permission
+from busmaster.app.service.record import Outcome
 from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Role
+from busmaster.bus.meaning import Meaning
+from busmaster.bus.node import Node
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, WriteUnconfirmed
 from busmaster.ext import CommandOptions, Hold
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
@@ -556,5 +563,123 @@ def test_a_program_with_a_stream_is_notified_of_values_that_a_write_makes_stale(
             while (message := await client.hear()).get("id") != 2:
                 heard += [message["params"]["items"]] if message.get("method") == "touched" else []
         assert heard == ([] if method is None else [["1"]])
+
+    on_a_line(tmp_path, story)
+
+
+# writes to points, and what is made of a request
+
+
+def test_a_value_for_a_point_is_a_label_or_a_number_and_is_on_record_if_it_is_refused(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        mode = replace(own.point("1"), meaning=Meaning(labels={0: "off", 1: "run"}))
+        line.bus.poll_group("axes", period=60.0, points=[mode, own.point("2")])
+        async with raw(line) as client:
+
+            async def refusal(key: str, value: object) -> str:
+                said = await client.ask("write", group="axes", key=key, value=value)
+                assert said["error"]["message"] == line.records[-1].error
+                message: str = said["error"]["message"]
+                return message
+
+            assert (await client.ask("write", group="axes", key="5/1", value="run"))["result"] is None
+            assert await own.read(1) == 1
+            assert (line.records[-1].point, line.records[-1].value) == ("5/1", 1)
+            assert "gallop" in await refusal("5/1", "gallop")
+            assert (line.records[-1].outcome, line.records[-1].value) == (Outcome.REFUSED, "'gallop'")
+            assert (line.records[-1].interface, line.records[-1].by) == ("service", str(line.service.clients[0].peer))
+            assert "on" in await refusal("5/2", "on")  # it has no labels
+            line.authorisation.read_only = True
+            assert await refusal("5/1", "gallop") == "this line is read-only"
+            line.authorisation.read_only = False
+            line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
+            said = await asked(client, 2, "write", group="axes", key="5/1", value="run")
+            assert "user me may read this line, but not write" in said["error"]["message"]
+        assert await own.read(1) == 1
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_request_is_made_with_all_that_its_client_has_sent(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        node = Node.of(Hcp2Controller(line.bus, 5))
+        node.note_stop()
+        line.bus.poll_group("axes", period=60.0, points=[Hcp2Controller(line.bus, 5).point("1")])
+        async with raw(line) as client:
+            assert "result" in await client.ask("node", protocol="hcp2", address=5)
+            hold = {"sequence": 1, "protocol": "hcp2", "address": 5, "max_hold": 1.0}
+            await client.say(method="hold", params=hold)
+            assert "result" in await client.ask("now")
+            [program] = line.service.clients
+            held = program._holds[1]
+            command, other = write(0.0)["command"], {"command": "read", "element": 2}
+            for params, client_of, stops, stop in (
+                (RequestParams("hcp2", 5, command, touches=other, stops_seen=2, stop=True), program.turn, 3, True),
+                (RequestParams("hcp2", 5, command, touches=other, sequence=1), held, None, False),
+            ):
+                made = client_request_of(params, program, line.service.line)
+                assert isinstance(made, Writing)
+                request = made._request
+                assert (str(request.command), str(request.touches)) == ("write element 1 = 0", "read element 2")
+                assert (request.client, request.stops_seen, request.stop) == (client_of, stops, stop)
+            for options in (None, OptionsForm(finish_within=1.0)):
+                params = RequestParams("hcp2", 5, other, options=options, stops_seen=2, sequence=1)
+                reading = client_request_of(params, program, line.service.line)
+                assert isinstance(reading, Reading)
+                assert (reading._request.client, reading._request.stops_seen) == (held, 3)
+            made = client_request_of(WriteParams("axes", "5/1", 7), program, line.service.line)
+            assert isinstance(made, Writing)
+            assert (made._request.client, str(made._request.touches)) == (program.turn, "read element 1")
+            with pytest.raises(InvalidCommand, match="is not a stop"):
+                client_request_of(RequestParams("hcp2", 5, other, stop=True), program, line.service.line)
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_read_ends_once_although_it_is_cancelled_afterwards(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        node, ends = Node.of(Hcp2Controller(line.bus, 5)), list[tuple[Any, BaseException | None]]()
+        ended = asyncio.Event()
+
+        def on_end(_: object, value: Any, error: BaseException | None) -> None:
+            ends.append((value, error))
+            ended.set()
+
+        reading = Reading(node, protocol_of("hcp2").read_back(READ["command"]), ext.line_of(line.bus).add_client(1.0))
+        reading.begin(on_end)
+        assert not reading.done()
+        await ended.wait()
+        assert reading.done()
+        reading.cancel()
+        assert (ends, reading.given_up) == ([(0.0, None)], False)
+        failing = Reading(
+            Node.of(Hcp2Controller(line.bus, ABSENT)), reading.command, ext.line_of(line.bus).add_client(1.0)
+        )
+        failing.begin(on_end)
+        failing.cancel()
+        failing.cancel()
+        assert (ends[1:], failing.given_up, failing.done()) == ([(None, None)], True, True)
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_write_whose_audit_entry_is_not_on_the_disk_is_unconfirmed(tmp_path: Path) -> None:
+    async def durable() -> str:
+        return "disk full"
+
+    async def story(line: Served) -> None:
+        line.authorisation.record = lambda _: durable()
+        async with raw(line) as client:
+            said = await client.ask("request", **write(2.5))
+            assert "its audit entry is not on the disk: disk full" in said["error"]["message"]
+            data = said["error"]["data"]
+            assert (data["error"], data["label"], data["command"]) == (
+                "WriteUnconfirmed",
+                "node 5",
+                "write element 1 = 2.5",
+            )
+            assert data["hint"] == "check why that output failed; the value need not be written again"
+        assert await Hcp2Controller(line.bus, 5).read(1) == 2.5
 
     on_a_line(tmp_path, story)

@@ -28,6 +28,7 @@ from busmaster import (
     Snapshot,
     connect,
 )
+from busmaster.app.service.client_requests import _encoded
 from busmaster.app.service.messages import encode_json, value_of
 from busmaster.app.service.values import (
     cycle_fields,
@@ -51,6 +52,7 @@ from busmaster.events import (
 )
 from busmaster.ext import Named
 from busmaster.protocols.hcp2.codec import Read
+from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import find, make_device
 from tests.app.service.lines import Served, on_a_served_line, raw
 from tests.patience import PATIENCE
@@ -253,3 +255,16 @@ ALARM = AlarmChanged(Point(NODE, "pull", Read(1)), "high", 5.0, 6.0, active=True
 )
 def test_an_event_is_a_sentence(event: Any, text: str) -> None:
     assert event_text(event) == text
+
+
+def test_a_whole_number_may_be_sent_with_a_decimal_point_and_a_read_only_point_is_not_written() -> None:
+    unit = ModbusUnit(Bus(MemoryPort(Line(ModbusUnit.profile.line))), 5)
+    holding = unit.point("holding:5")
+    assert str(_encoded(holding, 7.0)) == str(_encoded(holding, 7))
+    with pytest.raises(InvalidCommand) as own:
+        holding.encode(7.5)  # type: ignore[misc]  # it can be written
+    with pytest.raises(InvalidCommand) as caught:
+        _encoded(holding, 7.5)
+    assert str(caught.value) == str(own.value)
+    with pytest.raises(InvalidCommand, match="unit 5: input:5 is read-only"):
+        _encoded(unit.point("input:5"), 7)
