@@ -82,11 +82,12 @@ def test_the_bug_because_of_which_a_port_is_not_reopened_is_named_with_its_class
 def test_a_client_gets_an_alarm_with_its_bound_and_the_owners_name_and_unit(
     limit: Any, bound: Any, value: Any, active: bool
 ) -> None:
-    again = encoding.event_of(sent(AlarmChanged(POINT, limit, bound, value, active)), find)
+    named = encoding.OwnersPoint(POINT.node, POINT.item, POINT.command, "mm/s", owners_key="winder/speed")
+    again = encoding.event_of(sent(AlarmChanged(named, limit, bound, value, active)), find)
     assert isinstance(again, AlarmChanged)
     assert (again.limit, again.bound, again.value, again.active) == (limit, bound, value, active)
     assert type(again.bound) is type(bound)  # a bit has no number as its limit
-    assert (again.point.key, again.point.unit, again.point.command) == (POINT.key, "mm/s", POINT.command)
+    assert (again.point.key, again.point.unit, again.point.command) == ("winder/speed", "mm/s", POINT.command)
 
 
 def test_an_owners_point_equals_one_that_reads_the_same_under_the_same_name() -> None:

@@ -17,6 +17,7 @@ from busmaster.app.service.link import GRACE, Link, PendingRequest
 from busmaster.emulator.line import Line
 from busmaster.errors import BusClosed, InvalidCommand, LineDown, NotStarted, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
+from tests.app.service.lines import until
 from tests.stories import in_virtual_time
 
 NODE = Hcp2Controller(Bus(MemoryPort(Line(Hcp2Controller.profile.line))), 5).node
@@ -26,12 +27,13 @@ READ = hcp2.Read(1)
 class Way:
     """A connection that keeps what is sent."""
 
-    def __init__(self, **more: Any) -> None:
+    status, complaint, close_reason = None, None, ""
+
+    def __init__(self) -> None:
         self.full = False
         self.sent: list[dict[str, Any]] = []
         self.owner_ended = False
-        self.is_closed = False
-        self.__dict__.update(more)
+        self.is_closed = self.is_over = False
 
     def send(self, message: bytes) -> None:
         self.sent.append(json.loads(message))
@@ -41,6 +43,7 @@ class Way:
 
     async def closed(self) -> None:
         assert self.is_closed
+        self.is_over = True
 
     @property
     def methods(self) -> list[str]:
@@ -107,9 +110,45 @@ async def test_a_request_that_is_cancelled_is_cancelled_at_the_line_unless_it_ha
         opened.link._drop(pending)
     assert opened.way.methods == ["now", "now", f"cancel{handed.number}"]
     assert await opened.link.answer(ended) == 5.0
+    awaited = opened.ask()
+    waiting = asyncio.ensure_future(opened.link.answer(awaited))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    assert opened.way.methods[3:] == ["now", f"cancel{awaited.number}"]
     opened.reply(handed.number, 6.0)  # on its way already, and ignored
     opened.reply(4711, 6.0)
     assert opened.lost == 0
+
+
+@pytest.mark.parametrize("safe_only", [False, True])
+def test_the_first_message_names_the_program_whatever_was_sent_before(
+    safe_only: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @in_virtual_time
+    async def run() -> None:
+        way = Way()
+        link = Link("unix:/a.sock", None, lambda *_: None, lambda: None, safe_only=safe_only)
+
+        async def create(_: object, where: str) -> None:
+            assert where == "/a.sock"
+            link._connection = way  # type: ignore[assignment]  # as much of one as a link uses
+            link.opened()
+
+        monkeypatch.setattr(asyncio.get_running_loop(), "create_unix_connection", create)
+        link.notify("end", StreamParams(7))
+        opening = asyncio.ensure_future(link.open("mine"))
+        await until(lambda: way.sent)
+        assert way.methods == ["hello", "end"]
+        assert way.sent[0]["id"] == 0
+        given = {"versions": [3], "program": "mine"}
+        assert way.sent[0]["params"] == ({**given, "safe_only": True} if safe_only else given)
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+        assert way.is_over
+
+    run()
 
 
 @in_virtual_time
@@ -196,6 +235,7 @@ async def test_requests_in_progress_end_with_a_link_that_is_closed() -> None:
     opened = Opened()
     pending = opened.ask()
     await opened.link.close()
+    assert opened.way.is_over
     assert isinstance(pending.future.exception(), BusClosed)
     with pytest.raises(BusClosed, match="the bus was closed; make a new one"):
         opened.link.check()

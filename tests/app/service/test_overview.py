@@ -20,7 +20,7 @@ from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client_messages import WriteParams
 from busmaster.app.service.fields import NonFinite
 from busmaster.app.service.link import PendingRequest
-from busmaster.app.service.overview import COUNTED_AT_ONCE, INTERVAL, PART, EventLog, Overview, Part
+from busmaster.app.service.overview import COUNTED_AT_ONCE, INTERVAL, KEPT_EVENTS, PART, EventLog, Overview, Part
 from busmaster.app.service.owner_messages import NoBody, StreamMessage
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.picture import Picture
@@ -33,10 +33,13 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryTransport
 from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoReply, WriteUnconfirmed
+from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import make_device
-from busmaster.statistics import Timeline
+from busmaster.statistics import Quantiles, Timeline
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 from tests.stories import in_virtual_time
@@ -460,29 +463,32 @@ async def test_each_part_names_its_place_and_a_screen_that_joins_later_gets_all_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(overview, "PART", 2)
-    monkeypatch.setattr(overview, "MOST_POINTS", 9)
+    monkeypatch.setattr(overview, "MOST_POINTS", 8)
     async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
         points: list[Point[Any]] = [Hcp2Controller(bus, 1).point(str(element)) for element in range(1, 6)]
         for name in ("a", "b", "c", "d", "e", "f"):
             bus.poll_group(name, period=0.1, points=points if name in "ab" else points[:1])
-        for address in range(2, 8):
+        for address in range(2, 12):
             bus.node(hcp2.PROFILE, address)
         pictures, first, second = overview_of(bus), Screen(), Screen()
         pictures.join(first, 1)
         await asyncio.sleep(2.0)
+        for group in bus.groups:
+            group.pause()
+        await asyncio.sleep(1.0)
         pictures.join(second, 1)
         await asyncio.sleep(2.0)
         for screen in (first, second):
             rows, values = screen.parts("rows"), screen.parts("values")
-            assert [(body["first"], len(body["rows"])) for body in rows] == [(0, 2), (2, 2), (4, 1), (5, 2), (7, 2)]
-            assert [(body["first"], len(body["values"])) for body in values] == [(0, 2), (2, 2), (4, 1), (5, 2), (7, 2)]
+            assert [(body["first"], len(body["rows"])) for body in rows] == [(0, 2), (2, 2), (4, 1), (5, 2), (7, 1)]
+            assert [(body["first"], len(body["values"])) for body in values] == [(0, 2), (2, 2), (4, 1), (5, 2), (7, 1)]
             assert {value[0] for body in values for value in body["values"]} == {0.0}
             groups, nodes = screen.parts("groups"), screen.parts("nodes")
             assert [(body["first"], len(body["groups"])) for body in groups] == [(0, 5), (5, 1)]
-            assert [(body["first"], len(body["nodes"])) for body in nodes] == [(0, 5), (5, 2)]
-            assert [one["address"] for body in nodes for one in body["nodes"]] == [1, 2, 3, 4, 5, 6, 7]
+            assert [(body["first"], len(body["nodes"])) for body in nodes] == [(0, 5), (5, 5), (10, 1)]
+            assert [one["address"] for body in nodes for one in body["nodes"]] == [*range(1, 12)]
             [frame] = screen.parts("frame")
-            assert (frame["points"], frame["left_out"], frame["groups"], frame["nodes"]) == (9, 5, 6, 7)
+            assert (frame["points"], frame["left_out"], frame["groups"], frame["nodes"]) == (8, 6, 6, 11)
             assert {body["set"] for body in (*rows, *values, frame)} == {1}
         assert second.latest == {**first.latest, ("frame", 0): second.latest["frame", 0]}
         sent = first.count
@@ -566,7 +572,38 @@ async def test_the_frame_has_the_cause_and_the_time_of_a_lost_line() -> None:
         node = bus.nodes[0]
         node.suspend(60.0)
         assert overview.health_text(node) == "suspended"
+        polled(bus, "axes", "1", address=1, period=60.0)
+        pictures._regroup()
+        [part] = pictures._parts
+        await asyncio.sleep(61.0)
+        assert part.send_values(1, bus)
+        transport = bus._pump._transport
+        assert isinstance(transport, MemoryTransport)
+        transport.lose(OSError("unplugged"))
+        await until(lambda: bus.condition.is_lost)
+        lost = pictures._frame()
+        assert (lost.state, lost.why, lost.since) == ("offline", bus.condition.reason, bus.condition.since)
+        assert "unplugged" in lost.why
+        assert lost.losses == 1
+        assert overview.health_text(node) == "offline"  # suspended or not
+        assert part.send_values(1, bus)  # no value is good any more
         await pictures._journal.close()
+
+
+def test_points_are_the_same_as_before_only_if_they_are_the_same_objects() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line)))
+    point = Hcp2Controller(bus, 1).point("1")
+    one, other = object(), object()
+    group: Any = one
+    assert overview._same((group, (point,)), (group, (point,)))
+    renamed = replace(point, meaning=Meaning(precision=1))
+    assert renamed == point
+    second: Any = other
+    for groups in ((group, (renamed,)), (group, (point, point)), (group, ()), (second, (point,))):
+        assert not overview._same((group, (point,)), groups)
+    named: Any = SimpleNamespace(name="axes")
+    points = (point, replace(point, encode=None))
+    assert [overview._encode_point(named, one).writable for one in points] == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -631,3 +668,96 @@ def test_a_sample_that_was_never_sent_has_the_time_of_its_end() -> None:
     endless = overview._encode_value(bus, point, sample._replace(value=float("inf"), error=None, started=1.5))
     assert endless is not None
     assert (endless.value, endless.requested, endless.error) == (NonFinite("inf"), 1.5, "")
+
+
+@in_virtual_time
+async def test_values_are_sent_again_when_they_change_or_a_write_makes_them_stale_and_not_each_cycle() -> None:
+    device = EmulatedMint(1)
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [device]))) as bus:
+        controller = Hcp2Controller(bus, 1)
+        fast = polled(bus, "fast", "1", address=1, period=0.1)
+        slow = polled(bus, "slow", "2", address=1, period=1000.0)
+        for group in (fast, slow):
+            await anext(aiter(group))
+        pictures, screen = overview_of(bus), Screen()
+        pictures.join(screen, 1)
+        await asyncio.sleep(1.0)
+        before = screen.parts("values")
+        assert [(body["first"], body["values"][0][0]) for body in before] == [(0, 0.0), (1, 0.0)]
+        screen.latest.clear()
+        cycles = fast.statistics().cycles
+        await asyncio.sleep(2.0)
+        assert fast.statistics().cycles > cycles + 10
+        quality = before[1]["values"][0][1]
+        await controller.write(2, 5.0)
+        await asyncio.sleep(1.0)
+        [body] = [body for body in screen.parts("values") if body["first"] == 1]
+        assert body["values"][0][1] != quality
+        pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
+async def test_the_log_keeps_events_with_a_text_and_ends_when_it_is_closed() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)])))
+    journal = EventLog(bus)
+    async with bus:
+        journal.begin()
+        await Hcp2Controller(bus, 1).read(1)  # the node is up, which needs no sentence
+        bus.nodes[0].suspend(1.0)
+        for number in range(2 * KEPT_EVENTS):
+            journal.note(f"event {number}")
+        await asyncio.sleep(0.1)
+        assert all(text for _, text in journal.entries)
+        assert len(journal.entries) == KEPT_EVENTS
+        task = journal._task
+        assert task is not None
+        await journal.close()
+        assert task.done()
+
+
+def test_the_groups_and_nodes_of_a_picture_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(overview, "MOST_COUNTED", 1)
+
+    @in_virtual_time
+    async def run() -> None:
+        async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+            for name in ("axes", "slow"):
+                polled(bus, name, "1", "2", address=1, period=60.0)
+            Hcp2Controller(bus, 2)
+            pictures = overview_of(bus)
+            assert pictures._regroup()
+            assert not pictures._regroup()
+            frame = pictures._frame()
+            assert (frame.groups, frame.nodes, frame.points, frame.left_out, frame.set) == (1, 1, 2, 0, 1)
+            assert list(pictures._count_keys()) == [("groups", 0), ("nodes", 0)]
+            await pictures._journal.close()
+
+    run()
+
+
+def test_the_latencies_of_a_node_are_its_median_and_its_slowest(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line)))
+    node = bus.node(hcp2.PROFILE, 1)
+    counts = replace(node.statistics(), attempts=9, no_reply=3, late=2, latency=Quantiles(6, 0.3, 0.25, 0.75, 1.0))
+    monkeypatch.setattr(Node, "statistics", lambda _: counts)
+    shown = overview._encode_node(node)
+    assert (shown.requests, shown.failed, shown.late, shown.p50, shown.p99) == (9, 3, 2, 0.25, 0.75)
+
+
+def test_details_have_the_hint_of_an_error_and_the_limits_of_a_block() -> None:
+    bus = Bus(MemoryPort(Line(ModbusUnit.profile.line)))
+    unit = ModbusUnit(bus, 5)
+    unit.point("holding:10:3").limit(maximum=7)
+    point = unit.point("holding:11")
+    timeline = Timeline(1.0, 1.25, None, None, 1, 0, 0.0)
+    for error, hint in ((NoReply("no reply"), NoReply.hint), (BusError("odd"), "")):
+        sample: Sample[Any] = Sample(None, error, 1.0, 1.25, 2.0, Quality.BAD, timeline, 0.0)
+        group: Any = SimpleNamespace(latest=SimpleNamespace(samples={point: sample}))
+        details = overview.encode_details(bus, group, point)
+        assert (details.hint, details.due) == (hint, 1.0)
+        assert [limit.maximum for limit in details.limits] == [7]
+    assert overview.encode_details(bus, group, unit.point("holding:13")).limits == []
+    precise = replace(point, meaning=Meaning(precision=2))
+    named: Any = SimpleNamespace(name="axes")
+    assert overview._encode_point(named, precise).precision == 2

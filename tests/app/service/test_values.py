@@ -266,5 +266,5 @@ def test_a_whole_number_may_be_sent_with_a_decimal_point_and_a_read_only_point_i
     with pytest.raises(InvalidCommand) as caught:
         _encoded(holding, 7.5)
     assert str(caught.value) == str(own.value)
-    with pytest.raises(InvalidCommand, match="unit 5: input:5 is read-only"):
+    with pytest.raises(InvalidCommand, match="input:5 is read-only"):
         _encoded(unit.point("input:5"), 7)
