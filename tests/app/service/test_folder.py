@@ -213,7 +213,6 @@ def test_a_socket_that_was_removed_meanwhile_ends_all_the_same(tmp_path: Path) -
 def test_a_socket_that_cannot_be_served_keeps_no_file_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.sock"
     before, mask = open_files(), os.umask(0o022)
-    os.umask(mask)
     path.write_text("mine")
     with pytest.raises(InvalidCommand, match="is not a socket"):
         served(path).__enter__()
@@ -235,7 +234,7 @@ def test_a_socket_that_cannot_be_served_keeps_no_file_open(tmp_path: Path, monke
         served(path).__enter__()
     assert os.listdir(tmp_path) == []
     assert open_files() == before
-    assert os.umask(mask) == mask
+    assert os.umask(mask) == 0o022
 
 
 def test_the_group_with_number_0_gets_the_socket_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,3 +281,31 @@ def test_a_socket_whose_queue_is_full_is_in_use(tmp_path: Path) -> None:
         assert folders._listens(path)
     assert not folders._listens(path)
     assert not folders._listens(tmp_path / "missing.sock")
+
+
+def test_no_other_user_may_connect_before_the_mode_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes: list[int] = []
+    monkeypatch.setattr(os, "chmod", lambda path, _: modes.append(stat.S_IMODE(os.stat(path).st_mode)))
+    with served(tmp_path / "a.sock"):
+        assert modes == [0o600]
+
+
+def test_the_port_of_the_other_owner_may_be_written_differently(tmp_path: Path) -> None:
+    path = tmp_path / "a.sock"
+    with served(path, "localhost:4001"):
+        with pytest.raises(InvalidCommand, match="for localhost:4001; use it, or stop that process first"):
+            served(path, "socket://127.0.0.1:4001?echo=1").__enter__()
+        with pytest.raises(InvalidCommand, match="for localhost:4001; give this line another name"):
+            served(path, "127.0.0.1:4002").__enter__()
+
+
+def test_a_serial_server_whose_host_is_unknown_is_found_by_its_name(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(-2, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with served(folder / "a.sock", "gateway:4001") as found:
+        assert find_owner("socket://gateway:4001?baudrate=9600") == found.owner
+        assert find_owner("gateway:4002") is None
