@@ -285,6 +285,10 @@ class SlowWire(Wire):
     def __init__(self) -> None:
         super().__init__()
         self.closing = False
+        self.limit: int | None = None
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        self.limit = high
 
     def is_closing(self) -> bool:
         return self.closing
@@ -340,8 +344,10 @@ async def test_nothing_is_sent_before_a_connection_is_open_or_when_it_is_closing
     end.send(b"early")
     assert wire.written == b""
     end, wire, core = opened_by(host)
+    assert wire.limit == 0  # `pause_writing` is called as soon as a byte waits
     wire.closing = True
     end.send(b"late")
+    give(end, b"\x89\x80" + bytes(4), lambda: 512)  # a ping, which gets no reply any more
     assert wire.written == b""
     wire.closing = False
     end.close(1001, "the owner ends")
