@@ -630,17 +630,17 @@ def test_messages_that_wait_replace_only_earlier_ones_of_the_same_subject(
             connection.websocket.full = False
             connection.writable()
             await client.say(method="now", params={}, id=9)
-            heard: list[dict[str, Any]] = []
+            received: list[dict[str, Any]] = []
             while (message := await client.hear()).get("id") != 9:
-                heard.append(message)
-            assert len(heard) == most + 9
+                received.append(message)
+            assert len(received) == most + 9
             assert program.dropped[7] == 3
             await client.say(method="end", params={"stream": 7})
             assert "result" in await client.ask("now")
             assert program.dropped[7] == 0  # for a later stream of this number
-        exchanges = [one["params"]["dropped"] for one in heard if one["method"] == "exchanges"]
+        exchanges = [one["params"]["dropped"] for one in received if one["method"] == "exchanges"]
         assert exchanges == [0] * (most - 2) + [1, 2]
-        params = [one["params"] for one in heard[most:]]
+        params = [one["params"] for one in received[most:]]
         assert [(one["stream"], one["dropped"], one["body"]["set"], one["body"]["first"]) for one in params[:4]] == [
             (7, 3, 2, 0),
             (7, 3, 2, 50),

@@ -22,7 +22,7 @@ def message(number: int) -> str:
 
 
 class Way:
-    """A websocket that keeps what it is told to do."""
+    """A websocket that records the calls of its owner."""
 
     def __init__(self) -> None:
         self.full = False

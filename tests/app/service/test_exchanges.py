@@ -186,12 +186,12 @@ def test_each_field_of_an_attempt_is_reported_and_a_long_result_is_cut() -> None
     [[exchange], _] = listener.take()
     reported = json.loads(encode(encode_exchange(exchange)))
     check("ExchangeForm", reported)
-    told = Told(*reported)
+    found = Told(*reported)
     assert reported[0] == [[1_500_000, "master", b"ask".hex()], [1_750_000, "node", b"x".hex() * (MOST_BYTES - 3)]]
-    assert (told.bytes, told.ended, told.quiet_time) == (3 + MOST_BYTES + 50, 2_500_000, 250_000)
-    assert (told.protocol, told.address, told.command, told.writes) == ("hcp2", 5, "write element 1 = 2.5", True)
-    assert (told.purpose, told.request, told.attempt, told.verdict, told.late) == ("axes", 7, 3, "ok", True)
-    assert told.result == f"{'r' * LONGEST_RESULT}..."
+    assert (found.bytes, found.ended, found.quiet_time) == (3 + MOST_BYTES + 50, 2_500_000, 250_000)
+    assert (found.protocol, found.address, found.command, found.writes) == ("hcp2", 5, "write element 1 = 2.5", True)
+    assert (found.purpose, found.request, found.attempt, found.verdict, found.late) == ("axes", 7, 3, "ok", True)
+    assert found.result == f"{'r' * LONGEST_RESULT}..."
 
 
 @pytest.mark.parametrize(

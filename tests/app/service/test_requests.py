@@ -332,17 +332,17 @@ def test_a_check_reports_the_first_refused_write_of_several_and_writes_nothing(t
             assert (await client.ask("check", **node, commands=[right, READ["command"], right]))["result"] is None
             assert (await client.ask("check", **node, commands=[]))["result"] is None
             assert line.records == []
-            said = await client.ask("check", **node, commands=[right, wrong])
-            assert "maximum of 10" in said["error"]["message"]
+            reply = await client.ask("check", **node, commands=[right, wrong])
+            assert "maximum of 10" in reply["error"]["message"]
             assert line.audit() == [("5/write element 1 = 11", "refused")]
             assert "maximum of 10" in line.records[0].error
             assert "minimum of 5" in (await client.ask("check", **node, commands=[zero]))["error"]["message"]
             assert (await client.ask("check", **node, commands=[zero], stop=True))["result"] is None
-            said = await client.ask("check", **node, commands=[right], stop=True)
-            assert "is not a stop" in said["error"]["message"]
+            reply = await client.ask("check", **node, commands=[right], stop=True)
+            assert "is not a stop" in reply["error"]["message"]
             line.authorisation.read_only = True
-            said = await client.ask("check", **node, commands=[READ["command"], right])
-            assert said["error"]["message"] == "node 5: this line is read-only"
+            reply = await client.ask("check", **node, commands=[READ["command"], right])
+            assert reply["error"]["message"] == "node 5: this line is read-only"
             assert line.records[-1].error == "node 5: this line is read-only"
         assert (await line.bus.statistics()).exchanges == 0
 
@@ -394,8 +394,8 @@ def test_a_pause_and_a_suspension_are_noted_with_the_program_until_they_end(tmp_
             assert (await client.ask("suspend", **node, **{"for": 0}))["result"] is None
             assert [one.suspended for one in line.bus.nodes] == [False]
             for wrong in ({"protocol": "mentor", "address": 5}, {"protocol": "hcp2", "address": 6}):
-                said = await client.ask("suspend", **wrong, **{"for": 60.0})
-                assert "is not on this line; check protocol and address" in said["error"]["message"]
+                reply = await client.ask("suspend", **wrong, **{"for": 60.0})
+                assert "is not on this line; check protocol and address" in reply["error"]["message"]
             [program] = line.service.clients
         assert [text for _, text in line.service.line.journal.entries if " by " in text] == [
             f"{what} by {program.peer}"
@@ -413,8 +413,8 @@ def test_a_program_pauses_a_group_only_if_it_may_write_to_each_of_its_nodes(tmp_
             for allowed, paused in (((), False), ((5,), False), ((6,), False), ((5, 6), True)):
                 only = {("hcp2", address): None for address in allowed}
                 line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.WRITE, only)})
-                said = await asked(client, 2, "pause", group="axes", paused=True)
-                assert ("error" not in said, group.paused) == (paused, paused)
+                reply = await asked(client, 2, "pause", group="axes", paused=True)
+                assert ("error" not in reply, group.paused) == (paused, paused)
 
     on_a_line(tmp_path, story)
 
@@ -430,8 +430,8 @@ def test_a_program_has_so_many_poll_groups_and_each_ends_with_its_stream(tmp_pat
         async with raw(line) as client:
             for stream in range(most):
                 assert "result" in await asked(client, 1, "poll", **polled(stream, name=f"{stream}"))
-            said = await asked(client, 1, "poll", **polled(most))
-            assert f"one program has {most} poll groups at most" in said["error"]["message"]
+            reply = await asked(client, 1, "poll", **polled(most))
+            assert f"one program has {most} poll groups at most" in reply["error"]["message"]
             await client.say(method="end", params={"stream": 0})
             assert "result" in await asked(client, 1, "poll", **polled(most, name="again"))
             assert len(line.bus.groups) == most
@@ -469,15 +469,15 @@ def test_points_that_were_gathered_are_polled_together_and_are_limited(
         async with raw(line) as client:
             for element in (1, 2):
                 assert "result" in await asked(client, 1, "gather", stream=7, points=points(element))
-            said = await asked(client, 1, "gather", stream=7, points=points(3, 4))
-            assert "a poll group of a program has 3 points at most" in said["error"]["message"]
+            reply = await asked(client, 1, "gather", stream=7, points=points(3, 4))
+            assert "a poll group of a program has 3 points at most" in reply["error"]["message"]
             assert "result" in await asked(client, 1, "gather", stream=8, points=points(1, 2, 3))
-            said = await asked(client, 1, "gather", stream=9, points=points(1))
-            assert "one program has 2 poll groups at most" in said["error"]["message"]
+            reply = await asked(client, 1, "gather", stream=9, points=points(1))
+            assert "one program has 2 poll groups at most" in reply["error"]["message"]
             assert "result" in await asked(client, 1, "gather", stream=7, points=points(3))
             await client.say(method="end", params={"stream": 8})
-            said = await asked(client, 1, "gather", stream=9, points=points(1, command="write", values=[1.0]))
-            assert "a poll group reads: it writes nothing" in said["error"]["message"]
+            reply = await asked(client, 1, "gather", stream=9, points=points(1, command="write", values=[1.0]))
+            assert "a poll group reads: it writes nothing" in reply["error"]["message"]
             assert "result" in await asked(client, 1, "poll", **polled(7, points=[]))
             assert [point.item for point in line.bus.groups[0].points] == ["1", "2", "3"]
             assert "result" in await asked(client, 1, "gather", stream=9, points=points(1))
@@ -493,8 +493,8 @@ def test_a_program_has_so_many_streams(tmp_path: Path, monkeypatch: pytest.Monke
         async with raw(line) as client:
             assert (await asked(client, 1, "events", stream=1))["result"] == {}
             assert (await asked(client, 1, "events", stream=2))["result"] == {}
-            said = await asked(client, 1, "events", stream=3)
-            assert "one program has 2 streams at most" in said["error"]["message"]
+            reply = await asked(client, 1, "events", stream=3)
+            assert "one program has 2 streams at most" in reply["error"]["message"]
             await client.say(method="end", params={"stream": 1})
             assert "error" in await asked(client, 1, "events", stream=2)
             assert (await asked(client, 1, "exchanges", stream=1))["result"] == {}
@@ -508,10 +508,10 @@ def test_a_program_names_so_many_nodes_and_known_ones_again(tmp_path: Path, monk
     async def story(line: Served) -> None:
         async with raw(line) as client:
             for address in (5, 6, 5):
-                said = await client.ask("node", protocol="hcp2", address=address)
-                assert said["result"] == {"label": f"node {address}", "health": "unknown"}
-            said = await client.ask("node", protocol="hcp2", address=7)
-            assert "one program names 2 nodes at most" in said["error"]["message"]
+                reply = await client.ask("node", protocol="hcp2", address=address)
+                assert reply["result"] == {"label": f"node {address}", "health": "unknown"}
+            reply = await client.ask("node", protocol="hcp2", address=7)
+            assert "one program names 2 nodes at most" in reply["error"]["message"]
             assert (await client.ask("request", **READ))["result"] == 0
             assert (await client.ask("node", protocol="hcp2", address=5))["result"]["health"] == "up"
             assert "result" in await client.ask("node", protocol="hcp2", address=6, retries=2)
@@ -530,8 +530,8 @@ def test_a_sequence_that_has_begun_is_not_begun_again_under_its_number(tmp_path:
                 hold = {"sequence": 1, "protocol": "hcp2", "address": address, "max_hold": bounds.LONGEST_HOLD}
                 await client.say(method="hold", params=hold)
             assert (await client.ask("request", **READ, sequence=1))["result"] == 0
-            said = await client.ask("request", **{**READ, "address": 6}, sequence=1)
-            assert "no sequence 1 was begun for it" in said["error"]["message"]
+            reply = await client.ask("request", **{**READ, "address": 6}, sequence=1)
+            assert "no sequence 1 was begun for it" in reply["error"]["message"]
             [program] = line.service.clients
             held = program._holds[1]
             assert isinstance(held, Hold)
@@ -559,10 +559,10 @@ def test_a_program_with_a_stream_is_notified_of_values_that_a_write_makes_stale(
                 assert "result" in await asked(client, 1, method, stream=1, **params)
             await own.write(1, 2.5)
             await client.say(method="now", params={}, id=2)
-            heard: list[Any] = []
+            received: list[Any] = []
             while (message := await client.hear()).get("id") != 2:
-                heard += [message["params"]["items"]] if message.get("method") == "touched" else []
-        assert heard == ([] if method is None else [["1"]])
+                received += [message["params"]["items"]] if message.get("method") == "touched" else []
+        assert received == ([] if method is None else [["1"]])
 
     on_a_line(tmp_path, story)
 
@@ -578,9 +578,9 @@ def test_a_value_for_a_point_is_a_label_or_a_number_and_is_on_record_if_it_is_re
         async with raw(line) as client:
 
             async def refusal(key: str, value: object) -> str:
-                said = await client.ask("write", group="axes", key=key, value=value)
-                assert said["error"]["message"] == line.records[-1].error
-                message: str = said["error"]["message"]
+                reply = await client.ask("write", group="axes", key=key, value=value)
+                assert reply["error"]["message"] == line.records[-1].error
+                message: str = reply["error"]["message"]
                 return message
 
             assert (await client.ask("write", group="axes", key="5/1", value="run"))["result"] is None
@@ -594,8 +594,8 @@ def test_a_value_for_a_point_is_a_label_or_a_number_and_is_on_record_if_it_is_re
             assert await refusal("5/1", "gallop") == "this line is read-only"
             line.authorisation.read_only = False
             line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
-            said = await asked(client, 2, "write", group="axes", key="5/1", value="run")
-            assert "user me may read this line, but not write" in said["error"]["message"]
+            reply = await asked(client, 2, "write", group="axes", key="5/1", value="run")
+            assert "user me may read this line, but not write" in reply["error"]["message"]
         assert await own.read(1) == 1
 
     on_a_line(tmp_path, story)
@@ -671,9 +671,9 @@ def test_a_write_whose_audit_entry_is_not_on_the_disk_is_unconfirmed(tmp_path: P
     async def story(line: Served) -> None:
         line.authorisation.record = lambda _: durable()
         async with raw(line) as client:
-            said = await client.ask("request", **write(2.5))
-            assert "its audit entry is not on the disk: disk full" in said["error"]["message"]
-            data = said["error"]["data"]
+            reply = await client.ask("request", **write(2.5))
+            assert "its audit entry is not on the disk: disk full" in reply["error"]["message"]
+            data = reply["error"]["data"]
             assert (data["error"], data["label"], data["command"]) == (
                 "WriteUnconfirmed",
                 "node 5",
