@@ -7,7 +7,7 @@ from random import Random
 import pytest
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.disturbance import noise
+from busmaster.emulator.disturbance import Transmission, distort, misses, noise
 from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.traceable import TraceableMemory
@@ -298,3 +298,120 @@ def test_a_doubled_request_is_answered_twice_or_collides() -> None:
     line = line_with("doubled=1", on_line=True)
     got = bytes.fromhex(ask(line, READ))
     assert got.count(REPLY) >= 2
+
+
+class Least:
+    """A source of chance that always returns the lower end."""
+
+    def random(self) -> float:
+        return 0.0
+
+    def uniform(self, a: float, b: float) -> float:
+        return a
+
+    def randrange(self, start: int, stop: int) -> int:
+        return start
+
+    def getrandbits(self, k: int) -> int:
+        return 0
+
+
+class Most(Least):
+    """Likewise the upper end."""
+
+    def uniform(self, a: float, b: float) -> float:
+        return b
+
+    def randrange(self, start: int, stop: int) -> int:
+        return stop - 1
+
+    def getrandbits(self, k: int) -> int:
+        return (1 << k) - 1
+
+
+STX_NOISE = b"\x02\xff\xff"
+
+
+@pytest.mark.parametrize(
+    ("fault", "least", "most"),
+    [
+        ("lost", [], []),
+        ("truncated", [], [(1.0, b"ab", 0)]),
+        ("flip", [(1.0, b"`bc", 0)], [(1.0, b"ab\xe3", 0)]),
+        ("unseen", [(1.0, b"`cc", 0)], [(1.0, b"a\xe2\xe3", 0)]),
+        ("doubled", [(1.0, b"abcabc", 0)], [(1.0, b"abcabc", 0)]),
+        ("leading", [(1.0, b"\0abc", 0)], [(1.0, STX_NOISE + b"abc", 0)]),
+        ("trailing", [(1.0, b"abc\0", 0)], [(1.0, b"abc" + STX_NOISE, 0)]),
+        ("repeated", [(1.0, b"abc", 0), (1.035, b"abc", 0)], [(1.0, b"abc", 0), (1.33, b"abc", 0)]),
+        ("duplicate", [(1.0, b"abc", 0), (1.0, b"abc", 0)], [(1.0, b"abc", 0), (1.1, b"abc", 0)]),
+        ("forged", [(1.0, b"\x06abc", 0)], [(1.0, b"\x04abc", 0)]),
+        ("babble", [(1.0, b"abc", 0), (1.0, b"\0", 0)], [(1.0, b"abc", 0), (1.1, b"\x02" + b"\xff" * 59, 0)]),
+        ("split", [(1.0, b"abc", 1)], [(1.0, b"abc", 4)]),
+        ("wrong", [(1.0, b"abc", 0)], [(1.0, b"abc", 0)]),
+    ],
+)
+def test_what_becomes_of_a_frame_stays_within_the_bounds_of_the_fault(
+    fault: str, least: list[Transmission], most: list[Transmission]
+) -> None:
+    device = EmulatedMint(2, delay=Delay(0.05))
+    for chance, wanted in ((Least(), least), (Most(), most)):
+        found = distort(Faults.parse([f"{fault}=1"]), (1.0, b"abc", 0), device, 0.01, chance)
+        assert [(data, chunk) for _, data, chunk in found] == [(data, chunk) for _, data, chunk in wanted]
+        assert [start for start, _, _ in found] == pytest.approx([start for start, _, _ in wanted])
+
+
+def test_a_duplicate_request_of_the_host_follows_within_4_ms() -> None:
+    found = distort(Faults.parse(["duplicate=1"]), (1.0, b"abc", 0), None, 0.01, Most())
+    assert found[1][0] == pytest.approx(1.004)
+
+
+def test_a_lost_frame_has_no_other_fault_and_others_add_up() -> None:
+    faults = Faults.parse(["lost=1", "babble=1", "doubled=1"])
+    assert distort(faults, (1.0, b"abc", 0), None, 0.01, Most()) == []
+    faults.lost, faults.babble, faults.split = 0.0, 0.0, 1.0
+    assert distort(faults, (1.0, b"abc", 0), None, 0.01, Most()) == [(1.0, b"abcabc", 4)]
+
+
+def received(fault: str, *, request: bool = True, free_at: float = 0.0) -> tuple[bool, EmulatedMint]:
+    """Return whether a device with this fault misses bytes on the line from 1 s to 2 s, and the device."""
+    device = EmulatedMint(2)
+    device.free_at = free_at
+    device.faults = Faults.parse([f"{fault}=1", "late_by=0.5", "away_for=3"])
+    return misses(device, 1.0, 2.0, request, Most()), device
+
+
+@pytest.mark.parametrize(
+    ("fault", "request_", "free_at", "missed"),
+    [
+        ("dead", True, 0.0, True),
+        ("dead", False, 0.0, True),
+        ("deaf", True, 0.0, True),
+        ("deaf", False, 0.0, False),
+        ("drop", True, 1.5, True),
+        ("drop", False, 1.5, True),
+        ("drop", True, 1.0, False),
+        ("flapping", True, 0.0, True),
+        ("flapping", False, 0.0, False),
+        ("restart", True, 0.0, True),
+        ("restart", False, 0.0, False),
+        ("nak", True, 0.0, True),
+        ("nak", False, 0.0, False),
+        ("late", True, 0.0, False),
+    ],
+)
+def test_which_bytes_a_faulty_device_misses(fault: str, request_: bool, free_at: float, missed: bool) -> None:
+    found, device = received(fault, request=request_, free_at=free_at)
+    assert found is missed
+    assert device.restarted is (fault == "restart" and request_)
+    assert device.away_until == (5.0 if fault in ("flapping", "restart") and request_ else 0.0)
+    assert [data for _, data in device.outbox] == ([device.refusal] if fault == "nak" and request_ else [])
+    assert device.lag == (0.5 if fault == "late" and request_ else 0.0)
+
+
+def test_a_device_that_is_away_misses_everything_until_it_is_back() -> None:
+    device = EmulatedMint(2)
+    device.away_until = 1.0
+    device.lag = 0.5
+    assert misses(device, 0.9, 1.1, False, Most())
+    assert not misses(device, 1.0, 1.1, True, Most())
+    assert device.lag == 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from random import Random
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
@@ -11,11 +12,12 @@ from hypothesis import strategies as st
 
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.collision import Collision
-from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.device import Delay, Device, held
 from busmaster.emulator.faults import HEARING, SPEAKING, Faults
 from busmaster.emulator.line import PIECE, Echo, Line
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.emulator.lines import SETTINGS, TAU, arrivals, ask, hexed, line_of
 
@@ -69,9 +71,10 @@ def test_the_first_byte_is_an_event_unless_the_host_asks_in_time_by_itself() -> 
     assert [data for _, data in arrivals(line, 1.0)] == ["02", "30 31 30 03 32"]
 
 
-def test_a_long_frame_comes_in_pieces_without_a_pause_that_would_look_like_its_end() -> None:
+@pytest.mark.parametrize("chunk", [0, 1000])
+def test_a_long_frame_comes_in_pieces_without_a_pause_that_would_look_like_its_end(chunk: int) -> None:
     """MSC's BREAD packet lasts 148 ms at 9600 baud, and its inter-byte timeout is 100 ms."""
-    line = Line(LineSettings(9600), [make_device("msc", 1)])
+    line = Line(LineSettings(9600), [make_device("msc", 1)], chunk=chunk)
     line.send(bytes.fromhex("02 01 00 08 00 00 42 52 45 41 44 2C 07 D8 02 72"), 0.0)
     times = [when for when, data in arrivals(line, 0.5)][1:]
     assert times[-1] - times[0] > 0.1
@@ -187,6 +190,19 @@ def test_two_equal_replies_at_the_same_moment_look_like_one() -> None:
     line = line_of(mint(2), mint(2))
     assert ask(line, hexed(READ_2)) == REPLY
     assert line.collisions == 1
+
+
+def test_a_device_receives_what_is_left_of_a_collision() -> None:
+    line = line_of(first := Ear(), mint(2), mint(2), last := Ear())
+    ask(line, hexed(READ_2))  # two equal replies
+    for ear in (first, last):
+        assert bytes(byte for _, byte in ear.heard) == READ_2 + bytes.fromhex(REPLY)
+    line = line_of(mint(2, delay=0.0), ear := Ear(), driver_release_time=3 * TAU)
+    ask(line, hexed(READ_2))
+    heard = bytes(byte for _, byte in ear.heard)
+    assert heard.startswith(READ_2)
+    assert heard.endswith(bytes.fromhex("03 32"))
+    assert heard != READ_2 + bytes.fromhex(REPLY)
 
 
 def test_what_had_arrived_before_a_collision_stays_as_it_was() -> None:
@@ -444,3 +460,137 @@ def test_bytes_that_the_host_has_not_received_yet_are_kept_when_more_arrive() ->
     line._arrive(b"ab", 0.1)
     line._arrive(b"c", 0.2)
     assert line.receive(1.0) == b"abc"
+
+
+def test_a_device_that_was_removed_receives_and_sends_nothing_more() -> None:
+    line = line_of(mint(), ear := Ear(), sender := Insister(1))
+    line.remove(ear)
+    sender.wakeup = 0.001
+    line.remove(sender)
+    assert ask(line, hexed(READ_2)) == REPLY
+    assert ear.heard == []
+
+
+def test_a_device_that_is_added_later_has_the_time_and_the_chance_of_the_line() -> None:
+    line = line_of()
+    late = EmulatedMint(2, delay=Delay(0.05, 0.1))
+    line.add(late)
+    line.send(READ_2, 1.0)
+    [(first, _), (last, _)] = arrivals(line, 2.0)
+    assert 1.05 < first - 9 * TAU < 1.1
+    assert last - first == pytest.approx(5 * TAU)
+
+
+def test_two_requests_in_one_piece_reach_both_devices() -> None:
+    line = line_of(mint(2), mint(3, delay=0.005))
+    assert ask(line, hexed(READ_2 + READ_3)) == f"{REPLY} {REPLY}"
+
+
+def test_a_talker_never_collides_with_its_own_release_of_the_line() -> None:
+    device = mint(2)
+    device.driver_release_time = 3 * TAU
+    line = line_of(device, driver_release_time=3 * TAU)
+    line.send(b"\x07", 0.0)
+    line.send(READ_2[1:], 2 * TAU)
+    assert [data for _, data in arrivals(line, 1.0)] == ["02", REPLY[3:]]
+    assert line.collisions == 0
+
+
+def test_a_restart_happens_at_its_time_and_not_before() -> None:
+    """A reply that has begun is finished, and one that was transmitted before is complete."""
+    device = mint()
+    line = line_of(device)
+    device.comms[1] = 5
+    line.send(READ_2, 0.0)
+    line.restart(device, 1.0)
+    assert hexed(line.receive(1.0)) == "02 30 31 35 03 37"
+    assert device.comms[1] == 0
+
+
+def test_a_cut_of_some_devices_leaves_the_reply_of_another_alone() -> None:
+    line = line_of(mint(2), far := mint(3))
+    line.send(READ_2, 0.0)
+    line.cut(8 * TAU + 0.002 + 2.5 * TAU, far)
+    assert hexed(line.receive(1.0)) == REPLY
+
+
+def test_a_reply_that_waits_for_its_turn_is_lost_in_a_cut_and_another_is_not() -> None:
+    line = line_of(mint(2, delay=0.1), far := mint(3, delay=0.05))
+    line.send(READ_2, 0.0)
+    line.send(READ_3, 0.01)
+    line.cut(0.04, far)
+    [(when, _), _] = arrivals(line, 1.0)
+    assert when == pytest.approx(8 * TAU + 0.1 + TAU)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"low": -0.001},
+        {"low": 0.1, "high": 0.05},
+        {"high": float("inf")},
+        {"late_reply_delay": (0.2, 0.1)},
+        {"late_reply_delay": (-0.1, 0.1)},
+        {"late_reply_delay": (0.1, float("inf"))},
+        {"late_replies": 1.1},
+        {"late_replies": -0.1},
+    ],
+)
+def test_a_delay_that_no_device_can_have_is_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(InvalidCommand, match=r"reply delay|share of overdue replies is from 0 to 1"):
+        Delay(**values)
+    Delay(0.0, 0.0, late_replies=1.0, late_reply_delay=(0.0, 0.0))
+
+
+def test_a_device_without_settable_values_refuses_them() -> None:
+    with pytest.raises(InvalidCommand, match="Ear takes no initial values"):
+        Ear().preset("1", 5.0)
+
+
+@pytest.mark.parametrize(("value", "fits"), [(0, True), (255, True), (-1, False), (256, False), (1.5, False)])
+def test_a_device_stores_whole_numbers_of_its_range(value: float, fits: bool) -> None:
+    if fits:
+        assert held(value, 0, 255, "register 1") == value
+    else:
+        with pytest.raises(InvalidCommand, match=f"register 1 holds a whole number, 0 to 255, not {value:g}"):
+            held(value, 0, 255, "register 1")
+
+
+def test_a_device_that_restarts_takes_back_its_own_reply_alone() -> None:
+    devices = [mint(address, delay=address * 0.05) for address in (1, 2, 3)]
+    for device in devices:
+        device.comms[1] = device.address
+    line = line_of(*devices)
+    for number, device in enumerate(devices):
+        request = hcp2.Read(1).open(device.address, hcp2.PROFILE.timings).request
+        line.send(request, number * 0.01)
+    line.restart(devices[1], 0.04)
+    replies = "".join(data for _, data in arrivals(line, 1.0)).replace(" ", "")
+    assert bytes.fromhex(replies) == b"\x02011\x03\x33" + b"\x02013\x03\x31"
+
+
+class Low:
+    """A source of chance by which a low level always wins."""
+
+    def getrandbits(self, k: int) -> int:
+        return 0
+
+
+def test_after_a_byte_without_a_stop_bit_the_next_start_bit_begins_a_byte() -> None:
+    bit = TAU / 10
+    collision = Collision(SETTINGS, 0.0, cast("Random", Low()))
+    collision.add(0.0, b"\0", None)
+    collision.add(5 * bit, b"\0", None)  # low up to bit 13, over the stop bit of the first
+    collision.add(20 * bit, b"\x55", None)
+    heard = list(collision.heard(Ear()))
+    assert [byte for _, byte in heard] == [0x00, 0x55]
+    assert heard[1][0] == pytest.approx(20 * bit)
+
+
+def test_a_device_that_is_away_sends_nothing_of_its_own_accord() -> None:
+    device = Insister(1)
+    device.wakeup = 0.005
+    device.away_until = 0.02
+    line = line_of(device)
+    line.prompt = False
+    assert [round(when - 4 * TAU, 6) for when, _ in arrivals(line, 0.03)] == [0.025]

@@ -155,3 +155,117 @@ async def test_it_works_in_real_time() -> None:
     await recorder.heard(b"pong")
     transport.close()
     await recorder.lost()
+
+
+def test_a_port_in_memory_is_the_end_of_its_line() -> None:
+    async def look() -> None:
+        emulated = Line(SETTINGS, [], latency=0.016)
+        port = MemoryPort(emulated)
+        assert (port.name, port.receive_latency) == ("the emulated line", 0.016)
+        transport, _ = await opened(emulated)
+        assert transport.get_extra_info("line") is emulated
+        assert transport.get_extra_info("serial", "none") == "none"
+
+    run_in_virtual_time(look())
+
+
+def test_a_new_connection_gets_no_byte_from_before_it() -> None:
+    async def ask() -> None:
+        emulated = line()
+        emulated.send(b"\x05", 0.0)
+        await asyncio.sleep(1.0)
+        transport, recorder = await opened(emulated)
+        transport.write(b"\x05")
+        await recorder.heard(b"pong")
+        await asyncio.sleep(1.0)
+        assert recorder.received == b"pong"
+        transport.close()
+
+    run_in_virtual_time(ask())
+
+
+def test_a_new_connection_gets_the_bytes_that_are_still_on_the_line() -> None:
+    async def ask() -> None:
+        emulated = line()
+        emulated.prompt = False
+        emulated.send(b"\x05", 0.0)
+        _, recorder = await opened(emulated)
+        await recorder.heard(b"p")  # byte by byte, as from a real port
+        assert recorder.received == b"p"
+        await recorder.heard(b"pong")
+
+    run_in_virtual_time(ask())
+
+
+def test_a_quick_reply_does_not_wait_for_a_late_one() -> None:
+    async def ask() -> None:
+        emulated = line(delay=1.0, answer=b"late")
+        transport, recorder = await opened(emulated)
+        transport.write(b"\x05")
+        await asyncio.sleep(0.1)
+        emulated.devices[0].attentive = False
+        quick = Parrot(2, delay=Delay(0.002))
+        quick.attentive = True
+        emulated.add(quick)
+        transport.write(b"\x05")
+        await recorder.heard(b"pong")
+        assert asyncio.get_running_loop().time() == pytest.approx(0.1 + TAU + 0.002 + 4 * TAU)
+        await recorder.until(lambda r: len(r.received) > 4)
+        assert asyncio.get_running_loop().time() == pytest.approx(TAU + 1.0 + TAU)
+
+    run_in_virtual_time(ask())
+
+
+def test_held_writes_leave_together_when_they_are_released() -> None:
+    async def ask() -> None:
+        transport, recorder = await opened(line())
+        transport.release()
+        assert recorder.flow == []
+        transport.hold()
+        assert transport.get_write_buffer_size() == 0
+        transport.write(b"ping")
+        transport.hold()
+        transport.write(b"\x05")
+        await asyncio.sleep(1.0)
+        assert recorder.received == b""
+        assert transport.get_write_buffer_size() == 5
+        assert set(recorder.flow) == {"pause"}
+        transport.release()
+        await recorder.heard(b"pong")
+        assert recorder.flow[-1] == "resume"
+        assert recorder.flow.count("resume") == 1
+        assert transport.get_write_buffer_size() == 0
+        transport.write(b"\x05")
+        await recorder.heard(b"pongpong")
+        assert recorder.flow[-1] == "resume"
+
+    run_in_virtual_time(ask())
+
+
+def test_writes_held_when_the_port_is_lost_never_leave() -> None:
+    async def ask() -> None:
+        emulated = line()
+        transport, recorder = await opened(emulated)
+        transport.hold()
+        transport.write(b"\x05")
+        transport.abort()
+        transport.release()
+        await asyncio.sleep(1.0)
+        assert (recorder.flow, recorder.received, recorder.losses) == (["pause"], b"", [None])
+        assert emulated.next_event() == float("inf")
+
+    run_in_virtual_time(ask())
+
+
+def test_a_port_set_to_another_rate_gets_no_reply_until_it_has_the_rate_of_the_line() -> None:
+    async def ask() -> None:
+        transport, recorder = await opened(line())
+        await transport.tune(LineSettings(19200))
+        transport.write(b"\x05")
+        await asyncio.sleep(1.0)
+        assert recorder.received == b""
+        await transport.tune(SETTINGS)
+        transport.write(b"\x05")
+        await recorder.heard(b"pong")
+
+    run_in_virtual_time(ask())

@@ -54,6 +54,12 @@ def test_seven_bits_with_even_parity_are_heard_with_the_parity_as_bit_7() -> Non
     ]
 
 
+@pytest.mark.parametrize(("parity", "bytes_"), [("E", "B1 33"), ("O", "31 B3"), ("M", "B1 B3"), ("S", "31 33")])
+def test_the_parity_of_seven_bits_is_the_eighth_of_a_host_without_parity(parity: str, bytes_: str) -> None:
+    found = heard("31 33", LineSettings(9600, 7, parity), LineSettings(9600))
+    assert found == [(byte, True) for byte in bytes_.split()]
+
+
 def test_a_wrong_parity_is_told_and_the_byte_too() -> None:
     assert heard("31 33", LineSettings(9600, 8, "O"), LineSettings(9600, 8, "E")) == [("31", False), ("33", False)]
 
@@ -94,6 +100,16 @@ def test_the_echo_of_a_host_that_is_set_otherwise_is_what_it_said() -> None:
     line.host = LineSettings(9600)
     line.send(READ_1, 0.0)
     assert arrivals(line, 1.0) == [(8 * LineSettings(9600).byte_time, READ_1.hex(" ").upper())]
+
+
+def test_a_late_echo_of_a_host_that_is_set_otherwise_takes_as_long_as_it_said_it() -> None:
+    for paced, sent in ((True, 8 * LineSettings(9600).byte_time), (False, 0.0)):
+        line = line_of(EmulatedMint(1), echo=Echo(0.01), paced=paced)
+        line.host = LineSettings(9600)
+        line.send(READ_1, 1.0)
+        [(when, data)] = arrivals(line, 2.0)
+        assert when == pytest.approx(1.0 + sent + 0.01)
+        assert data == READ_1.hex(" ").upper()
 
 
 @pytest.mark.parametrize("baudrate", [57600, 123_456])

@@ -73,3 +73,69 @@ def test_an_axis_swings_to_and_fro() -> None:
     assert axis.velocity(4.0) == pytest.approx(-100 * math.tau / 8)
     axis.jog(0.0, 4.0)
     assert axis.motion is Motion.JOG
+
+
+def test_an_axis_that_is_placed_is_idle_there_whatever_it_did_before() -> None:
+    jogging, moving, swinging = Axis(), Axis(), Axis()
+    jogging.jog(10.0, 0.0)
+    moving.move(50.0, 0.0)
+    swinging.swing(9.0, 1.0, 0.0, 0.0)
+    for axis in (jogging, moving, swinging):
+        axis.place(7.0, 1.0)
+        assert axis.idle(1.0)
+        assert axis.velocity(1.0) == 0
+        assert axis.position(100.0) == 7.0
+
+
+def test_an_axis_follows_from_where_it_is_and_never_arrives() -> None:
+    axis = Axis(acceleration=10.0)
+    axis.place(5.0, 0.0)
+    axis.move(6.0, 0.0)
+    axis.stop(0.0)
+    axis.follow(-20.0, 0.0)
+    assert axis.motion is Motion.FOLLOW
+    assert axis.velocity(1.0) == pytest.approx(-10.0)
+    assert axis.position(2.0) == pytest.approx(5.0 - 20.0)
+    assert axis.position(3.0) == pytest.approx(5.0 - 40.0)
+    assert not axis.idle(1000.0)
+
+
+def test_a_jog_interrupts_a_move_for_good() -> None:
+    axis = Axis(acceleration=1e9)
+    axis.speed = 10.0
+    axis.move(100.0, 0.0)
+    axis.jog(20.0, 1.0)
+    assert axis.position(11.0) == pytest.approx(210.0)
+    assert axis.motion is Motion.JOG
+
+
+def test_a_swing_begins_at_its_phase() -> None:
+    axis = Axis()
+    axis.swing(100.0, 8.0, 0.25, 0.0)
+    assert axis.position(0.0) == pytest.approx(100)
+    assert axis.velocity(0.0) == pytest.approx(0, abs=1e-9)
+    assert axis.position(2.0) == pytest.approx(0, abs=1e-9)
+    axis.stop(4.0)
+    assert axis.position(9.0) == pytest.approx(-100)
+
+
+def test_a_move_without_speed_goes_on_for_very_long() -> None:
+    axis = Axis()
+    axis.speed = 0.0
+    axis.move(1.0, 0.0)
+    assert 0 < axis.position(1.0) < 1e-3
+    assert not axis.idle(1.0)
+    axis.place(0.0, 1.0)
+    axis.speed = -10.0
+    axis.move(1.0, 1.0)
+    assert axis.position(1.05) == pytest.approx(0.5)
+
+
+def test_after_a_swing_an_axis_begins_from_standstill() -> None:
+    axis = Axis(acceleration=10.0)
+    axis.jog(10.0, 0.0)
+    axis.position(0.0)
+    axis.swing(1.0, 1.0, 0.0, 1.0)
+    axis.jog(5.0, 2.0)
+    assert axis.velocity(2.0) == 0
+    assert axis.velocity(3.0) == 5.0

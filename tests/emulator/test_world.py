@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from random import Random
 
 import pytest
 
-from busmaster.arbiter.events import Event, LineChange, LineChanged, Polled
+from busmaster.arbiter.events import CameUnexpected, Event, LineChange, LineChanged, Polled
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
@@ -16,7 +18,7 @@ from busmaster.emulator.world import StuckWorldError, World
 from busmaster.errors import LineDown, NoReply
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.emulator.lines import SETTINGS, TAU
+from tests.emulator.lines import SETTINGS, TAU, hexed
 from tests.stories import in_use
 
 IN_SYNC = 0.2
@@ -156,6 +158,10 @@ def test_a_write_whose_value_is_far_from_its_turn_is_counted_as_foreign() -> Non
     assert memory.foreign_writes == 2
 
 
+def test_a_value_of_elsewhere_is_that_of_another_node() -> None:
+    assert TraceableMemory(2, 10**4).elsewhere() == traceable_value(3, 0, 0, 10**4)
+
+
 def element_of(read: Transaction) -> int:
     assert isinstance(read.command, hcp2.Read)
     return read.command.element
@@ -209,3 +215,105 @@ def test_a_world_that_turns_in_circles_says_so() -> None:
     world.arbiter.poll_timeout = lambda: 0.5  # type: ignore[method-assign]  # a bug, planted
     with pytest.raises(StuckWorldError, match=r"arbiter 0\.5"):
         world.run(1.0)
+
+
+def test_bytes_that_arrive_while_the_port_is_away_are_lost() -> None:
+    causes: list[tuple[LineChange, str]] = []
+    unexpected: list[bytes] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, LineChanged):
+            causes.append((event.change, event.cause))
+        elif isinstance(event, CameUnexpected):
+            unexpected.append(event.data)
+
+    world = World(Line(SETTINGS, [EmulatedMint(2, delay=Delay(0.02))]), on_event=on_event)
+    node = world.node(hcp2.PROFILE, 2)
+    world.plug()  # it is there
+    world.run(IN_SYNC)
+    world.request(node, hcp2.Read(1))
+    world.run(IN_SYNC + 8 * TAU)
+    world.unplug("pulled out")
+    world.unplug()
+    world.run(IN_SYNC + 1.0)
+    assert causes == [(LineChange.UP, ""), (LineChange.DOWN, "pulled out")]
+    world.plug()
+    world.run(IN_SYNC + 2.0)
+    assert unexpected == []
+
+
+def test_actions_of_one_moment_come_in_their_order_and_none_in_the_past() -> None:
+    world = world_of()
+    done: list[tuple[str, float]] = []
+
+    def act(name: str) -> Callable[[], None]:
+        return lambda: done.append((name, world.now))
+
+    now = world.now
+    world.at(now + 0.5, act("second"))
+    world.at(now + 0.5, act("third"))
+    world.at(now - 0.1, act("first"))
+    world.run(now + 0.4)
+    assert done == [("first", now)]
+    assert world.run_until(lambda: len(done) == 3, 1.0)
+    assert done == [("first", now), ("second", now + 0.5), ("third", now + 0.5)]
+    assert world.now == now + 0.5
+
+
+class Taps:
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, str]] = []
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self.seen.append(("sent", hexed(data)))
+        assert attempt is not None
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self.seen.append(("received", hexed(data)))
+        assert attempt is not None
+
+    def attempted(self, attempt: Attempt, /) -> None:
+        self.seen.append(("ended", f"{attempt.command} {attempt.result}"))
+
+
+def test_a_tap_and_a_record_of_a_world_have_every_byte_and_every_end() -> None:
+    tap, record = Taps(), list[str]()
+    world = World(Line(SETTINGS, [EmulatedMint(2)]), tap=tap, record=record.append)
+    in_use(world)
+    world.run(IN_SYNC)
+    world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
+    world.run(1.0)
+    assert tap.seen == [
+        ("sent", "07 30 32 02 30 31 05 04"),
+        ("received", "02 30 31 30 03 32"),
+        ("ended", "read element 1 0.0"),
+    ]
+    assert [line.partition(" ")[2] for line in record] == [
+        "line up",
+        "> 07 30 32 02 30 31 05 04",
+        "< 02 30 31 30 03 32",
+        "node 2: unknown -> up",
+        "node 2: read element 1 -> 0.0",
+    ]
+
+
+def test_a_record_names_every_kind_of_event() -> None:
+    record: list[str] = []
+    world = World(Line(SETTINGS, [EmulatedMint(2, delay=Delay(0.09))]), record=record.append)
+    in_use(world)
+    world.run(IN_SYNC)
+    world.request(world.node(hcp2.PROFILE, 2), hcp2.Write(1, (5.0,)), finish_by=world.now + 0.05)
+    world.request(world.node(hcp2.PROFILE, 3), hcp2.Read(1), retries=0)
+    world.run(1.0)
+    world.unplug()
+    world.run(1.0)
+    told = [line.partition(" ")[2] for line in record]
+    events = [line for line in told if line[0] not in "<>"]
+    assert events[:5] == [
+        "line up",
+        "node 2: write element 1 = 5 -> WriteUnconfirmed('sent, but not answered within its time: 50 ms')",
+        "node 2: unknown -> up",
+        "node 3: unknown -> down",
+        "node 3: read element 1 -> NoReply('no reply within 150 ms')",
+    ]
+    assert "line down unplugged" in events[5:]
