@@ -8,7 +8,8 @@ import socket
 import termios
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from tests.ports import free_port
 WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
 REPLY = bytes.fromhex("02 30 31 31 32 33 2E 34 35 36 03 2B")
+REPLY_ZERO = bytes.fromhex("02 30 31 30 03 32")
 
 
 def mint_line(paced: bool = False, delay: float = 0.0) -> Line:
@@ -278,3 +280,143 @@ def test_a_fault_in_a_device_ends_the_server_and_is_told_at_its_close() -> None:
         assert client.recv(1) == b""
     with pytest.raises(ZeroDivisionError):
         server.close()
+
+
+def test_every_tcp_client_receives_every_reply() -> None:
+    with serve_tcp(mint_line()) as server, connected(server) as one, connected(server) as other:
+        for asking, listening in ((one, other), (other, one)):
+            assert ask(asking.fileno(), WRITE, 1) == b"\x06"
+            assert listening.recv(10) == b"\x06"
+
+
+def test_a_reply_without_a_client_is_counted_as_dropped() -> None:
+    with serve_tcp(mint_line()) as server:
+        server.call(lambda line, now: line.send(READ, now))
+        until(lambda: server.dropped > 0)
+        assert server.dropped == len(REPLY_ZERO)
+        with connected(server) as client:
+            assert ask(client.fileno(), WRITE, 1) == b"\x06"
+        assert server.dropped == len(REPLY_ZERO)
+
+
+def test_tcp_replies_are_sent_without_delay() -> None:
+    with serve_tcp(mint_line()) as server, connected(server) as client:
+        assert ask(client.fileno(), WRITE, 1) == b"\x06"
+        [accepted] = server._clients.values()
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_a_line_is_served_at_an_ipv6_address() -> None:
+    with serve_tcp(mint_line(), "::1") as server:
+        assert server.path == f"socket://[::1]:{server.port}"
+        with connected(server) as client:
+            assert ask(client.fileno(), WRITE, 1) == b"\x06"
+
+
+def descriptors() -> set[str]:
+    """What the open descriptors of this process lead to, each with its number."""
+    found = set()
+    for number in os.listdir("/proc/self/fd"):
+        with suppress(OSError):
+            found.add(f"{number} {os.readlink(f'/proc/self/fd/{number}')}")
+    return found
+
+
+@pytest.mark.parametrize("serve", [serve_pty, serve_tcp])
+def test_a_closed_server_leaves_nothing_open(serve: Callable[[Line], LineServer]) -> None:
+    before = descriptors()
+    server = serve(mint_line())
+    with client_of(server) as client:
+        assert ask(client, WRITE, 1) == b"\x06"
+        server.close()
+    server.close()
+    assert descriptors() <= before
+
+
+def test_a_link_that_cannot_be_made_leaves_nothing_open(tmp_path: Path) -> None:
+    (tmp_path / "line").write_text("mine")
+    before = descriptors()
+    with pytest.raises(FileExistsError):
+        serve_pty(mint_line(), tmp_path / "line")
+    assert descriptors() <= before
+
+
+def test_a_link_to_another_device_is_replaced(tmp_path: Path) -> None:
+    """Only a pseudo-terminal has an emulator behind it."""
+    link = tmp_path / "line"
+    link.symlink_to("/dev/null")
+    with serve_pty(mint_line(), link):
+        assert os.readlink(link).startswith("/dev/pts/")
+
+
+def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path: Path) -> None:
+    link = tmp_path / "line"
+    with serve_pty(mint_line(), link):
+        link.unlink()
+        link.symlink_to("/dev/null")
+    assert os.readlink(link) == "/dev/null"
+
+
+def test_a_closed_server_refuses_every_call() -> None:
+    server = serve_tcp(mint_line())
+    server.close()
+    with pytest.raises(RuntimeError, match=f"{server.path} is no longer served"):
+        server.call(lambda line, now: None)
+
+
+def test_a_call_that_the_end_of_the_server_overtakes_fails() -> None:
+    """It is queued when the thread ends, and must not wait for ever."""
+    with serve_tcp(mint_line()) as server:
+
+        def end(line: Line, now: float) -> None:
+            server._actions.put((lambda line, now: None, waiting))
+            raise SystemExit
+
+        waiting: Future[None] = Future()
+        server._actions.put((end, Future()))
+        os.write(server._button, b".")
+        with pytest.raises(RuntimeError, match="no longer served"):
+            waiting.result(PATIENCE)
+        with pytest.raises(SystemExit):
+            server.close()
+
+
+def test_another_framing_is_named_in_the_report() -> None:
+    reports: list[str] = []
+    line = Line(LineSettings(9600, 8, "E"), [EmulatedMint(2)])
+    with serve_pty(line, report=reports.append) as server:
+        port = opened(server.path)
+        settings = termios.tcgetattr(port)
+        settings[2] |= termios.PARODD
+        settings[4] = settings[5] = termios.B9600
+        termios.tcsetattr(port, termios.TCSANOW, settings)
+        os.write(port, READ)
+        until(lambda: bool(reports))
+        os.close(port)
+    [report] = reports
+    assert report == (
+        f"{server.path}: the other side sends with 8O1, but the emulated line has 8E1: neither can read the other. "
+        "Set the other side to 8E1, or emulate a line with 8O1"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "client", "found"),
+    [
+        ((9600, 8, "N"), (0, 19200, False), (19200, 8, "N")),  # the rates of both directions may differ: it sends
+        ((9600, 8, "N"), (19200, 9600, False), None),
+        ((9600, 8, "N"), (0, 0, False), None),  # a rate of 0 is a hang-up
+        ((9600, 7, "E"), (9600, 9600, False), None),  # a pseudo-terminal has no flag for even parity, nor 7 bits
+        ((9600, 7, "E"), (9600, 9600, True), (9600, 7, "O")),
+        ((9600, 7, "O"), (9600, 9600, True), None),
+        ((9600, 7, "O"), (9600, 9600, False), (9600, 7, "N")),
+    ],
+)
+def test_settings_of_a_client_are_compared_with_those_of_the_line(
+    line: tuple[int, int, str], client: tuple[int, int, bool], found: tuple[int, int, str] | None
+) -> None:
+    incoming, outgoing, odd = client
+    words = port_settings.TERMIOS2.pack(0, 0, termios.PARODD * odd, 0, b"", incoming, outgoing)
+    port = port_settings.differing(words, LineSettings(*line))
+    assert port == (None if found is None else LineSettings(*found))
+    assert port_settings.differing(b"", LineSettings(*line)) is None
