@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+import errno
 import logging
 import os
 import time
@@ -16,7 +17,7 @@ import uvloop
 
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import alarm as alarm_module
-from busmaster.transport.alarm import SOON, Alarm, KernelTimer
+from busmaster.transport.alarm import SOON, Alarm, KernelTimer, call_system
 from tests.patience import PATIENCE
 
 
@@ -188,3 +189,28 @@ def test_a_kernel_timer_that_was_set_again_has_not_expired() -> None:
     timer.set(time.monotonic() + 60.0)
     assert not timer.has_expired()
     timer.close()
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.001, 2 * SOON), (2 * SOON, 0.001), (2 * SOON, 3 * SOON)])
+def test_of_a_near_and_a_far_deadline_the_later_set_counts_alone(first: float, second: float) -> None:
+    async def main() -> None:
+        rings: list[float] = []
+        alarm = Alarm(asyncio.get_running_loop(), lambda: rings.append(time.monotonic()))
+        start = time.monotonic()
+        alarm.set(start + first)
+        alarm.set(start + second)
+        await asyncio.sleep(4 * SOON)
+        async with asyncio.timeout(PATIENCE):
+            while not rings:  # noqa: ASYNC110  # a busy machine
+                await asyncio.sleep(0.001)
+        assert len(rings) == 1
+        assert rings[0] - start >= second
+        alarm.close()
+
+    asyncio.run(main())
+
+
+def test_a_call_of_the_system_that_fails_says_why() -> None:
+    with pytest.raises(OSError, match="Bad file descriptor") as caught:
+        call_system("inotify_add_watch", -1, b"/", 0x100)
+    assert caught.value.errno == errno.EBADF

@@ -52,6 +52,13 @@ MENTOR = LineSettings(9600, 7, "E", 1)
         ("usb:12345678:1?baudrate=9600", SerialPort("usb:12345678:1", baudrate=9600)),
         ("usb:12345678?baudrate=9600", SerialPort("usb:12345678", baudrate=9600)),
         ("line?baudrate=9600&rtscts=1&parity=n", SerialPort("line", baudrate=9600, rtscts=True)),
+        (
+            "line?baudrate=9600&parity=Mark&stopbits=1.5&rtscts=YES",
+            SerialPort("line", baudrate=9600, parity="M", stopbits=1.5, rtscts=True),
+        ),
+        ("line?baudrate=9600&parity=space&echo=False", SerialPort("line", baudrate=9600, parity="S")),
+        ("line?baudrate=9600&parity=none&rtscts=off", SerialPort("line", baudrate=9600)),
+        ("line?baudrate=9600&parity=odd&rs485=0", SerialPort("line", baudrate=9600, parity="O", rs485=False)),
         ("socket://server:4001", TcpPort("server", 4001)),
         ("socket://[::1]:4001/", TcpPort("::1", 4001)),
         (

@@ -106,6 +106,51 @@ def test_a_port_that_the_kernel_does_not_describe_has_just_gone(usb: UsbTree, mo
         assert not known.is_behind(zero.fileno())
 
 
+def test_the_advice_for_another_device_names_what_this_one_is_found_by(usb: UsbTree) -> None:
+    with plugged() as a, plugged() as b, plugged() as c:
+        usb.plug(a.path, "A500ABC", place="1-1")
+        usb.plug(b.path, "A500ABC", place="1-1", interface=1)
+        usb.plug(c.path, place="1-2.3")
+        advice = [identify(end.path).advice for end in (a, b, c)]
+    assert [text.partition(",")[0] for text in advice] == [
+        "name it usb:A500ABC",
+        "name it usb:A500ABC:1",
+        "plug it in at 1-2.3 again",
+    ]
+
+
+def test_an_adapter_is_called_by_its_product_or_else_by_its_kind(usb: UsbTree, one: PtyMaster) -> None:
+    usb.plug(one.path, "A500ABC", maker="", kind=CH340)
+    assert str(identify(one.path)) == f"{CH340} A500ABC"
+    (usb.root / "devices/1-1/product").write_text("USB Serial\n")
+    assert str(identify(one.path)) == "USB Serial A500ABC"
+
+
+def test_a_port_is_behind_a_name_only_while_the_kernel_describes_it_so(usb: UsbTree, one: PtyMaster) -> None:
+    usb.plug(one.path, "A500ABC")
+    known = identify(one.path)
+    descriptor = os.open(one.path, os.O_RDWR | os.O_NOCTTY)
+    assert known.is_behind(descriptor)
+    usb.unplug(one.path)
+    assert not known.is_behind(descriptor)
+    os.close(descriptor)
+
+
+def test_ttys_are_looked_up_in_the_folder_that_the_kernel_means(
+    usb_dev: UsbTree, one: PtyMaster, tmp_path: Path
+) -> None:
+    (tmp_path / "dev/usb").mkdir()
+    usb_dev.plug(one.path, "A500ABC", node="usb/tty0")
+    assert identity.all_ttys() == (("usb!tty0", None),)
+    usb_dev.make_node("usb/tty0", one.path)
+    assert identity.all_ttys() == (("usb!tty0", identity.node_at(one.path)),)
+    usb_dev.unplug(one.path)
+    assert identity.all_ttys() == ()
+    (tmp_path / "sys/class/tty").rmdir()
+    assert identity.all_ttys() is None
+    assert usb_devices() == []
+
+
 # -- names by serial number ------------------------------------------------------------------------------------------
 
 

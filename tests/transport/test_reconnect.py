@@ -387,3 +387,21 @@ async def _flood(pty_master: PtyMaster) -> None:
             pty_master.read(patience=0.001)
             await asyncio.sleep(0)
     assert recorder.flow == ["pause", "resume"]
+
+
+def test_a_close_that_is_cancelled_still_gives_the_port_back() -> None:
+    async def cancel() -> None:
+        told, recorder = Told(stuck=True), Recorder()
+        connection = Connection(told, recorder)
+        await connection.open()
+        closing = asyncio.ensure_future(connection.close())
+        await asyncio.sleep(reconnect.CLOSE_DEADLINE / 2)
+        assert [wire.aborted for wire in told.wires] == [False]
+        closing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await closing
+        assert [wire.aborted for wire in told.wires] == [True]
+        await recorder.lost()
+        assert recorder.losses == [None]
+
+    run_in_virtual_time(cancel())

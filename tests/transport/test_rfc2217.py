@@ -162,6 +162,22 @@ async def test_dtr_and_rts_are_left_alone_unless_asked_for() -> None:
         await closed(*await opened(server.number))
 
 
+@pytest.mark.asyncio
+async def test_dtr_and_rts_are_switched_on_each_by_its_own_option() -> None:
+    tried: list[dict[str, Any]] = [{"dtr": True}, {"rts": True}, {"dtr": True, "rts": False}]
+    for options in (*tried, {"rtscts": True, "dtr": False}):
+        port = RemotePort()
+        port.dtr, port.rts = not options.get("dtr"), not options.get("rts")
+        others = {name: getattr(port, name) for name in ("dtr", "rts") if name not in options}
+        async with rfc2217_server(port=port) as server:
+            await closed(*await opened(server.number, **options))
+        assert {name: getattr(port, name) for name in ("dtr", "rts")} == {
+            **others,
+            **{name: on for name, on in options.items() if name != "rtscts"},
+        }
+        assert port.rtscts is options.get("rtscts", False)
+
+
 @pytest.mark.parametrize(
     ("name", "says"),
     [
@@ -310,6 +326,41 @@ async def test_a_server_that_answers_no_masks_and_no_flow_control_is_used() -> N
         transport, recorder = await opened(number)
         assert transport.get_extra_info("modem_lines") is None
         assert heard[0] == bytes.fromhex("ff fb 2c ff fb 00 ff fd 00 ff fb 03 ff fd 03")
+        await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_server_that_suspends_while_the_port_is_opened_gets_no_byte_until_it_resumes() -> None:
+    async with scripted(AGREES, CONFIRMS + "ff fa 2c 6c ff f0") as (number, heard, writers):
+        transport, recorder = await opened(number)
+        transport.write(b"a")
+        assert recorder.flow == ["pause"]
+        assert transport.get_write_buffer_size() == 1
+        writers[0].write(bytes.fromhex("ff fa 2c 6c ff f0") + b"x")  # once more
+        await recorder.heard(b"x")
+        assert transport.get_write_buffer_size() == 1
+        writers[0].write(bytes.fromhex("ff fa 2c 6d ff f0"))
+        await recorder.until(lambda r: r.flow == ["pause", "resume"])
+        transport.write(b"b")
+        async with asyncio.timeout(PATIENCE):
+            while not heard[-1].endswith(b"b"):  # noqa: ASYNC110  # the server has no event for it
+                await asyncio.sleep(0.001)
+        assert b"".join(heard).endswith(b"ab")
+        await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_errors_are_counted_from_the_opening_where_the_server_reports_them() -> None:
+    before = "ff fa 2c 6a 10 ff f0"
+    async with scripted(AGREES, CONFIRMS + before + "ff fa 2c 6e 1e ff f0") as (number, _, writers):
+        transport, recorder = await opened(number, Marked())
+        port = open_port(transport)
+        writers[0].write(bytes.fromhex("ff fa 2c 6a 60 ff f0") + b"x")  # its transmitter is empty: not an error
+        await recorder.heard(b"x")
+        assert port.errors() == DriverErrors(0, 0, 0, 0, 0)
+        writers[0].write(bytes.fromhex("ff fa 2c 6a 10 ff f0") + b"y")
+        await recorder.heard(b"y")
+        assert port.errors() == DriverErrors(framing=0, parity=0, breaks=1, overruns=0, buffer_overruns=0)
         await closed(transport, recorder)
 
 

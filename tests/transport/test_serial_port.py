@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import termios
 import threading
 from collections.abc import Iterator
@@ -10,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import serial_port
 from busmaster.transport.endpoints import is_paced
+from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from tests.transport.fakes import PtyMaster, closed, opened, plugged
 
@@ -81,6 +85,72 @@ async def test_a_pty_is_unpaced_unless_told(pty_master: PtyMaster) -> None:
         assert transport.get_extra_info("paced") is expected
         assert is_paced(SerialPort(pty_master.path, baudrate=57600, paced=told), transport) is expected
         await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_rate_framing_and_flow_control_reach_the_driver(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pseudo-terminal would not keep all of them."""
+    configured: list[serial.Serial] = []
+
+    def refuse(device: serial.Serial, path: str) -> None:
+        assert path == device.port == pty_master.path
+        configured.append(device)
+        raise OSError(errno.ENXIO, "nothing")
+
+    monkeypatch.setattr(serial_port, "_names_pty", lambda path: False)
+    monkeypatch.setattr(serial_port, "_open_device", refuse)
+    for options in ({"parity": "E", "bytesize": 7, "stopbits": 2, "rtscts": True}, {"exclusive": False}):
+        with pytest.raises(LineDown, match="no hardware behind"):
+            await opened(pty_master.path, **options)
+    assert [
+        (one.baudrate, one.bytesize, one.parity, one.stopbits, one.rtscts, one.exclusive, one.timeout)
+        for one in configured
+    ] == [(57600, 7, "E", 2, True, True, 0), (57600, 8, "N", 1, False, None, 0)]
+
+
+@pytest.mark.asyncio
+async def test_an_open_port_can_be_tuned_and_a_refusal_names_what_it_does_not_take(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport, recorder = await opened(pty_master.path)
+
+    def found() -> tuple[int, bool, bool]:
+        settings = termios.tcgetattr(pty_master.fd)
+        return settings[5], bool(settings[2] & termios.PARODD), bool(settings[2] & termios.CSTOPB)
+
+    assert found() == (termios.B57600, False, False)
+    await transport.tune(LineSettings(9600, 7, "O", 2))
+    assert found() == (termios.B9600, True, True)
+    await transport.tune(LineSettings(19200, 7, "E"))  # even parity and 7 bits are ignored
+    assert found() == (termios.B19200, False, False)
+
+    def refuse(device: serial.Serial, wanted: dict[str, object]) -> None:
+        asked.append(wanted)
+        raise ValueError("Failed to set custom baud rate")
+
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(serial.Serial, "apply_settings", refuse)
+    monkeypatch.setattr(serial_port, "is_pty", lambda device: False)
+    with pytest.raises(LineDown, match=f"{pty_master.path} does not take 1200 baud, 7E1"):
+        await transport.tune(LineSettings(1200, 7, "E"))
+    assert asked == [{"baudrate": 1200, "bytesize": 7, "parity": "E", "stopbits": 1}]
+    monkeypatch.undo()
+    await closed(transport, recorder)
+
+
+@pytest.mark.parametrize(
+    ("rs485", "delay"),
+    [
+        (None, 0.0),
+        (True, 0.0),
+        (Rs485(delay_before=0.005, delay_after=0.01), 0.005),
+        (Rs485(by="software", delay_before=0.0004), 0.0004),
+    ],
+)
+def test_the_delay_of_each_frame_is_that_before_its_first_byte(rs485: Rs485 | bool | None, delay: float) -> None:
+    assert SerialPort("/dev/ttyS0", baudrate=9600, rs485=rs485).send_delay == delay
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------

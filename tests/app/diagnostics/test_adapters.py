@@ -212,6 +212,16 @@ def test_of_a_program_in_python_the_module_or_script_is_named_and_no_more(
     assert holders(pty_master.path, proc=tmp_path) == (Holder(4711, name),)
 
 
+def test_a_process_that_only_names_the_port_does_not_hold_it(tmp_path: Path, pty_master: PtyMaster) -> None:
+    for number, (pid, flags) in enumerate((("4711", "0100002"), ("812", "012100002"), ("9", "0100002")), 3):
+        (tmp_path / pid / "fd").mkdir(parents=True)
+        (tmp_path / pid / "fdinfo").mkdir()
+        for name, target in (("0", "/dev/null"), (str(number), pty_master.path)):
+            (tmp_path / pid / "fd" / name).symlink_to(target)
+            (tmp_path / pid / "fdinfo" / name).write_text(f"pos:\t0\nflags:\t{flags}\nmnt_id:\t26\n")
+    assert [holder.pid for holder in holders(pty_master.path, proc=tmp_path)] == [9, 4711]
+
+
 def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(pty_master: PtyMaster) -> None:
     """An emulator has the port open too, so that clients may come and go."""
     with open(pty_master.path, "rb", buffering=0):
