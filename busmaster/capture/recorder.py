@@ -82,6 +82,8 @@ class Recorder:
         self._writer = PcapngWriter(self._files, port=port)
         self._unwritten = 0
         """Events in packets that are not written yet."""
+        self._file_ended = False
+        """The file has its closing statistics, but the next one could not be created yet."""
         self._reported = 0
         offset = time.time() - time.monotonic()
         self._assembler = Assembler(self._write, protocol=protocol, echo=echo, offset=offset)
@@ -138,7 +140,7 @@ class Recorder:
         busy = time.monotonic()
         while not self._stop.wait(TICK if self.error is None else RETRY):
             if self.error is not None:
-                self._flush()
+                self._resume()
             elif self._events:
                 busy = time.monotonic()
                 self._drain()
@@ -151,7 +153,8 @@ class Recorder:
     def _end(self) -> None:
         """Write the remaining events if the disk accepts them."""
         # First: nothing is drained before a disk that was full accepts data again.
-        self._flush()
+        if self.error is not None:
+            self._resume()
         self._drain()
         self._assembler.finish(time.monotonic())
         self._writer.finish(round(time.time() * 1e6), self.dropped)
@@ -177,7 +180,8 @@ class Recorder:
                 self._begin_next()
             elif self._files.pending > AT_ONCE:
                 self._flush()
-        self._flush()
+        if self.error is None:
+            self._flush()
 
     def _flush(self) -> None:
         self._try(self._files.flush)
@@ -187,10 +191,20 @@ class Recorder:
 
         The events of an unfinished exchange are all in the next file.
         """
-        self._writer.finish(round(time.time() * 1e6), self.dropped)
+        if not self._file_ended:
+            self._file_ended = True
+            self._writer.finish(round(time.time() * 1e6), self.dropped)
         if self._try(self._files.begin_next):
             # each file has a header and can be read separately
             self._writer = PcapngWriter(self._files, port=self._port)
+            self._file_ended = False
+
+    def _resume(self) -> None:
+        """Retry what has failed: a flush of the old file proves nothing about the next one."""
+        if self._files.full:
+            self._begin_next()
+        else:
+            self._flush()
 
     def _try(self, work: Callable[[], None]) -> bool:
         """Return True if writing succeeded. Reports changes."""

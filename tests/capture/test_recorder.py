@@ -9,9 +9,11 @@ import pytest
 
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture import recorder
+from busmaster.capture.files import CaptureFiles
 from busmaster.capture.pcapng import Outcome, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.protocols.hcp2 import codec as hcp2
+from tests.app.outputs.cycles import until
 
 READ = hcp2.Read(1)
 REQUEST = READ.open(2, hcp2.PROFILE.timings).request
@@ -71,3 +73,96 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
 
 def test_every_verdict_of_an_arbiter_has_its_outcome_in_a_capture() -> None:
     assert {verdict.name for verdict in Verdict} == {outcome.name for outcome in Outcome} - {"NONE", "UNEXPECTED"}
+
+
+def test_a_capture_of_a_silent_line_is_on_disk_before_it_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A read without a reply is judged by the silence behind it."""
+    monkeypatch.setattr(recorder, "TICK", 0.001)
+    monkeypatch.setattr(recorder, "IDLE", 0.01)
+    path = tmp_path / "line.pcapng"
+    with Recorder(path, protocol="hcp2") as tap:
+        for _ in range(2):  # the silence is noticed each time
+            size = path.stat().st_size
+            tap.overheard(time.monotonic(), REQUEST)
+            until(lambda before=size: path.stat().st_size > before)  # type: ignore[misc]
+    with path.open("rb") as file:
+        packets = list(read_packets(file))
+    assert [(packet.protocol, packet.frame, packet.outcome) for packet in packets] == [
+        ("hcp2", REQUEST, Outcome.NONE),
+        ("hcp2", b"", Outcome.NO_REPLY),
+    ] * 2
+
+
+def test_sent_bytes_that_are_received_too_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "line.pcapng"
+    with Recorder(path, echo=True) as tap:
+        now, asked = time.monotonic(), attempt()
+        tap.transmitted(now, REQUEST, asked)
+        tap.received(now + 0.002, REQUEST + REPLY, asked)
+    with path.open("rb") as file:
+        assert [packet.frame for packet in read_packets(file)] == [REQUEST, REPLY]
+
+
+def test_events_that_are_lost_are_counted_once_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each packet has the events that were lost since the one before, the end of the file has all of them."""
+    monkeypatch.setattr(recorder, "TICK", 0.001)
+    path = tmp_path / "line.pcapng"
+    with Recorder(path) as tap:
+        for lost in (2, 3):
+            tap.dropped += lost
+            tap.received(time.monotonic(), b"\xff", None)
+            size = path.stat().st_size
+            tap.transmitted(time.monotonic(), REQUEST, attempt())
+            until(lambda before=size: path.stat().st_size > before)  # type: ignore[misc]
+    with path.open("rb") as file:
+        assert [packet.dropped for packet in read_packets(file) if packet.dropped] == [2, 3]
+    assert path.read_bytes()[-16:-8] == (5).to_bytes(8, "little")
+    assert tap.dropped == 5
+
+
+def test_a_recorder_can_be_closed_twice(tmp_path: Path) -> None:
+    tap = Recorder(tmp_path / "line.pcapng")
+    tap.close()
+    size = (tmp_path / "line.pcapng").stat().st_size
+    tap.close()
+    assert (tmp_path / "line.pcapng").stat().st_size == size
+
+
+def test_a_next_file_that_cannot_be_made_is_reported_once_and_made_as_soon_as_it_can_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts: list[None] = []
+
+    class Counted(CaptureFiles):
+        def begin_next(self) -> None:
+            attempts.append(None)
+            super().begin_next()
+
+    monkeypatch.setattr(recorder, "CaptureFiles", Counted)
+    monkeypatch.setattr(recorder, "TICK", 0.001)
+    monkeypatch.setattr(recorder, "RETRY", 0.001)
+    folder, away = tmp_path / "captures", tmp_path / "away"
+    folder.mkdir()
+    said: list[str] = []
+    with Recorder(folder / "line.pcapng", port="COM", size=100, report=said.append) as tap:
+        folder.rename(away)
+        for _ in range(3):
+            tap.transmitted(time.monotonic(), REQUEST, attempt())
+        until(lambda: len(attempts) > 3)
+        assert len(said) == 1
+        away.rename(folder)
+        until(lambda: len(said) == 2)
+        tap.transmitted(time.monotonic(), REQUEST, attempt())
+    assert said[0].startswith("the capture rests: ")
+    assert said[0].endswith(": No such file or directory")
+    assert said[1].endswith("; nothing is lost")
+    assert (tap.error, tap.dropped, len(said)) == (None, 0, 2)
+    frames = 0
+    for path in folder.iterdir():
+        assert b"COM" in path.read_bytes()
+        with path.open("rb") as file:
+            frames += sum(packet.frame == REQUEST for packet in read_packets(file))
+    assert frames == 4
+    assert len(list(folder.iterdir())) > 1
