@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -137,6 +138,54 @@ def test_what_one_writing_leaves_is_written_by_the_next(tmp_path: Path) -> None:
         disk.clear()
         files.close()
         assert (tmp_path / "line.pcapng").read_bytes() == bytes(2_000) + b"x" * 10_000
+
+
+def test_a_pipe_or_a_device_is_written_to_as_it_is(tmp_path: Path) -> None:
+    pipe = tmp_path / "line.pcapng"
+    os.mkfifo(pipe)
+    end = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        files = CaptureFiles(pipe, size=10)
+        files.write(bytes(20))
+        assert not files.full
+        files.close()
+        assert os.read(end, 100) == bytes(20)
+    finally:
+        os.close(end)
+    assert files.path == str(pipe)
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+def test_an_old_file_that_was_moved_is_left_alone(tmp_path: Path) -> None:
+    files = CaptureFiles(tmp_path / "line.pcapng", count=2)
+    (tmp_path / "line.pcapng").rename(tmp_path / "kept.pcapng")
+    for _ in range(3):
+        files.begin_next()
+    files.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["kept.pcapng", "line-3.pcapng", "line-4.pcapng"]
+
+
+def test_a_file_is_full_when_it_has_its_size_with_the_bytes_that_wait(tmp_path: Path) -> None:
+    files = CaptureFiles(tmp_path / "line.pcapng", size=10)
+    files.write(bytes(4))
+    files.flush()
+    files.write(bytes(5))
+    assert (files.full, files.pending) == (False, 5)
+    files.write(bytes(1))
+    assert files.full
+    files.begin_next()
+    assert (files.full, files.pending) == (False, 0)
+    files.close()
+    assert [path.stat().st_size for path in sorted(tmp_path.iterdir())] == [0, 10]
+
+
+def test_a_file_is_closed_though_its_rest_cannot_be_written() -> None:
+    files = CaptureFiles("/dev/full")
+    files.write(b"x")
+    with pytest.raises(OSError, match="No space left"):
+        files.close()
+    assert files._file.closed
+    assert files.pending == 1
 
 
 RECORD = """

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.capture.decode import Decoder
+from busmaster.capture.decode import LONGEST_FRAME, Decoder
 from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.errors import InvalidCommand
 from busmaster.registry import find, kinds
@@ -292,6 +292,44 @@ def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply(
     assert (asked.time, asked.delay) == (1.0, None)
     assert reply.time == 1.03
     assert reply.delay == pytest.approx(0.02)
+
+
+def test_a_silence_of_the_gap_continues_a_frame_and_a_longer_one_ends_it() -> None:
+    def pieces(pause: float) -> list[str]:
+        decoder = Decoder(find("hcp2").protocol.dialect(), gap=0.5)
+        frames = decoder.feed(bytes.fromhex("07 30 32 02"), 10.0)
+        frames += decoder.feed(bytes.fromhex("30 31 05 04"), 10.0 + pause)
+        assert decoder.unfinished is (pause > 0.5)
+        return said(frames + decoder.quiet())
+
+    assert pieces(0.5) == ["host 2 read 1"]
+    assert pieces(0.6) == ["unknown 4 bytes [cut short after 4 bytes]", "unknown 4 bytes [no frame]"]
+
+
+def test_frames_that_came_in_one_piece_are_marked_and_end_when_it_came() -> None:
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    request, reply = bytes.fromhex("07 30 32 02 30 31 05 04"), bytes.fromhex("02 30 31 35 03 37")
+    frames = decoder.feed(request + reply + b"\xff" + request, 1.0)
+    frames += decoder.feed(reply[:2], 2.0)
+    frames += decoder.feed(reply[2:] + b"\xff\xff", 2.05) + decoder.quiet()
+    assert [(frame.raw, frame.time, frame.ended, frame.joined) for frame in frames] == [
+        (request, 1.0, 1.0, False),
+        (reply, 1.0, 1.0, True),
+        (b"\xff", 1.0, 1.0, True),
+        (request, 1.0, 1.0, True),
+        (reply, 2.0, 2.05, False),
+        (b"\xff\xff", 2.05, 2.05, True),
+    ]
+
+
+def test_endless_noise_comes_in_frames_of_bounded_length() -> None:
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    frames = [frame for n in range(10) for frame in decoder.feed(b"\xff" * 99, n / 100)]
+    assert [len(frame.raw) for frame in frames] == [LONGEST_FRAME] * 3
+    assert [frame.time for frame in frames] == [0.0, 0.02, 0.05]
+    (rest,) = decoder.quiet()
+    assert len(rest.raw) == 990 - 3 * LONGEST_FRAME
+    assert decoder.quiet() == []
 
 
 def test_a_sender_that_is_known_is_believed() -> None:

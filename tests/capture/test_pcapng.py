@@ -141,3 +141,38 @@ def test_a_file_with_any_byte_damaged_is_read_or_refused_in_words(wrong: int) ->
         except CaptureError:
             refused += 1
     assert refused
+
+
+def test_numbers_that_outgrow_the_header_are_cut_and_do_not_end_the_capture() -> None:
+    packet = Packet(1, "hcp2", NODE, b"\x06", 5, transaction=2**32 + 7, attempt=300)
+    (read,) = read_packets(io.BytesIO(written(packet)))
+    assert (read.transaction, read.attempt) == (7, 255)
+
+
+def test_a_note_without_a_comment_stays_a_note() -> None:
+    packet = Packet(1, "hcp2", NODE, b"\x06", 5, notes=("late", "cancelled"))
+    assert list(read_packets(io.BytesIO(written(packet)))) == [packet]
+
+
+def test_captures_that_were_joined_are_read_as_one() -> None:
+    """Each section numbers its own interfaces."""
+    one, other = (Packet(1, name, NODE, b"\x06", 5) for name in ("msc", "hcp2"))
+    assert list(read_packets(io.BytesIO(written(one) + written(other)))) == [one, other]
+
+
+def test_an_empty_file_is_no_capture() -> None:
+    with pytest.raises(CaptureError, match="the file is empty"):
+        list(read_packets(io.BytesIO()))
+
+
+def test_times_in_parts_of_a_power_of_two_are_read() -> None:
+    interface = struct.pack("<IIHHIHHB3xII", 1, 32, 157, 0, 0, 9, 1, 0x80 | 10, 0, 32)
+    packet = struct.pack("<IIIIIII7sxI", 6, 40, 0, 0, 3 * 1024 + 512, 7, 7, b"\1\6\2\0\xff\xff\x06", 40)
+    (read,) = read_packets(io.BytesIO(HEAD[:48] + interface + packet))
+    assert read.micros == 3_500_000
+
+
+def test_a_packet_of_an_interface_that_is_not_there_is_refused() -> None:
+    packet = struct.pack("<IIIIIII7sxI", 6, 40, 1, 0, 0, 7, 7, b"\1\6\2\0\xff\xff\x06", 40)
+    with pytest.raises(CaptureError, match="no link type 157"):
+        list(read_packets(io.BytesIO(HEAD + packet)))
