@@ -6,13 +6,27 @@ import asyncio
 import copy
 import pickle
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from busmaster import Bus, BusClosed, BusError, Hcp2Controller, LineDown, NoReply, Refused, SerialPort
+from busmaster import (
+    Bus,
+    BusClosed,
+    BusError,
+    Hcp2Controller,
+    HoldEnded,
+    LineDown,
+    NoReply,
+    NotStarted,
+    Refused,
+    SerialPort,
+    WriteUnconfirmed,
+)
 from busmaster import errors as public
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Transaction, make_error
+from busmaster.errors import cause_text
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.stories import on_a_bus
@@ -86,3 +100,54 @@ def test_a_port_that_cannot_be_opened_is_named() -> None:
     with pytest.raises(LineDown) as caught:
         asyncio.run(opening())
     assert (caught.value.line, caught.value.label, caught.value.address) == ("/dev/no-such-port", None, None)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({}, "it went wrong; read the value back before you write again"),
+        ({"hint": ""}, "it went wrong"),
+        ({"attempts": 1, "hint": "wait"}, "it went wrong, 1 attempt; wait"),
+        ({"attempts": 2, "command": "read 1", "hint": ""}, "it went wrong, 2 attempts (read 1)"),
+        ({"command": "read 1", "hint": ""}, "it went wrong (read 1)"),
+    ],
+)
+def test_the_text_of_an_error_has_what_is_known(options: dict[str, Any], text: str) -> None:
+    error = WriteUnconfirmed("it went wrong", **options)
+    assert str(error) == text
+    assert (error.line, error.label, error.address) == (None, None, None)
+    assert WriteUnconfirmed.hint == "read the value back before you write again", "a hint of one error is its own"
+
+
+def test_a_node_without_a_line_gives_an_error_without_a_line() -> None:
+    error = Refused(node=NodeRecord(hcp2.PROFILE, 5, hcp2.PROFILE.timings, 2, ""))
+    assert (error.what, error.line, error.label, error.address) == ("refused", None, "node 5", 5)
+    assert (error.confirm, error.temporary) == (True, False)
+
+
+def test_what_a_refusal_says_of_its_time_is_sent_with_it() -> None:
+    found = pickle.loads(pickle.dumps(Refused("busy", temporary=True, hint="wait")))
+    assert (found.temporary, found.confirm, found.hint) == (True, True, "wait")
+
+
+@pytest.mark.parametrize(
+    ("kind", "standard"),
+    [(NoReply, TimeoutError), (NotStarted, TimeoutError), (HoldEnded, NotStarted), (LineDown, ConnectionError)],
+)
+def test_an_error_is_also_one_of_the_standard_library(kind: type[BusError], standard: type[Exception]) -> None:
+    assert issubclass(kind, standard)
+
+
+@pytest.mark.parametrize(
+    ("cause", "text"),
+    [
+        (None, "closed by the other end"),
+        (LineDown("unplugged"), "unplugged"),
+        (OSError(5, "Input/output error"), "Input/output error"),
+        (OSError("no number"), "no number"),
+        (ValueError("odd"), "odd"),
+        (EOFError(), "EOFError"),
+    ],
+)
+def test_the_cause_of_a_lost_connection_has_a_text(cause: Exception | None, text: str) -> None:
+    assert cause_text(cause, "closed by the other end") == text

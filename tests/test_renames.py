@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import busmaster
 from busmaster import InvalidCommand, ReplyTiming
 from busmaster.app.config import load
-from busmaster.renames import ROOT, STATISTICS, TIMES
+from busmaster.renames import ROOT, STATISTICS, TIMES, now_called, refuse_old_arguments
 from busmaster.statistics import LineStatistics
 
 PAGE = Path(__file__).parents[1] / "docs" / "upgrading.md"
@@ -63,3 +64,27 @@ def test_the_old_name_of_the_configuration_names_the_new_ones() -> None:
 def test_the_old_name_of_the_frames_names_the_new_one() -> None:
     with pytest.raises(ImportError, match=r"has moved to busmaster\.contract\.frames"):
         importlib.import_module("busmaster.capture.frames")
+
+
+def test_an_old_key_has_a_new_name_only_where_that_is_a_key() -> None:
+    assert now_called("nominal", ["window", "late_after"]) == "late_after"
+    assert now_called("nominal", ["window"]) is None
+    assert now_called("late_after", ["late_after"]) is None
+
+
+def test_each_argument_is_looked_at() -> None:
+    refuse_old_arguments(["window", "late_after"], "ReplyTiming")
+    with pytest.raises(
+        TypeError, match="Timing takes no argument 'byte_gap': it is now 'inter_byte_timeout'; see docs"
+    ):
+        refuse_old_arguments(["window", "byte_gap"], "Timing")
+
+
+def test_a_moved_name_of_the_package_is_an_error_with_its_new_place() -> None:
+    with pytest.raises(
+        ImportError, match=r"busmaster\.LatenessRaised has moved: from busmaster\.events import Max"
+    ) as err:
+        busmaster.LatenessRaised  # noqa: B018  looking it up is the point
+    assert err.value.name == "busmaster"
+    with pytest.raises(AttributeError, match="module 'busmaster' has no attribute 'Nothing'"):
+        busmaster.Nothing  # noqa: B018  likewise

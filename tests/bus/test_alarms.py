@@ -248,3 +248,15 @@ def test_only_the_bits_that_are_named_begin_alarms() -> None:
 def test_an_alarm_of_a_bit_names_a_bit_once(alarms: Any, complaint: str) -> None:
     with pytest.raises(MeansNothing, match=complaint):
         word(**alarms)
+
+
+def test_the_kind_of_an_alarm_is_its_limit_or_for_a_bit_its_state() -> None:
+    kinds: list[str] = []
+    alarms = Alarms(lambda alarm: kinds.append(f"{alarm.name} {alarm.active}"))
+    watched = replace(point("2"), meaning=Meaning(low=0, high=10))
+    bits = word(alarm_if_set=("FAULT",), alarm_if_clear=("RUNS",)).bits
+    [sample] = samples(11.0).values()
+    alarms.look([watched], {watched: sample})
+    alarms.look([watched], {watched: sample._replace(value=-1.0)})
+    alarms.look(bits, {bit: sample._replace(value=bit.item.endswith("FAULT")) for bit in bits})
+    assert kinds == ["high True", "high False", "low True", "clear True", "set True"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -11,11 +12,12 @@ from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.bounds import LONGEST_HOLD
 from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.errors import BusClosed, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
-from tests.stories import on_a_bus
+from tests.stories import cycles, on_a_bus
 
 
 class Heard(EmulatedMint):
@@ -228,3 +230,26 @@ def test_a_sequence_on_a_bus_that_is_not_open_says_so() -> None:
                 await held.read(1)
 
     asyncio.run(late())
+
+
+def test_a_node_of_a_sequence_is_otherwise_its_node() -> None:
+    async def story(bus: Bus) -> None:
+        first = Hcp2Controller(bus, 1)
+        point, node = first.point("9"), Node.of(first)
+        await cycles(bus.poll_group("polled", period=10.0, points=[point]), 1)
+        async with node.exclusive() as held:
+            assert (held.line, held.label, held.address) == (bus.endpoint.name, "node 1", 1)
+            assert held.profile is node.profile
+            assert held.latest(point) == bus.latest(point) is not None
+            assert held.now() == bus.now()
+            held.note_stop()
+            assert held.stops == node.stops == 1
+            held.merge_reads(merge)
+            assert node.profile.merge is merge
+            held.use_sync_reads(hcp2.Read(3), (hcp2.Read(4), hcp2.Read(5)))
+            assert (node.profile.probe, node.profile.sync_reads) == (hcp2.Read(3), (hcp2.Read(4), hcp2.Read(5)))
+
+    def merge(commands: Sequence[Any]) -> Sequence[Any]:
+        return ()
+
+    on_a_bus(story, *two()[0])

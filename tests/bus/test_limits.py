@@ -6,6 +6,7 @@ import asyncio
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import pytest
@@ -16,7 +17,16 @@ from busmaster.bus.node import Health, Node, Priority
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import InvalidCommand, NotStarted, Superseded, WriteUnconfirmed
+from busmaster.errors import (
+    BusError,
+    GarbledReply,
+    InvalidCommand,
+    NoReply,
+    NotStarted,
+    Refused,
+    Superseded,
+    WriteUnconfirmed,
+)
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp.handle import HcpController
@@ -370,3 +380,75 @@ async def test_a_value_beyond_its_limits_comes_back_by_a_step_from_the_nearest_l
             with pytest.raises(InvalidCommand, match=f"too far from {inside}: "):
                 await drive.write(10, inside + 60 if limit == 0 else inside - 60)
             Node.of(drive).lift(held)
+
+
+@pytest.mark.parametrize(("fault", "cause"), [({"dead": 1.0}, NoReply), ({"flip": 1.0}, GarbledReply)], ids=str)
+@in_virtual_time
+async def test_a_write_is_not_sent_if_the_value_from_which_it_steps_cannot_be_read(
+    fault: dict[str, float], cause: type[BusError]
+) -> None:
+    device = make_device("hcp2", 5)
+    async with bus_of(Hcp2Controller, device) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        for name, rate in fault.items():
+            setattr(device.faults, name, rate)
+        for finish_within in (None, 100.0):
+            with pytest.raises(NotStarted, match="the current value, needed for max_step, could not be read") as failed:
+                await drive.write(10, 20, finish_within=finish_within)
+            assert isinstance(failed.value.__cause__, cause)
+            assert failed.value.__cause__.what in failed.value.what
+            assert failed.value.hint == cause.hint
+            assert (failed.value.label, failed.value.command) == ("node 5", "write element 10 = 20")
+
+
+@in_virtual_time
+async def test_a_write_is_not_sent_if_the_node_refuses_to_read_the_value_from_which_it_steps() -> None:
+    async with bus_of(Dc104Drive, make_device("dc104", 0, maximum=9)) as bus:
+        drive = Dc104Drive(bus, maximum=12)
+        drive.point("12").limit(max_step=20)
+        with pytest.raises(NotStarted, match="could not be read") as failed:
+            await drive.write(12, 20)
+        assert isinstance(failed.value.__cause__, Refused)
+
+
+@in_virtual_time
+async def test_a_write_that_does_not_declare_its_changes_is_refused_by_a_node_with_limits() -> None:
+    class Opaque:
+        """A write of an element, which does not declare what it changes."""
+
+        writes, idempotent, open = True, False, hcp2.Write(11, (5.0,)).open
+
+        def __str__(self) -> str:
+            return "opaque write"
+
+    async with controller() as drive:
+        await drive.node.request(Opaque())
+        drive.element(10).limit(maximum=10)
+        with pytest.raises(InvalidCommand, match="node 5 has limits, and opaque write does not declare its changes"):
+            await drive.node.request(Opaque())
+
+
+@in_virtual_time
+async def test_the_limits_of_a_lent_node_end_with_the_last_who_gives_it_back() -> None:
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5)) as bus:
+        lent = bus._lend_node(Hcp2Controller.profile, 5)
+        point = Hcp2Controller(SimpleNamespace(node=lambda *_, **__: lent), 5).element(10)
+        point.limit(maximum=10)
+        assert [limit.name for limit in lent.limits] == ["10"]
+        bus._give_back(lent)
+        assert not [limit.name for limit in lent.limits]
+        await Hcp2Controller(bus, 5).write(10, 11)
+
+
+@in_virtual_time
+async def test_a_limit_of_a_held_handle_applies_to_its_node() -> None:
+    async with controller() as drive, drive.exclusive() as held:
+        held.element(10).limit(maximum=10)
+        with pytest.raises(InvalidCommand, match="maximum of 10"):
+            await held.write(10, 11)
+        with pytest.raises(InvalidCommand, match="maximum of 10"):
+            drive.node.check(hcp2.Write(10, (11.0,)))
+        drive.node.check(hcp2.Write(10, (11.0,)), stop=True)
+        held.node.check(hcp2.Write(10, (11.0,)), stop=True)
+        assert len(Node.of(drive).limits) == 1

@@ -12,10 +12,13 @@ import pytest
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
-from busmaster.bus.polling import Quality, Sample
+from busmaster.bus.polling import Quality, Sample, Stream
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
-from busmaster.errors import GarbledReply, NoReply, Refused
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, NoReply, Refused
+from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.mentor import codec as mentor
@@ -490,5 +493,178 @@ def test_samples_carry_the_time_of_day_which_follows_a_clock_that_was_set(monkey
             assert snapshot.wall_at(snapshot.due) == pytest.approx(snapshot.wall - (snapshot.finished - snapshot.due))
             assert bus.wall_time() - bus.now() == pytest.approx(min(found[-1]))
         assert found == [{1000.0}, {1000.0}, {5000.0}, {400.0}]  # 2 ms is two clocks read one after the other
+
+    on_a_bus(story)
+
+
+# groups by their names
+
+
+def test_a_name_belongs_to_one_group_at_a_time() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        groups = [bus.poll_group(name, period=0.1, points=[point]) for name in ("fast", "slow")]
+        assert [bus.group(group.name) for group in groups] == groups
+        with pytest.raises(InvalidCommand, match="a poll group 'fast' already exists"):
+            bus.poll_group("fast", period=0.2, points=[point])
+        groups[0].close()
+        with pytest.raises(InvalidCommand, match=r"no poll group 'fast'; there are: slow$"):
+            bus.group("fast")
+        again = bus.poll_group("fast", period=0.2, points=[point])
+        groups[0].close()  # the group that it was does not end the new one
+        assert bus.group("fast") is again
+        groups[1].close()
+        again.close()
+        with pytest.raises(InvalidCommand, match=r"no poll group 'fast'; there are: none$"):
+            bus.group("fast")
+
+    on_a_bus(story)
+
+
+def test_whoever_follows_the_groups_is_called_when_one_is_made_or_ends() -> None:
+    async def story(bus: Bus) -> None:
+        point, seen = Hcp2Controller(bus, 1).point("7"), list[list[str]]()
+        bus._line.on_groups.append(lambda: seen.append([group.name for group in bus.groups]))
+        group = bus.poll_group("a", period=0.1, points=[point])
+        bus.poll_group("b", period=0.1, points=[point])
+        group.close()
+        group.close()
+        assert seen == [["a"], ["a", "b"], ["b"]]
+
+    on_a_bus(story)
+
+
+def test_a_group_that_is_closed_ends_its_consumers_and_takes_no_more() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        consumers = [group.subscribe(), group.subscribe(changes=True)]
+        await cycles(group, 2)
+        group.close()
+        assert [[snapshot.cycle async for snapshot in consumer] for consumer in consumers] == [[1, 2], [1, 2]]
+        for changes in (False, True):
+            with pytest.raises(BusClosed, match="poll group 'g' is closed"):
+                group.subscribe(changes=changes)
+        assert bus.latest(point) is None
+        sent = Node.of(point).statistics().attempts
+        await asyncio.sleep(1.0)
+        assert Node.of(point).statistics().attempts == sent
+
+    on_a_bus(story)
+
+
+def test_a_group_reads_only_points_of_its_own_bus_and_is_unchanged_by_a_refusal() -> None:
+    other = Bus(MemoryPort(Line(LineSettings(57600), [EmulatedMint(1)])))
+
+    async def story(bus: Bus) -> None:
+        own, foreign = Hcp2Controller(bus, 1).point("7"), Hcp2Controller(other, 1).point("8")
+        group = bus.poll_group("g", period=0.1, points=[own])
+        for points in ([foreign], [Hcp2Controller(bus, 1).point("9"), foreign]):
+            with pytest.raises(InvalidCommand, match="poll group 'g': 1/8 belongs to another bus"):
+                group.add(*points)
+        assert group.points == (own,)
+        with pytest.raises(InvalidCommand, match="belongs to another bus"):
+            bus.poll_group("h", period=0.1, points=[foreign])
+        assert [group.name for group in bus.groups] == ["g"]
+
+    on_a_bus(story)
+
+
+def test_the_last_periods_are_kept_without_a_pause_and_until_a_reset() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        await cycles(group, 4)
+        assert group.recent_periods == pytest.approx((0.1,) * 3, abs=0.001)
+        group.pause()
+        await asyncio.sleep(5.0)
+        group.resume()
+        await cycles(group, 3)
+        assert group.recent_periods == pytest.approx((0.1,) * 5, abs=0.001)
+        assert group.statistics().achieved == pytest.approx(0.1, abs=0.001)
+        group.reset_statistics()
+        assert group.recent_periods == ()
+        counts = group.statistics()
+        assert (counts.missed, counts.jitter.count, counts.cycle_time.count, counts.achieved) == (0, 0, 0, 0.0)
+
+    on_a_bus(story)
+
+
+def test_when_a_point_was_last_good_is_known_while_it_fails() -> None:
+    device = EmulatedMint(1)
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        point, never = axis.point("7"), axis.point("8")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        assert group.good_at(point) is None
+        [snapshot] = await cycles(group, 1)
+        good = snapshot[point].wall
+        assert group.good_at(point) == good
+        device.faults.dead = 1.0
+        for _ in range(3):
+            [snapshot] = await cycles(group, 1)
+            assert snapshot[point].error is not None
+            assert group.good_at(point) == good
+        group.add(never)
+        await cycles(group, 2)
+        assert (group.good_at(never), group.good_at(point)) == (None, good)
+        group.remove(point)
+        assert group.good_at(axis.point("9")) is None
+        group.add(point)
+        await cycles(group, 2)
+        assert group.good_at(point) is None, "a point that was removed begins again"
+
+    on_a_bus(story, device)
+
+
+def test_a_stream_that_is_closed_holds_what_it_has_and_takes_no_more() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        stream = group.subscribe(buffer=8)
+        await cycles(group, 2)
+        stream.close()
+        stream.close()
+        await cycles(group, 2)
+        assert ([snapshot.cycle async for snapshot in stream], stream.dropped) == ([1, 2], 0)
+        waits = group.subscribe()
+        ending = asyncio.ensure_future(anext(waits))
+        await asyncio.sleep(0)
+        waits.close()
+        with pytest.raises(StopAsyncIteration):
+            await ending
+        for wrong in (0, -1, 1.5, True):
+            with pytest.raises(InvalidCommand, match="a buffer"):
+                group.subscribe(buffer=wrong)  # type: ignore[arg-type]  # some of them
+
+    on_a_bus(story)
+
+
+def test_a_stream_ends_with_the_first_cause_that_it_was_given() -> None:
+    async def story(bus: Bus) -> None:
+        stream = Stream[int]([], 4)
+        stream.put(1)
+        stream.close(KeyError("first"))
+        stream.close(ValueError("second"))
+        assert await anext(stream) == 1
+        for _ in range(2):
+            with pytest.raises(KeyError, match="first"):
+                await anext(stream)
+        ended = Stream[int]([], 4)
+        ended.close()
+        ended.close(ValueError("later"))
+        with pytest.raises(StopAsyncIteration):
+            await anext(ended)
+
+    on_a_bus(story)
+
+
+def test_an_application_may_leave_the_loop_over_a_group_and_its_consumer_ends() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        iteration = aiter(group)
+        await anext(iteration)
+        assert len(group._consumers) == 1
+        await iteration.aclose()  # type: ignore[attr-defined]  # it is a generator
+        assert group._consumers == []
 
     on_a_bus(story)

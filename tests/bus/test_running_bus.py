@@ -9,14 +9,16 @@ from dataclasses import replace
 
 import pytest
 
+from busmaster import ext
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
+from busmaster.arbiter.tap import Attempt
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node, Priority
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
-from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
+from busmaster.errors import BusClosed, BusError, InvalidCommand, NodeDown, NoReply
 from busmaster.planning import PlannedGroup
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -244,3 +246,105 @@ def test_a_second_handle_with_the_same_timings_is_welcome_after_max_reply_delay_
             Hcp2Controller(bus, 1, timings=hcp2.PROFILE.timings)
 
     on_a_bus(story)
+
+
+def test_r11_a_hook_that_fails_is_logged_and_the_polls_of_its_node_go_on(caplog: pytest.LogCaptureFixture) -> None:
+    device = EmulatedMint(1)
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+
+        async def restore(node: Node) -> None:
+            raise KeyError("ramp")
+
+        Node.of(point).on_return = restore
+        group = bus.poll_group("g", period=0.5, points=[point])
+        await cycles(group, 2)
+        device.faults.dead = 1.0
+        while Node.of(point).health is not Health.DOWN:
+            await cycles(group, 1)
+        device.faults.dead = 0.0
+        while (await cycles(group, 1))[0][point].error is not None:
+            pass
+        [record] = [record for record in caplog.records if record.levelname == "ERROR"]
+        assert record.message == f"{bus.endpoint.name}: the on_return hook of node 1 failed"
+        assert record.exc_info is not None
+        assert isinstance(record.exc_info[1], KeyError)
+        assert not bus._tasks - {task for task in bus._tasks if not task.done()}
+
+    on_a_bus(story, device)
+
+
+def test_a_suspension_is_ended_by_0_and_lasts_a_day_at_most() -> None:
+    async def story(bus: Bus) -> None:
+        node = Node.of(Hcp2Controller(bus, 1))
+        states = [node.suspended]
+        node.suspend(86_400.0)
+        states.append(node.suspended)
+        await asyncio.sleep(86_399.0)
+        states.append(node.suspended)
+        node.suspend(0.0)
+        states.append(node.suspended)
+        await node.request(hcp2.Read(1))
+        for wrong in (86_400.5, -1.0):
+            with pytest.raises(InvalidCommand, match="node 1: a suspension"):
+                node.suspend(wrong)
+        states.append(node.suspended)
+        assert states == [False, True, True, False, False]
+
+    on_a_bus(story)
+
+
+def test_a_node_describes_itself_by_protocol_address_and_health() -> None:
+    async def story(bus: Bus) -> None:
+        node = Node.of(Hcp2Controller(bus, 1))
+        assert repr(node) == "<Node hcp2 1 unknown>"
+        await node.request(hcp2.Read(1))
+        assert repr(node) == "<Node hcp2 1 up>"
+
+    on_a_bus(story)
+
+
+def test_a_probe_on_a_bus_that_is_not_open_proves_nothing_about_the_node() -> None:
+    async def probe() -> None:
+        with pytest.raises(BusClosed):
+            await Node.of(Hcp2Controller(Bus(SerialPort("/dev/ttyS0", baudrate=57600)), 1)).probe()
+
+    asyncio.run(probe())
+
+
+def test_two_taps_receive_the_same_traffic_and_each_until_it_is_removed() -> None:
+    async def story(bus: Bus) -> None:
+        axis, taps = Hcp2Controller(bus, 1), [Counted(), Counted()]
+        for tap in taps:
+            ext.add_tap(bus, tap)
+        await axis.read(1)
+        assert taps[0].seen == taps[1].seen == ["transmitted", "received", "attempted"]
+        ext.remove_tap(bus, taps[0])
+        await axis.read(1)
+        assert (len(taps[0].seen), len(taps[1].seen)) == (3, 6)
+        ext.remove_tap(bus, taps[1])
+        await axis.read(1)
+        assert len(taps[1].seen) == 6
+
+    on_a_bus(story)
+
+
+class Counted:
+    """A tap that keeps the names of its calls, each once for bytes that follow one another."""
+
+    def __init__(self) -> None:
+        self.seen: list[str] = []
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self._note("transmitted")
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self._note("received")
+
+    def attempted(self, attempt: Attempt, /) -> None:
+        self._note("attempted")
+
+    def _note(self, name: str) -> None:
+        if self.seen[-1:] != [name]:
+            self.seen.append(name)

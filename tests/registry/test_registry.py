@@ -28,7 +28,18 @@ from busmaster.protocols.hcp2.microflex import CommandWord
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
-from busmaster.registry import NodeKind, Protocol, find, kinds, make_device, protocols
+from busmaster.registry import (
+    NodeKind,
+    Protocol,
+    device_of,
+    everywhere,
+    find,
+    kinds,
+    make_device,
+    nowhere,
+    protocols,
+)
+from busmaster.registry.protocol import usual_width
 from tests.patience import PATIENCE
 from tests.tiers import one_by_default
 
@@ -149,6 +160,11 @@ def test_a_command_is_written_down_and_read_back(name: str, command: Command[Any
         ({"command": "read", "element": 100}, "element"),
         ({"command": "read", "element": "1"}, "element"),
         ({"command": "read", "element": 1, "node": 3}, "hcp: read has the arguments element: look at node"),
+        (
+            {"command": "write", "element": 1, "values": [1], "idempotent": 1},
+            "write: idempotent is true or false, not 1",
+        ),
+        ({"command": "write", "element": 1, "values": 5}, "hcp: write: 'int' object is not iterable"),
         ({"command": "write"}, "write has the arguments element, values, idempotent: look at element, values"),
     ],
 )
@@ -202,3 +218,37 @@ def test_naming_the_protocols_loads_no_emulated_device() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_protocol_has_a_kind_of_node() -> None:
+    protocol = find("hcp").protocol
+    with pytest.raises(InvalidCommand, match="hcp: a protocol has at least one kind of node"):
+        Protocol(protocol.profile, (), protocol.commands, protocol.dialect)
+
+
+def test_the_decimals_of_an_item_are_those_of_its_document() -> None:
+    kind = find("mentor")
+    decimals = {item.item: item.decimals for item in kind.documented if item.decimals}
+    assert decimals
+    for name, number in decimals.items():
+        assert kind.decimals(name) == kind.decimals(f"{name}:wide") == number
+    assert kind.decimals("99.99") == 0
+
+
+def test_a_kind_makes_its_devices_with_the_delay_and_the_options_that_are_given() -> None:
+    device: Any = make_device("modbus", 17, delay=Delay(0.5), size=7, lively=True)
+    assert (device.address, device.delay, len(device.registers), device.lively) == (17, Delay(0.5), 7, True)
+    plain: Any = make_device("modbus", 17)
+    assert (plain.delay, plain.lively) == (Delay(), False)
+    with pytest.raises(InvalidCommand, match="no such protocol 'modbu'; did you mean 'modbus'"):
+        make_device("modbu", 17)
+
+
+def test_a_device_is_of_the_module_that_is_named() -> None:
+    device: Any = device_of("busmaster.protocols.dc104.device")(0, maximum=9)
+    assert list(device.parameters) == list(range(1, 10))
+
+
+@pytest.mark.parametrize("item", ["1", "anything"])
+def test_every_item_is_of_32_bits_unless_its_protocol_says_otherwise(item: str) -> None:
+    assert (everywhere(item), nowhere(item), usual_width(item)) == (True, False, 32)

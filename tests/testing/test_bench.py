@@ -6,25 +6,31 @@ import asyncio
 import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, NoReply
 from busmaster.arbiter.transaction import Priority
+from busmaster.bus.node import Node
 from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand
-from busmaster.protocols.hcp2.codec import Write
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2.codec import Read, Write
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing.bench import (
     BenchReport,
     Budget,
     BudgetExceeded,
     EmulatedLine,
+    Measurement,
     Stopwatch,
     Times,
     Workload,
@@ -38,6 +44,7 @@ from busmaster.testing.bench import (
     reads_of,
 )
 from busmaster.testing.fixtures import latency_bench
+from busmaster.testing.latency_plot import _course, _title
 from busmaster.testing.latency_report import histogram
 from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.tiers import one_by_default
@@ -317,6 +324,96 @@ def test_a_text_that_is_no_report_is_refused(text: str) -> None:
         BenchReport.from_json(text)
 
 
+def test_an_exceeded_budget_is_described_with_what_was_measured() -> None:
+    half = Times.of([0.5])
+    report = BenchReport(
+        {}, {}, 1.0, 1, 1.0, 1.0, half, {}, {"urgent": half}, {}, Times(), 2, {"NoReply": 2, "Refused": 1}, ()
+    )
+    before = replace(report, total=Times.of([0.2]), priorities={"urgent": Times()}, missed=0)
+    texts = report.exceeded(
+        ["p50=499.9", "urgent.max=1x", "max=2x", "errors=2", "missed=1", "cycle.p99=1", "max=2.5x"], before=before
+    )
+    assert texts == [
+        "p50: 500 ms, budget 499.9 ms",
+        "max of urgent: nothing was measured in the first report",
+        "max: 500 ms, budget 400 ms (2 times 200 ms)",
+        "3 errors, budget 2",
+        "2 missed, budget 1",
+        "p99 of cycle: nothing was measured",
+    ]
+    with pytest.raises(BudgetExceeded, match=r"^3 errors, budget 0; 2 missed, budget 0$"):
+        report.check("errors=0", Budget("", "missed", 0))
+    report.check("errors=3", "missed=2", "p50=500", "max=2.5x", before=before)
+    assert ratios(before, report) == {"": dict.fromkeys(half.figures, 2.5)}
+
+
+def test_a_node_that_refuses_some_reads_is_measured_by_the_others_and_one_that_refuses_all_has_errors() -> None:
+    async def main() -> tuple[BenchReport, BenchReport]:
+        device = EmulatedMint(3, axes=0, refuse_reserved=True)
+        async with Bus(MemoryPort(Line(find("hcp2").profile.line, [device]))) as bus:
+            axis = Hcp2Controller(bus, 3)
+            axis.use_sync_reads(probe="1", sync_reads=["axis0.position", "2"])
+            some = await measure(bus, [axis], Workload(seconds=1))
+            Node.of(axis)._record.profile = replace(axis.node.profile, probe=Read(105), sync_reads=(Read(106),))
+            return some, await measure(bus, [axis], Workload(seconds=1))
+
+    some, every = run_in_virtual_time(main())
+    assert some.errors == {}
+    assert some.values > 50
+    assert (set(every.errors), every.values) == ({"Refused"}, 0)
+
+
+def test_a_measurement_leaves_the_bus_as_it_was() -> None:
+    async def main() -> BenchReport:
+        line = Line(find("hcp2").profile.line, [make_device("hcp2", 3)])
+        async with Bus(MemoryPort(line)) as bus:
+            axis = Hcp2Controller(bus, 3)
+            own = [bus.poll_group(name, period=10.0, points=[axis.point("9")]) for name in ("bench", "bench1")]
+            measurement = Measurement(bus, [axis], Workload(seconds=1, callers=1, period=0.1))
+            states = [(measurement.begun, measurement.report().elapsed)]
+            await measurement.run_open()
+            assert [*states, measurement.begun] == [(False, 0), True]
+            assert bus.groups == tuple(own)
+            assert bus._pump.tap is None
+            return measurement.report()
+
+    report = run_in_virtual_time(main())
+    assert report.cycles.count in (10, 11)
+    assert report.elapsed == pytest.approx(1, abs=0.05)
+    assert report.samples[0][0] < 0.1
+    assert {kind for _, _, kind in report.samples} == {"command"}
+
+
+def test_errors_of_polls_and_of_calls_are_counted_too() -> None:
+    async def application(bus: Bus, timed: Stopwatch) -> None:
+        for _ in range(2):
+            with suppress(NoReply):
+                await timed("lost", Hcp2Controller(bus, 2).read(1, retries=0))
+        await asyncio.sleep(3600)
+
+    report = bench("hcp2", [1], virtual=True, seconds=2, callers=0, application=application)
+    assert report.errors == {"NoReply": 2}
+    assert report.calls == {}
+    polled = bench("hcp2", [1], virtual=True, seconds=2, callers=0, period=0.5, faults=["dead=1"])
+    assert sum(polled.errors.values()) == polled.cycles.count > 1
+
+
+def test_the_workload_of_a_report_is_what_was_wanted() -> None:
+    report = bench(
+        "hcp2", [1], baud=9600, virtual=True, seconds=1, callers=2, every=0.5, period=0.25, priorities="urgent=3",
+        items=("7",), seed=5, delay=Delay(0.001, 0.003), faults=["lost=0"],
+    )  # fmt: skip
+    assert report.workload == {
+        "nodes": [1], "seconds": 1, "callers": 2, "priorities": {"urgent": 3}, "every": 0.5, "period": 0.25,
+        "items": ["7"], "seed": 5,
+    }  # fmt: skip
+    assert report.line == {
+        "protocol": "hcp2", "port": "emulated", "baudrate": 9600, "framing": "8N1", "virtual": True,
+        "reply_delay": [0.001, 0.003], "faults": ["lost=0"],
+    }  # fmt: skip
+    assert set(report.priorities) == {"urgent"}
+
+
 # the plot
 
 
@@ -332,6 +429,33 @@ def test_the_plot_is_drawn(suffix: str, tmp_path: Path) -> None:
 def test_a_plot_of_nothing_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     plot(bench("hcp2", [1], virtual=True, seconds=1, faults=["dead=1"]), str(tmp_path / "latency.png"))
+
+
+def test_the_title_of_a_plot_names_the_line_and_its_rate() -> None:
+    pytest.importorskip("matplotlib")
+    report = bench("hcp2", [1, 2], virtual=True, seconds=1)
+    assert (
+        _title(report)
+        == f"hcp2, 2 nodes, 57600 baud 8N1: {report.rate:.1f} values a second, 100.0% of the wire's limit"
+    )
+    one = replace(report, nodes={"1": Times()}, values=25, elapsed=2.0, share=0.5)
+    assert _title(one).startswith("hcp2, 1 node, 57600")
+    assert _title(one).endswith("8N1: 12.5 values a second, 50.0% of the wire's limit")
+
+
+def test_a_plot_over_time_has_a_bounded_number_of_dots_of_each_class() -> None:
+    pytest.importorskip("matplotlib")
+    drawn: dict[str, int] = {}
+    panel: Any = MagicMock()
+    panel.plot = lambda x, y, *style, label, **options: drawn.__setitem__(label, len(x))
+    _course(panel, {"command": [(0.0, 1.0)] * 50_001, "urgent": [(0.0, 1.0)] * 20})
+    assert drawn == {"command": 16_667, "urgent": 20}
+
+
+def test_a_suffix_of_a_plot_may_have_capital_letters(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    check_plot("latency.PNG")
+    check_plot(str(tmp_path / "latency.svg"))
 
 
 def test_a_plot_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
