@@ -216,7 +216,7 @@ async def walk(handle: Holder, parameters: Sequence[Parameter]) -> AsyncIterator
                 continue
             try:
                 values = await _answer(handle.node, batch.command)
-            except (Refused, NoReply, GarbledReply):
+            except (Refused, _Unanswered):
                 continue  # one of them does not exist: they are read one by one
             for index, raw in zip(batch.serves, values, strict=True):
                 del left[index]
@@ -235,24 +235,28 @@ async def read_one(handle: Holder, parameter: Parameter, command: Command[Any] |
         return Found(parameter, why="no such parameter", gap=True)
     except Refused as refusal:
         return Found(parameter, why=refusal.what, gap=True)
-    except (NoReply, GarbledReply) as error:
-        return Found(parameter, why=f"{error.what}, though the node replies to other reads")
+    except _Unanswered as error:
+        return Found(parameter, why=f"{error}, though the node replies to other reads")
+
+
+class _Unanswered(Exception):
+    """A read has no valid reply, and the node replies to its probe."""
 
 
 async def _answer(node: Requester, command: Command[Any]) -> Any:
-    """Return the value of a read. Raises NoReply or GarbledReply only if the node replies to its probe."""
-    for turn in range(ROUNDS):
+    """Return the value of a read. Raises _Unanswered if the node replies to its probe only, else its BusError."""
+    why = ""
+    for _ in range(ROUNDS):
         try:
             return await node.request(command, priority=BACKGROUND)
-        except (NoReply, GarbledReply):
-            try:
-                # A dead node would otherwise take three rounds for each of hundreds of parameters.
-                await node.request(node.profile.probe, priority=BACKGROUND)
-            except Refused:
-                pass  # it replies
-            if turn == ROUNDS - 1:
-                raise
-    raise AssertionError
+        except (NoReply, GarbledReply) as error:
+            why = error.what
+        try:
+            # A dead node would otherwise take three rounds for each of hundreds of parameters.
+            await node.request(node.profile.probe, priority=BACKGROUND)
+        except Refused:
+            pass  # it replies
+    raise _Unanswered(why)
 
 
 def _found(handle: Holder, parameter: Parameter, raw: Any) -> Found:

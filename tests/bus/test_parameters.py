@@ -3,16 +3,57 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from math import inf
 
-from busmaster import Bus, Dc104Drive, MemoryPort, MentorDrive
-from busmaster.bus.handle import Handle
-from busmaster.bus.parameters import Entry, ParameterLoad, ParameterSet, Result
+import pytest
+
+from busmaster import Bus, Dc104Drive, InvalidCommand, MemoryPort, MentorDrive, ModbusUnit, NoReply, NotStarted
+from busmaster.bus.handle import Handle, Send
+from busmaster.bus.node import Node
+from busmaster.bus.parameters import FIRST, LAST, Change, Entry, Found, Parameter, ParameterLoad, ParameterSet, Result
 from busmaster.emulator.device import Device
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
-from busmaster.protocols.dc104.device import EmulatedDc104
+from busmaster.protocols.dc104.device import READ, EmulatedDc104
+from busmaster.protocols.ei_bisynch.handle import BisynchInstrument
 from busmaster.protocols.mentor.device import EmulatedMentor
+from busmaster.protocols.modbus.device import EmulatedModbus
+from busmaster.registry import make_device
 from tests.stories import in_virtual_time
+
+
+class OddDrive(EmulatedDc104):
+    """A drive with parameters that behave in an unusual way, each named in one of these sets."""
+
+    no_read: frozenset[int] = frozenset()
+    """They do not reply to a read."""
+    halved: frozenset[int] = frozenset()
+    """They store half of a value that is written."""
+    no_ack: frozenset[int] = frozenset()
+    """They store a value, but do not acknowledge it."""
+    lost: frozenset[int] = frozenset()
+    """They neither store nor acknowledge the next value."""
+    writes = 0
+
+    def _handle(self, frame: bytes, now: float) -> None:
+        parameter, value = frame[2], int.from_bytes(frame[3:5], "big")
+        if frame[1] == READ and parameter in self.no_read:
+            return
+        if frame[1] != READ:
+            self.writes += 1
+            if parameter in self.lost:
+                self.lost -= {parameter}
+                return
+            if parameter in self.no_ack:
+                self._write(parameter, value)
+                return
+        super()._handle(frame, now)
+
+    def _write(self, parameter: int, value: int) -> None:
+        super()._write(parameter, value // 2 if parameter in self.halved else value)
 
 
 def bus_of(handle: type[Handle], *devices: Device) -> Bus:
@@ -63,3 +104,242 @@ async def test_gaps_are_left_out_and_the_address_of_a_drive_is_never_written() -
         load = await drive.prepare_load(wanted)
         assert [change.parameter.item for change in load.changes] == ["1.18"]
         assert [left.parameter.item for left in load.left] == ["11.11"]
+
+
+@in_virtual_time
+async def test_each_parameter_that_is_not_read_is_reported_with_its_reason_and_the_others_are_saved() -> None:
+    device = OddDrive(maximum=6)
+    device.no_read = frozenset({4})
+    found: list[Found] = []
+    async with bus_of(Dc104Drive, device) as bus:
+        drive = Dc104Drive(bus, retries=0)
+        saved = await drive.save_parameters(drive.parameters(["3:6"]), progress=found.append, by="ada")
+    assert (list(saved.entries), saved.by) == (["3", "5", "6"], "ada")
+    assert [(one.parameter.item, one.gap) for one in found] == [
+        ("3", False), ("4", False), ("5", False), ("6", False), ("7", True), ("8", True)
+    ]  # fmt: skip
+    assert found[1].why == "no reply within 200 ms, though the node replies to other reads"
+    assert found[4].why
+
+
+@in_virtual_time
+async def test_a_read_without_a_reply_is_repeated_while_the_node_replies_to_its_probe() -> None:
+    device = OddDrive()
+    device.no_read = frozenset({4})
+    async with bus_of(Dc104Drive, device) as bus:
+        drive = Dc104Drive(bus, retries=0)
+        await drive.save_parameters([Parameter(item="4")])
+        # Three rounds, each of one read and one probe.
+        assert Node.of(drive).statistics().attempts == 6
+        device.faults = Faults(dead=1.0)
+        with pytest.raises(NoReply):
+            await drive.save_parameters([Parameter(item="4"), Parameter(item="5")])
+        assert Node.of(drive).statistics().attempts == 8  # of a dead node one read and one probe
+
+
+@in_virtual_time
+async def test_neighbouring_parameters_are_read_in_one_exchange_and_by_themselves_where_one_does_not_exist() -> None:
+    async with bus_of(ModbusUnit, EmulatedModbus(17, range(100, 110))) as bus:
+        unit = ModbusUnit(bus, 17)
+        saved = await unit.save_parameters(unit.parameters(["holding:0:10"]))
+        assert {item: entry.value for item, entry in saved.entries.items()} == {
+            f"holding:{place}": 100 + place for place in range(10)
+        }
+        assert Node.of(unit).statistics().attempts == 1
+        beyond = await unit.save_parameters(unit.parameters(["holding:7:5"]))
+        assert [(item, entry.value) for item, entry in beyond.entries.items()] == [
+            ("holding:7", 107), ("holding:8", 108), ("holding:9", 109)
+        ]  # fmt: skip
+
+
+@in_virtual_time
+async def test_a_parameter_is_saved_as_one_finite_number() -> None:
+    device, found = make_device("modbus", 17), list[Found]()
+    for item, value in (("holding:0:float32", inf), ("holding:2:float32", 0.5), ("coil:0", 1)):
+        device.preset(item, value)
+    async with bus_of(ModbusUnit, device) as bus:
+        items = ("holding:0:float32", "holding:2:float32", "coil:0")
+        saved = await ModbusUnit(bus, 17).save_parameters(
+            [Parameter(item=item) for item in items], progress=found.append
+        )
+    assert {item: entry.value for item, entry in saved.entries.items()} == {"holding:2:float32": 0.5, "coil:0": True}
+    [left] = [one for one in found if one.value is None]
+    assert (left.why, left.gap) == ("it holds inf, which is not one finite number", False)
+
+
+@in_virtual_time
+async def test_a_set_names_the_node_its_line_and_what_identifies_it() -> None:
+    async with bus_of(BisynchInstrument, make_device("ei-bisynch", 1)) as bus:
+        instrument = BisynchInstrument(bus, 1)
+        Node.of(instrument)._rename("oven")
+        saved = await instrument.save_parameters([])
+        assert (saved.protocol, saved.address, saved.label) == ("ei-bisynch", 1, "oven")
+        assert saved.line == bus.endpoint.name
+        assert saved.identity == {item: await instrument.read(item) for item in ("II", "V0")}
+
+
+@in_virtual_time
+async def test_sets_of_different_kinds_of_node_are_neither_compared_nor_loaded() -> None:
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Dc104Drive(bus)
+        own = await drive.save_parameters([Parameter(item="4")])
+        other = replace(own, protocol="mentor")
+        for pair in ((own, other), (other, own)):
+            with pytest.raises(InvalidCommand, match="a set of a mentor cannot be compared with one of a dc104"):
+                drive.differences(*pair)
+        with pytest.raises(InvalidCommand, match=f"{drive.node.label} is a dc104: a set of a mentor is not for it"):
+            await drive.prepare_load(other)
+
+
+@in_virtual_time
+async def test_a_parameter_that_one_of_two_sets_does_not_have_differs() -> None:
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Dc104Drive(bus)
+        saved = await drive.save_parameters(drive.parameters(["4:3"]))
+    first = replace(saved, entries={item: saved.entries[item] for item in ("4", "5")})
+    second = changed(replace(saved, entries={item: saved.entries[item] for item in ("5", "6")}), p5=9)
+    assert [(one.parameter.item, one.one, one.other) for one in drive.differences(first, second)] == [
+        ("4", 0, None), ("5", 0, 9), ("6", None, 0)
+    ]  # fmt: skip
+
+
+@in_virtual_time
+async def test_a_load_states_why_it_does_not_write_a_parameter() -> None:
+    async with bus_of(Dc104Drive, OddDrive(maximum=8)) as bus:
+        drive = Dc104Drive(bus)
+        saved = await drive.save_parameters(drive.parameters(["3:5"]))
+        drive.point("4").limit(maximum=50)
+        drive.point("5").limit(maximum=50)
+        wanted = changed(saved, p3=7, p4=51, p5=50, p6=7, p7=7)
+        wanted.entries["9"] = Entry(Parameter(item="9"), 7)  # type: ignore[index]  # a dictionary
+        described = [Parameter(item="6", access="read"), Parameter(item="7", kept="it is the address")]
+        load = await drive.prepare_load(wanted, parameters=described, by="ada")
+        assert [(change.parameter.item, change.before, change.value) for change in load.changes] == [
+            ("3", 0, 7), ("5", 0, 50)
+        ]  # fmt: skip
+        left = {one.parameter.item: (one.before, one.value, one.why, one.expected) for one in load.left}
+        assert left["4"][2:] == (f"{drive.node.label}: 4 = 51 is above its maximum of 50", False)
+        assert left["6"] == (0, 7, "it is read-only", True)
+        assert left["7"] == (0, 7, "it is the address", True)
+        assert (left["9"][:2], left["9"][3]) == ((None, 7), False)
+        assert {item: entry.value for item, entry in load.undo.entries.items()} == {"3": 0, "5": 0}
+        assert load.undo.by == "ada"
+
+
+@in_virtual_time
+async def test_a_load_writes_in_the_order_of_the_document_except_what_must_be_first_or_last() -> None:
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Dc104Drive(bus)
+        saved = await drive.save_parameters([Parameter(item=item) for item in ("6", "5", "4", "3")])
+        described = [Parameter(item="3", stage=LAST), Parameter(item="6", stage=FIRST)]
+        load = await drive.prepare_load(changed(saved, p3=1, p4=1, p5=1, p6=1), parameters=described)
+        assert [change.parameter.item for change in load.changes] == ["6", "4", "5", "3"]
+        saved = await drive.save_parameters([Parameter(item="4"), Parameter(item="5")])
+
+
+async def outcomes(device: EmulatedDc104, *items: int, retries: int | None = None) -> tuple[list[Result], list[str]]:
+    """The results and reasons of a load that writes 100 to each of these parameters."""
+    async with bus_of(Dc104Drive, device) as bus:
+        drive = Dc104Drive(bus, retries=retries)
+        saved = await drive.save_parameters([Parameter(item=str(item)) for item in items])
+        load = await drive.prepare_load(changed(saved, **{f"p{item}": 100 for item in items}))
+        found = [outcome async for outcome in load.write()]
+    return [one.result for one in found], [one.why for one in found]
+
+
+@in_virtual_time
+async def test_a_value_that_is_stored_differently_is_reported_and_the_others_are_written() -> None:
+    device = OddDrive()
+    device.halved = frozenset({4})
+    results, reasons = await outcomes(device, 3, 4, 5)
+    assert results == [Result.WRITTEN, Result.DIFFERS, Result.WRITTEN]
+    assert reasons == ["", "it reads 50 after 100 was written", ""]
+    assert device.writes == 3
+
+
+@in_virtual_time
+async def test_a_write_without_an_acknowledgement_is_decided_by_the_value_that_is_read_back() -> None:
+    device = OddDrive()
+    device.no_ack = frozenset({4})
+    assert await outcomes(device, 3, 4, 5, retries=0) == ([Result.WRITTEN] * 3, [""] * 3)
+    assert device.writes == 3
+    device = OddDrive()
+    device.lost = frozenset({4})
+    assert await outcomes(device, 3, 4, 5, retries=0) == ([Result.WRITTEN] * 3, [""] * 3)
+    assert (device.writes, device.registers[4]) == (4, 100)
+
+
+@in_virtual_time
+async def test_nothing_is_written_after_a_write_whose_outcome_is_unknown() -> None:
+    class Vanishing(OddDrive):
+        def _write(self, parameter: int, value: int) -> None:
+            super()._write(parameter, value)
+            self.faults.dead = float(parameter == 4)
+
+    device = Vanishing()
+    results, reasons = await outcomes(device, 3, 4, 5, 6, retries=0)
+    assert results == [Result.WRITTEN, Result.UNCONFIRMED, Result.NOT_WRITTEN, Result.NOT_WRITTEN]
+    assert reasons[1].startswith("sent, and not answered: ")
+    assert reasons[2:] == ["nothing is written after 4, whose write did not succeed"] * 2
+    assert (device.registers[5], device.registers[6]) == (0, 0)
+
+
+@in_virtual_time
+async def test_nothing_is_written_after_a_write_that_cannot_be_sent_and_each_is_within_its_context() -> None:
+    seen: list[str] = []
+
+    @contextmanager
+    def recorded(change: Change) -> Iterator[None]:
+        seen.append(change.parameter.item)
+        try:
+            yield
+        except NotStarted:
+            seen.append("not started")
+            raise
+
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Dc104Drive(bus)
+
+        def prepare(change: Change, item: str) -> Send:
+            async def send() -> None:
+                if item == "4":
+                    raise NotStarted("not in time")
+                await drive.write(int(item), int(change.value))
+
+            return send
+
+        saved = await drive.save_parameters(drive.parameters(["3:3"]))
+        load = await drive.prepare_load(changed(saved, p3=1, p4=1, p5=1), prepare=prepare)
+        found = [outcome async for outcome in load.write(around=recorded)]
+    assert [one.result for one in found] == [Result.WRITTEN, Result.NOT_WRITTEN, Result.NOT_WRITTEN]
+    assert [one.why for one in found][1] == "not in time"
+    assert seen == ["3", "4", "not started"]
+
+
+@in_virtual_time
+async def test_a_value_that_cannot_be_read_back_is_unconfirmed() -> None:
+    class Hiding(OddDrive):
+        def _write(self, parameter: int, value: int) -> None:
+            super()._write(parameter, value)
+            self.no_read = frozenset({4} if parameter == 4 else ())
+
+    results, reasons = await outcomes(Hiding(), 4, 5, retries=0)
+    assert results == [Result.UNCONFIRMED, Result.NOT_WRITTEN]
+    assert reasons[0].startswith("it cannot be read back: no reply within")
+
+
+def test_parameters_are_counted_each_once_and_known_by_any_form_of_their_item() -> None:
+    drive = MentorDrive(Bus(MemoryPort(Line(MentorDrive.profile.line))), 11)
+    listed = {one.item: one for one in drive.parameters()}
+    assert drive.parameters(["1.1", "1.01:2"]) == (listed["1.01"], listed["1.02"])
+    with pytest.raises(InvalidCommand, match="modbus: this protocol documents no list of parameters: name the items"):
+        ModbusUnit(Bus(MemoryPort(Line(ModbusUnit.profile.line))), 17).parameters()
+
+
+def test_a_set_has_a_bounded_number_of_parameters() -> None:
+    unit = ModbusUnit(Bus(MemoryPort(Line(ModbusUnit.profile.line))), 17)
+    assert len(unit.parameters(["coil:0:20000"])) == 20_000
+    with pytest.raises(InvalidCommand, match="a parameter set has 20000 parameters at most"):
+        unit.parameters(["coil:0:20000", "coil:20000"])
+    with pytest.raises(InvalidCommand, match="the count of coil:0"):
+        unit.parameters(["coil:0:20001"])
