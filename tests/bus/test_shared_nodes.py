@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from busmaster import (
+    LEARNED,
     Bus,
     Hcp2Controller,
     HcpController,
@@ -21,6 +22,7 @@ from busmaster import (
 )
 from busmaster.bus.handle import Handle
 from busmaster.bus.node import Node
+from busmaster.contract.learning import Learned
 from busmaster.emulator.line import Line
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
@@ -48,6 +50,14 @@ ALIKE: dict[str, tuple[Make, Make]] = {
         lambda bus: Hcp2Controller(bus, 5, timings=hcp2.PROFILE.timings, retries=hcp2.PROFILE.retries),
     ),
     "timings left out": (lambda bus: Hcp2Controller(bus, 5, timings=SLOW), lambda bus: Hcp2Controller(bus, 5)),
+    "learned, twice": (
+        lambda bus: Hcp2Controller(bus, 5, timings=LEARNED),
+        lambda bus: MicroFlexDrive(bus, 5, timings=LEARNED),
+    ),
+    "learned, and the times that it stands for": (
+        lambda bus: Hcp2Controller(bus, 5, timings=LEARNED),
+        lambda bus: MicroFlexDrive(bus, 5, timings=Learned(hcp2.PROFILE.timings)),
+    ),
     "chained, twice": (lambda bus: MentorDrive(bus, 12, chained=True), lambda bus: MentorDrive(bus, 12, chained=True)),
     "chained left out": (lambda bus: MentorDrive(bus, 12, chained=True), lambda bus: MentorDrive(bus, 12)),
     "other symbols": (
@@ -77,6 +87,26 @@ UNLIKE: dict[str, tuple[Make, Make, str]] = {
         lambda b: Hcp2Controller(b, 5, timings=SLOW),
         lambda b: Hcp2Controller(b, 5, timings=hcp2.PROFILE.timings),
         "other timings",
+    ),
+    "a window": (
+        lambda b: Hcp2Controller(b, 5),
+        lambda b: MicroFlexDrive(b, 5, timings=SLOW),
+        r"other timings \(a reply window of 200 ms, not 100 ms\)",
+    ),
+    "learned": (
+        lambda b: Hcp2Controller(b, 5),
+        lambda b: Hcp2Controller(b, 5, timings=LEARNED),
+        r"other timings \(a reply window of the learned time, not 100 ms\)",
+    ),
+    "no longer learned": (
+        lambda b: Hcp2Controller(b, 5, timings=LEARNED),
+        lambda b: Hcp2Controller(b, 5, timings=SLOW),
+        r"other timings \(a reply window of 200 ms, not the learned time\)",
+    ),
+    "another delay with the same window": (
+        lambda b: Hcp2Controller(b, 5, timings=SLOW),
+        lambda b: Hcp2Controller(b, 5, timings=SLOW.with_max_reply_delay(0.5)),
+        r"other timings\.",
     ),
     "retries": (lambda b: Hcp2Controller(b, 5), lambda b: Hcp2Controller(b, 5, retries=0), "other retries"),
     "chained": (lambda b: MentorDrive(b, 12), lambda b: MentorDrive(b, 12, chained=True), "another profile"),
