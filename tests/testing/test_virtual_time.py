@@ -93,3 +93,46 @@ def test_anyio_can_run_on_it() -> None:
         return anyio.current_time()
 
     assert anyio.run(main, backend_options={"loop_factory": VirtualTimeLoop}) == pytest.approx(20)
+
+
+def test_a_thread_that_fails_is_waited_for_no_longer_and_the_end_of_all_threads_is_awaited() -> None:
+    ended = threading.Event()
+
+    async def main() -> float:
+        loop = asyncio.get_running_loop()
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.to_thread(lambda: 1 / 0)
+        await asyncio.sleep(5.0)
+        loop.run_in_executor(None, ended.wait, PATIENCE)
+        loop.call_soon(ended.set)
+        return loop.time()
+
+    assert run_in_virtual_time(main()) == 5.0
+    assert ended.is_set()
+
+
+def test_timers_are_due_after_years_too() -> None:
+    async def main() -> list[float]:
+        loop, due = asyncio.get_running_loop(), list[float]()
+        for _ in range(3):
+            await asyncio.sleep(365 * DAY + 0.1)
+            loop.call_later(1e-9, lambda: due.append(loop.time()))
+            await asyncio.sleep(1.0)
+        return due
+
+    assert run_in_virtual_time(main()) == pytest.approx([(365 * DAY + 0.1) * n + n - 1 for n in (1, 2, 3)])
+
+
+def test_every_task_that_waits_for_ever_is_named() -> None:
+    async def stuck() -> None:
+        await asyncio.Event().wait()
+
+    async def main() -> None:
+        await asyncio.sleep(3.0)
+        await asyncio.gather(asyncio.create_task(stuck(), name="first"), asyncio.create_task(stuck(), name="second"))
+
+    with pytest.raises(DeadlockError) as found:
+        run_in_virtual_time(main())
+    assert str(found.value).startswith("at 3 s nothing is ready and no timer is set; these wait for ever:\n")
+    assert "first: " in str(found.value)
+    assert "second: " in str(found.value)
