@@ -449,6 +449,8 @@ async def test_a_limit_of_a_held_handle_applies_to_its_node() -> None:
             await held.write(10, 11)
         with pytest.raises(InvalidCommand, match="maximum of 10"):
             drive.node.check(hcp2.Write(10, (11.0,)))
+        with pytest.raises(InvalidCommand, match="maximum of 10"):
+            held.node.check(hcp2.Write(9, (1.0,)), hcp2.Write(10, (11.0,)))
         drive.node.check(hcp2.Write(10, (11.0,)), stop=True)
         held.node.check(hcp2.Write(10, (11.0,)), stop=True)
         assert len(Node.of(drive).limits) == 1

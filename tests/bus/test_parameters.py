@@ -12,7 +12,7 @@ import pytest
 
 from busmaster import Bus, Dc104Drive, InvalidCommand, MemoryPort, MentorDrive, ModbusUnit, NoReply, NotStarted
 from busmaster.bus.handle import Handle, Send
-from busmaster.bus.node import Node
+from busmaster.bus.node import Node, Priority
 from busmaster.bus.parameters import FIRST, LAST, Change, Entry, Found, Parameter, ParameterLoad, ParameterSet, Result
 from busmaster.emulator.device import Device
 from busmaster.emulator.faults import Faults
@@ -22,6 +22,7 @@ from busmaster.protocols.ei_bisynch.handle import BisynchInstrument
 from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.modbus.device import EmulatedModbus
 from busmaster.registry import make_device
+from busmaster.wire.checks import sum8
 from tests.stories import in_virtual_time
 
 
@@ -36,6 +37,8 @@ class OddDrive(EmulatedDc104):
     """They store a value, but do not acknowledge it."""
     lost: frozenset[int] = frozenset()
     """They neither store nor acknowledge the next value."""
+    ignored: frozenset[int] = frozenset()
+    """They acknowledge a value, but keep the one before."""
     writes = 0
 
     def _handle(self, frame: bytes, now: float) -> None:
@@ -47,6 +50,9 @@ class OddDrive(EmulatedDc104):
             if parameter in self.lost:
                 self.lost -= {parameter}
                 return
+            if parameter in self.ignored:
+                frame = frame[:3] + self.registers[parameter].to_bytes(2, "big") + frame[5:-1]
+                frame += bytes((sum8(frame[1:]),))
             if parameter in self.no_ack:
                 self._write(parameter, value)
                 return
@@ -98,7 +104,11 @@ async def test_a_refusal_is_reported_and_the_others_are_written() -> None:
 async def test_gaps_are_left_out_and_the_address_of_a_drive_is_never_written() -> None:
     async with bus_of(MentorDrive, EmulatedMentor(11)) as bus:
         drive = MentorDrive(bus, 11, decimals={"1.17": 1})
-        saved = await drive.save_parameters(drive.parameters(["1.15:4", "11.11"]))
+        found: list[Found] = []
+        saved = await drive.save_parameters(drive.parameters(["1.15:4", "11.11"]), progress=found.append)
+        assert {one.parameter.item: one.why for one in found if one.gap} == dict.fromkeys(
+            ("1.15", "1.16"), "no such parameter"
+        )
         assert list(saved.entries) == ["1.17", "1.18", "11.11"]
         wanted = changed(saved, **{"p1.18": 3, "p11.11": 12})
         load = await drive.prepare_load(wanted)
@@ -267,6 +277,51 @@ async def test_a_write_without_an_acknowledgement_is_decided_by_the_value_that_i
     device.lost = frozenset({4})
     assert await outcomes(device, 3, 4, 5, retries=0) == ([Result.WRITTEN] * 3, [""] * 3)
     assert (device.writes, device.registers[4]) == (4, 100)
+
+
+@in_virtual_time
+async def test_an_acknowledged_write_that_is_not_stored_is_reported_and_not_repeated() -> None:
+    device = OddDrive()
+    device.ignored = frozenset({4})
+    results, reasons = await outcomes(device, 3, 4, 5)
+    assert results == [Result.WRITTEN, Result.DIFFERS, Result.WRITTEN]
+    assert reasons[1] == "it reads 0 after 100 was written"
+    assert device.writes == 3
+
+
+@in_virtual_time
+async def test_reads_and_writes_of_a_load_go_in_the_background_of_other_traffic() -> None:
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Dc104Drive(bus)
+        saved = await drive.save_parameters([Parameter(item="4")])
+        assert await written(await drive.prepare_load(changed(saved, p4=7))) == [Result.WRITTEN]
+        waits = (await bus.statistics()).waits
+        assert (waits[Priority.BACKGROUND].count, waits[Priority.COMMAND].count) == (4, 0)
+
+
+@in_virtual_time
+async def test_a_node_that_refuses_its_probe_replies() -> None:
+    device = OddDrive()
+    device.parameters = range(2, 256)
+    device.no_read = frozenset({4})
+    found: list[Found] = []
+    async with bus_of(Dc104Drive, device) as bus:
+        drive = Dc104Drive(bus, retries=0)
+        saved = await drive.save_parameters([Parameter(item="4"), Parameter(item="5")], progress=found.append)
+    assert list(saved.entries) == ["5"]
+    assert found[0].why.endswith("though the node replies to other reads")
+
+
+@in_virtual_time
+async def test_of_reads_that_overlap_the_largest_serves() -> None:
+    async with bus_of(ModbusUnit, EmulatedModbus(17, range(100, 110))) as bus:
+        unit = ModbusUnit(bus, 17)
+        usual = unit.node.profile.merge
+        assert usual is not None
+        unit.node.merge_reads(lambda commands: [*usual(commands[:2]), *usual(commands)])
+        saved = await unit.save_parameters(unit.parameters(["holding:0:4"]))
+        assert [entry.value for entry in saved.entries.values()] == [100, 101, 102, 103]
+        assert Node.of(unit).statistics().attempts == 1
 
 
 @in_virtual_time

@@ -589,6 +589,18 @@ def test_the_last_periods_are_kept_without_a_pause_and_until_a_reset() -> None:
     on_a_bus(story)
 
 
+def test_missed_cycles_are_counted_until_a_reset() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.003, points=[Hcp2Controller(bus, 1).point("7")])
+        missed = (await cycles(group, 5))[-1].missed
+        group.pause()
+        assert group.statistics().missed == missed > 0
+        group.reset_statistics()
+        assert group.statistics().missed == 0
+
+    on_a_bus(story)
+
+
 def test_when_a_point_was_last_good_is_known_while_it_fails() -> None:
     device = EmulatedMint(1)
 
