@@ -29,8 +29,13 @@ def read_file(path: str | os.PathLike[str], most: int = LONGEST_FILE) -> bytes:
     """
     name = os.fspath(path)
     descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
+    try:
+        # Before `open`, which would leave the descriptor of a folder open, and name its number in the error.
         check_regular(os.fstat(descriptor), name)
+    except OSError:
+        os.close(descriptor)
+        raise
+    with open(descriptor, "rb") as file:
         data = file.read(most + 1)
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it has more than {most} bytes, which is the bound for such a file", name)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import errno
 import os
+import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +15,7 @@ import pytest
 from busmaster.app.outputs.growing_file import GrowingFile
 from busmaster.app.outputs.spool import Spool
 from busmaster.capture.files import CaptureFiles
-from busmaster.files import open_file
+from busmaster.files import FOLDER_MODE, check_regular, open_file, read_file
 
 PACKAGE = Path(__file__).parent.parent / "busmaster"
 FOR_ALL_TO_READ = {"app/service/folder.py"}
@@ -78,3 +80,43 @@ def test_the_check_sees_each_way_of_making_a_file() -> None:
 def test_no_file_is_made_in_another_way() -> None:
     found = {str(path.relative_to(PACKAGE)): makes_files(path.read_text()) for path in PACKAGE.rglob("*.py")}
     assert {name for name, lines in found.items() if lines} == {"files.py"} | FOR_ALL_TO_READ
+
+
+def test_a_file_of_the_largest_size_is_read_and_a_larger_one_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "list"
+    path.write_bytes(b"12345")
+    assert read_file(path, 5) == read_file(str(path)) == b"12345"
+    with pytest.raises(OSError, match="it has more than 4 bytes, which is the bound for such a file") as refused:
+        read_file(path, 4)
+    assert (refused.value.errno, refused.value.filename) == (errno.EFBIG, str(path))
+
+
+def test_what_is_not_a_regular_file_is_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    descriptors = os.listdir("/proc/self/fd")
+    for path, number in (
+        (tmp_path / "fifo", errno.EINVAL),
+        (Path("/dev/zero"), errno.EINVAL),
+        (tmp_path, errno.EISDIR),
+    ):
+        with pytest.raises(OSError, match=re.escape(str(path))) as refused:
+            read_file(path)
+        assert (refused.value.errno, refused.value.filename) == (number, str(path))
+    assert os.listdir("/proc/self/fd") == descriptors
+    with pytest.raises(IsADirectoryError):
+        check_regular(tmp_path.stat(), "folder")
+    with pytest.raises(FileNotFoundError):
+        read_file(tmp_path / "none")
+
+
+def test_a_descriptor_of_a_file_is_not_inherited_and_no_content_is_lost_by_opening(tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    path.write_bytes(b"old")
+    descriptor = open_file(str(path), os.O_WRONLY | os.O_APPEND)
+    try:
+        assert not os.get_inheritable(descriptor)
+        os.write(descriptor, b" and new")
+    finally:
+        os.close(descriptor)
+    assert path.read_bytes() == b"old and new"
+    assert oct(FOLDER_MODE) == "0o750"
