@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import pytest
 
@@ -14,8 +15,10 @@ from busmaster.arbiter.events import (
     MaxReplyDelayRaised,
     NodeChanged,
     PortFailed,
+    RepliesLate,
 )
-from busmaster.arbiter.health import Health
+from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.bus.alarms import BusEvent
 from busmaster.bus.logbook import PAUSE, Logbook
 from tests.arbiter.bench import Bench
 
@@ -73,3 +76,48 @@ def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(li
         "line: cannot connect: cannot open line: ValueError: odd",
     ]
     assert [record.exc_info is None for record in lines.records] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("event", "level", "text"),
+    [
+        (lambda node: NodeChanged(node, Health.DOWN, Health.UP, True), "INFO", "node 3 is up (was down)"),
+        (lambda node: LineChanged(LineChange.DOWN, "unplugged"), "WARNING", "the line is down: unplugged"),
+        (lambda node: LineChanged(LineChange.NOISY), "WARNING", "the line is noisy"),
+        (lambda node: LineChanged(LineChange.UP), "INFO", "the line is up"),
+        (
+            lambda node: RepliesLate(node, 0.14, 0.1),
+            "WARNING",
+            "node 3 replies after 140 ms, later than its reply window of 100 ms; its values are marked late",
+        ),
+        (lambda node: PortFailed("no permission", ""), "WARNING", "cannot connect: no permission"),
+    ],
+)
+def test_r14_the_level_of_a_change_shows_whether_it_is_a_fault(
+    lines: pytest.LogCaptureFixture, event: Callable[[NodeRecord], BusEvent], level: str, text: str
+) -> None:
+    Logbook("line").note(event(Bench().node(3)), 0.0)
+    assert [(record.levelname, record.message) for record in lines.records] == [(level, f"line: {text}")]
+
+
+def test_r14_a_rounded_value_is_logged_once_for_each_parameter(lines: pytest.LogCaptureFixture) -> None:
+    logbook, bench = Logbook("line"), Bench()
+    first, other = bench.node(3), bench.node(4)
+    for node, what in ((first, "1.17 = 5.5"), (first, "1.17 = 6.5"), (first, "1.18 = 5.5"), (other, "1.17 = 5.5")):
+        logbook.rounded(node, what, 0.0)
+    ending = "; round it, or declare the decimals of the parameter"
+    assert lines.messages == [
+        f"line: node 3: 1.17 = 5.5{ending}",
+        f"line: node 3: 1.18 = 5.5{ending}",
+        f"line: node 4: 1.17 = 5.5{ending}",
+    ]
+
+
+def test_r14_exchanges_that_cannot_be_chosen_are_logged_with_group_and_error(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("line").failed_choice("fast", ValueError("odd"))
+    [record] = lines.records
+    assert (record.levelname, record.message) == (
+        "ERROR",
+        "line: the exchanges of poll group 'fast' could not be chosen",
+    )
+    assert record.exc_info is not None

@@ -150,3 +150,21 @@ def test_a_number_that_is_no_word_is_an_error_of_its_bits_alone() -> None:
         assert isinstance(snapshot[word.bit("READY")].error, GarbledReply)
 
     on_a_bus(story)
+
+
+def test_a_label_stands_for_its_number_if_only_one_has_it() -> None:
+    modes = Meaning(labels={0: "off", 1: "run", 2: "run"})
+    assert modes.number_of("off") == 0
+    with pytest.raises(InvalidCommand, match="'run' is the label of more than one value: use 'off', 'run', 'run'"):
+        modes.number_of("run")
+    with pytest.raises(InvalidCommand, match="'fast' is the label of no value: use 'off'"):
+        modes.number_of("fast")
+
+
+@pytest.mark.parametrize(("said", "by_exception"), [({}, False), ({"deadband": 0}, True), ({"heartbeat": 1.0}, True)])
+def test_values_are_reported_by_exception_if_a_deadband_or_a_heartbeat_is_set(
+    said: dict[str, Any], by_exception: bool
+) -> None:
+    assert Meaning(**said).by_exception is by_exception
+    word = Meaning(bits={"READY": 0}, **said)
+    assert (word.of_bit("READY").deadband, word.of_bit("READY").heartbeat) == (word.deadband, word.heartbeat)

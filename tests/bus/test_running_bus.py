@@ -16,6 +16,7 @@ from busmaster.arbiter.schedule import line_time
 from busmaster.arbiter.tap import Attempt
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node, Priority
+from busmaster.contract.profile import LineSettings
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NodeDown, NoReply
@@ -25,6 +26,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
 from tests.stories import cycles, on_a_bus
 
 # plans and bounds of the running bus
@@ -348,3 +350,57 @@ class Counted:
     def _note(self, name: str) -> None:
         if self.seen[-1:] != [name]:
             self.seen.append(name)
+
+
+def test_a_reset_begins_all_statistics_again() -> None:
+    async def story(bus: Bus) -> None:
+        point = replace(Hcp2Controller(bus, 1).point("7"), read_after_write=True)
+        group = bus.poll_group("g", period=0.1, points=[point])
+        await cycles(group, 3)
+        await point.write(5.0)
+        await asyncio.sleep(0.5)
+        assert ext.reads_after_writes(bus).read == 1
+        group.pause()
+        await asyncio.sleep(0.2)
+        bus.reset_statistics()
+        assert ext.reads_after_writes(bus).read == 0
+        assert (await bus.statistics()).exchanges == Node.of(point).statistics().attempts == 0
+        assert group.statistics().cycles == 0
+
+    on_a_bus(story)
+
+
+def test_behind_a_port_of_unknown_rate_a_byte_takes_the_time_of_the_first_protocol() -> None:
+    bus = Bus(TcpPort("127.0.0.1", 1))
+    assert bus._byte_time == pytest.approx(10 / 9600)
+    bus.node(hcp2.PROFILE, 1)
+    assert bus._byte_time == hcp2.PROFILE.line.byte_time
+    bus.node(replace(hcp2.PROFILE, name="slower", line=LineSettings(1200), shares_line_with=frozenset({"hcp2"})), 1)
+    assert bus._byte_time == hcp2.PROFILE.line.byte_time
+    known = Bus(TcpPort("127.0.0.1", 1, baudrate=9600))
+    known.node(hcp2.PROFILE, 1)
+    assert known._byte_time == pytest.approx(10 / 9600)
+
+
+def test_a_greatest_age_is_a_time_and_only_a_good_sample_serves() -> None:
+    device = EmulatedMint(1)
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        for wrong in (-1.0, float("nan"), "1"):
+            with pytest.raises(InvalidCommand, match="node 1: max_age"):
+                await point.read(max_age=wrong)  # type: ignore[arg-type]  # one of them
+        group = bus.poll_group("g", period=1000.0, points=[point])
+        await cycles(group, 1)
+        await asyncio.sleep(100.0)
+        sent = Node.of(point).statistics().attempts
+        assert await point.read(max_age=float("inf")) == 0.0
+        assert Node.of(point).statistics().attempts == sent
+        device.faults.dead = 1.0
+        group.demand()
+        await cycles(group, 1)
+        device.faults.dead = 0.0
+        assert await point.read(max_age=float("inf")) == 0.0
+        assert Node.of(point).statistics().attempts > sent + 1
+
+    on_a_bus(story, device)

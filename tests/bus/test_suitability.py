@@ -94,3 +94,12 @@ def test_another_framing_on_a_serial_port_is_warned_about() -> None:
         Bus(Rfc2217Port("server", 4001, baudrate=9600)).node(mentor.PROFILE, 14)
     with pytest.warns(UserWarning, match=r"mentor is meant for 7E1, but /dev/ttyS0 is 8N1"):
         Bus(SerialPort("/dev/ttyS0", baudrate=9600)).node(mentor.PROFILE, 14)
+
+
+def test_a_framing_that_the_documents_name_beside_the_usual_one_is_accepted() -> None:
+    several = replace(mentor.PROFILE, other_lines=(LineSettings(9600), LineSettings(19200)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Bus(SerialPort("/dev/ttyS0", baudrate=9600)).node(several, 14)
+    with pytest.warns(UserWarning, match="mentor is meant for 7E1 or 8N1, but /dev/ttyS0 is 8N2"):
+        Bus(SerialPort("/dev/ttyS0", baudrate=9600, stopbits=2)).node(several, 14)
