@@ -76,6 +76,18 @@ def test_the_newest_of_several_reads_is_the_last_value() -> None:
     on_a_bus(story, device, settings=ModbusUnit.profile.line)
 
 
+def test_the_last_value_is_that_of_its_own_node() -> None:
+    other = make_device("modbus", 18)
+    other.preset("holding:0", *range(200, 210))
+
+    async def story(bus: Bus) -> None:
+        points = [ModbusUnit(bus, address).point("holding:3") for address in (17, 18)]
+        await cycles(bus.poll_group("g", period=1000.0, points=points), 1)
+        assert [ext.last_value(point) for point in points] == [103, 203]
+
+    on_a_bus(story, modbus(), other, settings=ModbusUnit.profile.line)
+
+
 # values that are no longer current
 
 
