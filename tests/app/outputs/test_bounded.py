@@ -5,11 +5,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from busmaster.app.outputs.base import Happening, Item, Output, Unsendable
+import pytest
+
+from busmaster.app.outputs import batches
+from busmaster.app.outputs.base import FIRST_RETRY, LAST_RETRY, Happening, Item, Output, Unsendable, reason
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.settings import SpillingSettings
+from busmaster.app.service.record import WriteRecord
 from busmaster.bus.polling import Snapshot
 from tests.app.outputs.cycles import cycle, settled, until
+from tests.app.outputs.test_audit import WRITE
 from tests.patience import PATIENCE
 
 
@@ -198,3 +203,156 @@ def test_an_item_that_can_never_be_sent_is_dropped_counted_and_reported_once() -
     counts = output.statistics()
     assert (counts.written, counts.dropped, counts.waiting, counts.error) == (6, 4, 0, "")
     assert reported == ["picky dropped values that it cannot send: the packet is too large"]
+
+
+class Sender(Output):
+    """Sends items one by one, with the errors that a test wants."""
+
+    def __init__(self, *errors: tuple[int, Exception], report: Callable[[str], None] = lambda _: None) -> None:
+        """`errors`: what sending the cycle of that number raises, once each."""
+        super().__init__("sender", SpillingSettings(), report)
+        self._retry = 0.01
+        self._errors = list(errors)
+        self.sent: list[int] = []
+
+    def work(self) -> None:
+        self.drain(self._send)
+
+    def _send(self, item: Item) -> None:
+        if isinstance(item, WriteRecord):
+            raise Unsendable("the entry is too large")
+        assert isinstance(item, Snapshot)
+        for number, (cycle_number, error) in enumerate(self._errors):
+            if cycle_number == item.cycle:
+                del self._errors[number]
+                raise error
+        self.sent.append(item.cycle)
+
+
+def test_an_item_that_could_not_be_sent_is_sent_before_those_that_came_later() -> None:
+    output = Sender((2, OSError("gone")))
+    offer(output, 1, 4)
+    output.start()
+    until(lambda: settled(output))
+    output.close(PATIENCE)
+    assert output.sent == [1, 2, 3, 4]
+    assert output.written == 8
+
+
+def test_each_reason_for_which_items_are_dropped_is_reported_and_an_entry_learns_it() -> None:
+    reported: list[str] = []
+    why_not: list[str] = []
+    output = Sender((1, Unsendable("too large")), (2, Unsendable("too old")), report=reported.append)
+    offer(output, 1, 3)
+    output.offer_entry(WRITE, why_not.append)
+    output.start()
+    output.close(PATIENCE)
+    assert output.sent == [3]
+    assert reported == [
+        f"sender dropped values that it cannot send: {why}"
+        for why in ("too large", "too old", "the entry is too large")
+    ]
+    assert why_not == ["sender dropped it: the entry is too large"]
+    assert output.statistics().dropped == 5
+
+
+def test_an_output_that_replaces_another_continues_all_of_its_counts() -> None:
+    before = Sender((1, Unsendable("too large")))
+    offer(before, 1, 3)
+    before.miss(3)
+    before.suppress(7)
+    before.start()
+    before.close(PATIENCE)
+    after = Sender()
+    after.succeed(before)
+    counts = after.statistics()
+    assert counts == before.statistics()
+    assert (counts.written, counts.dropped, counts.suppressed, counts.waiting) == (4, 5, 7, 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError(28, "No space left on device", "/disk/x"), "/disk/x: No space left on device"),
+        (RuntimeError("[Errno 111] Connection refused"), "Connection refused"),
+        (ValueError("two\n  lines"), "two lines"),
+        (TimeoutError(), "TimeoutError"),
+        (ExceptionGroup("a", [ExceptionGroup("b", [OSError(28, "No space")]), ValueError("c")]), "No space"),
+    ],
+)
+def test_the_reason_why_an_output_is_down_is_one_line_without_numbers(error: Exception, text: str) -> None:
+    assert reason(error) == text
+
+
+def test_another_reason_is_reported_while_an_output_is_down_and_the_same_one_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(batches, "TICK", 0.001)
+    said: list[str] = []
+    tries: list[float] = []
+    output = Shelf(report=said.append)
+    output._destination = "/disk/x"
+
+    def rest(seconds: float) -> None:
+        tries.append(seconds)
+
+    output.rest = rest  # type: ignore[method-assign]
+    output.broken = OSError("full")
+    offer(output, 1, 1)
+    output.start()
+    until(lambda: len(tries) > 2)
+    output.broken = OSError("/disk/x is gone")
+    until(lambda: len(said) > 1)
+    output.broken = None
+    until(lambda: settled(output))
+    output.close(PATIENCE)
+    assert said == [
+        "shelf is down: /disk/x: full",
+        "shelf is down: /disk/x is gone",  # it names its destination once
+        "shelf is up again",
+    ]
+
+
+def test_pauses_between_tries_are_doubled_up_to_a_bound_and_short_again_after_a_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(batches, "TICK", 0.001)
+    pauses: list[float] = []
+    output = Shelf()
+
+    def rest(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) in (7, 8):
+            output.broken = None
+
+    output.rest = rest  # type: ignore[method-assign]
+    output.broken = OSError("gone")
+    offer(output, 1, 1)
+    output.start()
+    until(lambda: settled(output))
+    assert (pauses[0], pauses[-1]) == (FIRST_RETRY, LAST_RETRY)
+    assert pauses == [0.5, 1, 2, 4, 8, 10, 10]
+    output.broken = OSError("gone")
+    offer(output, 2, 2)
+    until(lambda: settled(output))
+    output.close(PATIENCE)
+    assert pauses[7:] == [FIRST_RETRY]
+
+
+def test_an_output_that_is_ended_while_a_try_fails_tries_once_more() -> None:
+    output = Shelf()
+    output.let.clear()
+    output.broken = OSError("gone")
+
+    def shut() -> None:
+        output.broken = None
+
+    output.shut = shut  # type: ignore[method-assign]
+    output.start()
+    offer(output, 1, 1)
+    until(lambda: not output._waiting)  # the thread has it, and is stuck
+    output._stop.set()
+    output.let.set()
+    output.close(PATIENCE)
+    assert output.cycles == [1]

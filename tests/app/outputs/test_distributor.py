@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import sqlite3
+import time
+from collections.abc import AsyncIterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import anyio
 import pytest
@@ -17,9 +21,13 @@ from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.outputs.distributor import Wanted, label_of
+from busmaster.app.outputs import distributor
+from busmaster.app.outputs.base import Happening, Item, Kept, Output, OutputKind, OutputLine
+from busmaster.app.outputs.distributor import Distributor, Wanted, label_of
 from busmaster.app.outputs.exceptions import News
-from busmaster.app.outputs.settings import MqttSettings
+from busmaster.app.outputs.settings import FileSettings, MqttSettings, Settings
+from busmaster.app.service.record import Outcome, WriteRecord
+from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.emulator.line import Line
 from busmaster.events import (
@@ -33,6 +41,12 @@ from busmaster.events import (
     PortFailed,
     RepliesLate,
 )
+from busmaster.ext import Outdated
+from busmaster.registry import make_device
+from tests.app.outputs.cycles import BUS, NODE, cycle
+from tests.app.outputs.test_audit import WRITE
+from tests.app.outputs.test_exceptions import meant
+from tests.patience import PATIENCE
 
 TEXT = """
 port = "/dev/ttyUSB0"
@@ -170,3 +184,302 @@ def test_an_output_is_another_one_if_its_settings_or_what_it_lets_others_write_d
     assert not wanted.same(Wanted(settings, {"5/1": point, "5/2": point}))
     assert not Wanted(settings, {}).same(wanted)
     assert not wanted.same(Wanted(settings, {"5/1": replace(point)})), "an equal point may have another scale"
+
+
+# the distributor alone
+
+
+class Listed(Output):
+    """Keeps what it is offered. Its thread does nothing."""
+
+    order: ClassVar[list[str]] = []
+
+    def __init__(self, kind: str, settings: Settings, line: OutputLine) -> None:
+        super().__init__(kind, settings, line.report)
+        self.line = line
+        self.items: list[Item] = []
+        self.entries: list[Kept] = []
+        self.reopened = 0
+
+    def offer(self, item: Item) -> None:
+        super().offer(item)
+        self.items.append(item)
+
+    def offer_entry(self, entry: WriteRecord, kept: Kept) -> None:
+        self.entries.append(kept)
+
+    def reopen(self) -> None:
+        self.reopened += 1
+
+    def close_interface(self) -> None:
+        self.order.append("interface")
+
+    def work(self) -> None:
+        self._stop.wait()
+        self.order.append("closed")
+        self._waiting.clear()
+        self.written = self.offered - self.dropped
+
+    @property
+    def cycles(self) -> list[int]:
+        return [item.cycle for item in self.items if isinstance(item, Snapshot)]
+
+    @property
+    def texts(self) -> list[str]:
+        return [item.text for item in self.items if isinstance(item, Happening)]
+
+
+class First(Listed):
+    """Finds out by itself what a write has made stale."""
+
+    finds_outdated = True
+
+
+@pytest.fixture
+def _listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(name: str) -> OutputKind:
+        made = First if name == "first" else Listed
+        return OutputKind(
+            name=name, settings=Settings, make=lambda settings, line: made(name, settings, line), about="A list."
+        )
+
+    monkeypatch.setattr(Listed, "order", [])
+    monkeypatch.setattr(distributor, "find", found)
+
+
+class Cycles:
+    """The cycles of a source; with each comes how many were dropped before it."""
+
+    def __init__(self, *steps: tuple[Snapshot, int]) -> None:
+        self._steps = steps
+        self.dropped = 0
+
+    async def __aiter__(self) -> AsyncIterator[Snapshot]:
+        for snapshot, dropped in self._steps:
+            self.dropped = dropped
+            yield snapshot
+
+
+class Fed:
+    """A source of these cycles, which begin again with each subscription."""
+
+    def __init__(self, name: str, *steps: tuple[Snapshot, int]) -> None:
+        self.name = name
+        self.points = tuple(steps[0][0].samples)
+        self.subscriptions = 0
+        self._steps = steps
+
+    def subscribe(self, _buffer: int, /, *, changes: bool = False) -> Any:
+        assert changes
+        self.subscriptions += 1
+        return Cycles(*self._steps)
+
+
+def listed(outputs: Distributor) -> dict[str, Listed]:
+    return {output.kind: output for output in outputs._outputs if isinstance(output, Listed)}
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_of_outputs_that_are_replaced_each_gets_each_cycle_and_event_once() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)))
+    reported: list[str] = []
+    kept, changed = Wanted(Settings(), {}), Wanted(Settings(buffer=7), {})
+    async with bus:
+        point = Hcp2Controller(bus, 5).point("1")
+        one = bus.poll_group("one", period=1000.0, points=[point])
+        outputs = Distributor(bus, reported.append)
+        for kind in ("kept", "changed", "left"):
+            outputs.add(kind, Settings())
+        outputs.start([one])
+        before = listed(outputs)
+        two = bus.poll_group("two", period=1000.0, points=[point])
+        for _ in range(2):  # the second time nothing is another one
+            await outputs.replace({"kept": kept, "changed": changed}, [one, two])
+        after = listed(outputs)
+        await Node.of(Hcp2Controller(bus, 6)).probe()
+        async with asyncio.timeout(PATIENCE):
+            while any(len(output.cycles) < 2 for output in after.values()):  # noqa: ASYNC110  nothing reports it
+                await asyncio.sleep(0.001)
+    await outputs.close()
+    assert list(after) == ["kept", "changed"]
+    assert after["kept"] is before["kept"]
+    assert after["kept"].reopened == 2
+    assert after["changed"] is not before["changed"]
+    assert after["changed"].reopened == 1
+    assert [text for text in reported if "is ended" in text] == ["left is ended: 0 written, 0 dropped"]
+    for output in after.values():
+        groups = [(item.group, item.cycle) for item in output.items if isinstance(item, Snapshot)]
+        assert sorted(set(groups)) == sorted(groups)
+        assert {"one", "two"} == {group for group, _ in groups}
+        assert output.texts.count("node 6 is down, was unknown") == 1
+        assert all(abs(item.time - time.time()) < 600 for item in output.items if isinstance(item, Happening))
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_cycles_that_the_loop_was_too_slow_for_are_counted_once_with_all_of_their_values() -> None:
+    outputs = Distributor(BUS)
+    outputs.add("all", Settings())
+    outputs.add("other", Settings(groups=("other", "axes")))
+    outputs.add("none", Settings(groups=("other",)))
+    source = Fed("axes", *((cycle(number, 1.0, 2.0), dropped) for number, dropped in ((1, 0), (4, 2), (5, 2), (7, 3))))
+    outputs.start([source])
+    await asyncio.gather(*outputs._feeding.values())
+    counts = [output.dropped for output in outputs._outputs]
+    cycles = [output.cycles for output in listed(outputs).values()]
+    await outputs.close()
+    assert counts == [6, 6, 0]
+    assert cycles == [[1, 4, 5, 7], [1, 4, 5, 7], []]
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_a_source_that_has_ended_is_followed_again_when_it_is_there_again() -> None:
+    outputs = Distributor(BUS)
+    outputs.add("all", Settings())
+    source = Fed("axes", (cycle(1, 1.0), 0))
+    outputs.start([source])
+    await asyncio.gather(*outputs._feeding.values())
+    await outputs.replace({"all": Wanted(Settings(), {})}, [source])
+    await asyncio.gather(*outputs._feeding.values())
+    assert source.subscriptions == 2
+    await outputs.close()
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_what_a_write_made_stale_comes_to_outputs_behind_one_that_finds_it_by_itself() -> None:
+    outputs = Distributor(BUS)
+    for kind in ("first", "second"):
+        outputs.add(kind, Settings())
+    stale = Outdated(**{field.name: getattr(cycle(2, 1.0), field.name) for field in fields(Snapshot)})
+    outputs.start([Fed("axes", (cycle(1, 1.0), 0), (stale, 0))])
+    await asyncio.gather(*outputs._feeding.values())
+    assert [output.cycles for output in listed(outputs).values()] == [[1], [1, 2]]
+    await outputs.close()
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_a_cycle_without_a_value_to_report_is_not_offered() -> None:
+    outputs = Distributor(BUS)
+    outputs.add("all", Settings())
+    quiet = [meant(cycle(number, 1.0), Meaning(deadband=5)) for number in (1, 2)]
+    outputs.start([Fed("axes", *((snapshot, 0) for snapshot in quiet))])
+    await asyncio.gather(*outputs._feeding.values())
+    [output] = listed(outputs).values()
+    assert output.cycles == [1]
+    assert output.statistics().suppressed == 1
+    await outputs.close()
+
+
+STRICT = FileSettings(path="x", audit="strict")
+
+
+async def turns() -> None:
+    """Let calls from other threads arrive."""
+    for _ in range(3):
+        await asyncio.sleep(0)
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_a_write_is_durable_when_every_strict_output_has_its_entry() -> None:
+    outputs = Distributor(BUS)
+    for kind, settings in (("one", STRICT), ("batched", Settings()), ("two", STRICT)):
+        outputs.add(kind, settings)
+    made = listed(outputs)
+    written, failed = WRITE._replace(outcome=Outcome.WRITTEN), WRITE._replace(outcome=Outcome.REFUSED)
+    assert outputs.record(failed) is None
+    durable = outputs.record(written)
+    assert durable is not None
+    assert made["batched"].items == [failed, written]
+    made["one"].entries[0]("")
+    await turns()
+    assert not durable.done()
+    made["two"].entries[0]("")
+    await turns()
+    assert durable.result() == ""
+    durable = outputs.record(written)
+    assert durable is not None
+    made["two"].entries[1]("two dropped it")
+    made["one"].entries[1]("one ended")  # the first reason counts
+    await turns()
+    assert durable.result() == "two dropped it"
+    assert len(made["one"].items) == 1  # of the write that failed
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_without_a_strict_output_a_write_waits_for_none() -> None:
+    outputs = Distributor(BUS)
+    outputs.add("batched", Settings())
+    assert outputs.record(WRITE._replace(outcome=Outcome.WRITTEN)) is None
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_strict_outputs_that_do_not_write_an_entry_in_time_are_named_with_their_reasons(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(distributor, "AUDIT_WITHIN", 0.01)
+    outputs = Distributor(BUS)
+    for kind, settings in (("one", STRICT), ("two", STRICT), ("three", STRICT), ("other", Settings())):
+        outputs.add(kind, settings)
+    made = listed(outputs)
+    made["two"].error, made["other"].error = "disk full", "gone"
+    durable = outputs.record(WRITE._replace(outcome=Outcome.WRITTEN))
+    assert durable is not None
+    made["three"].entries[0]("")
+    async with asyncio.timeout(PATIENCE):
+        assert await durable == "one and two did not write it within 0.01 s; two is down: disk full"
+    made["one"].entries[0]("")  # too late, and no error
+    await turns()
+
+
+@pytest.mark.usefixtures("_listed")
+def test_what_an_output_reports_after_the_loop_has_ended_is_discarded() -> None:
+    reported: list[str] = []
+
+    async def opened_and_closed() -> tuple[Distributor, Listed]:
+        outputs = Distributor(BUS, reported.append)
+        outputs.add("one", STRICT)
+        outputs.start(())
+        [output] = listed(outputs).values()
+        outputs.record(WRITE._replace(outcome=Outcome.WRITTEN))
+        output.line.report("in time")
+        await outputs.close()
+        return outputs, output
+
+    _, output = asyncio.run(opened_and_closed())
+    output.entries[0]("")
+    output.line.report("too late")
+    assert reported == ["in time"]
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_all_interfaces_are_closed_before_any_output_is() -> None:
+    outputs = Distributor(BUS)
+    for kind in ("one", "two"):
+        outputs.add(kind, Settings())
+    outputs.start(())
+    await outputs.close()
+    assert Listed.order == ["interface", "interface", "closed", "closed"]
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_an_output_knows_of_its_line_what_it_may_report_and_what_others_count() -> None:
+    listens = Distributor(BUS, in_charge=False, asks=False)
+    polls = Distributor(BUS)
+    for outputs in (listens, polls):
+        outputs.add("one", Settings(), commands={"5/1": NODE.point("1")})
+        outputs.add("two", Settings())
+    (one, two), (other, _) = (listed(outputs).values() for outputs in (listens, polls))
+    assert (one.line.in_charge, one.line.polls, other.line.in_charge, other.line.polls) == (False, False, True, True)
+    assert one.line.commands == {"5/1": NODE.point("1")}
+    assert two.line.commands == {}
+    assert [counts.kind for counts in one.line.statistics()] == ["one", "two"]
+    assert one.line.authorisation is listens.authorisation

@@ -52,10 +52,32 @@ def test_json_lines_are_synced_before_the_entry_is_reported(tmp_path: Path, monk
         assert synced == []  # a cycle waits for `sync_every`
         output.offer_entry(entry(77), lambda why: found.append(not why and "77" in synced[-1]))
         until(lambda: bool(found))
+        times = len(synced)
+        output.offer(cycle(2, 1.0))
+        until(lambda: output.written == 3)
+        assert len(synced) == times  # behind an entry a cycle waits as before
+        output.offer_entry(entry(78), lambda why: found.append(not why and "78" in synced[-1]))
+        until(lambda: len(found) == 2)
 
     closed_after(output, does)
-    assert found == [True]
+    assert found == [True, True]
     assert synced[0] == str(tmp_path)  # the name of a new file
+    assert synced.count(str(tmp_path)) == 1
+
+
+def test_without_strict_an_entry_is_not_synced_before_it_is_due(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr("busmaster.app.outputs.growing_file.os.fsync", synced.append)
+    output = JsonlOutput("jsonl", FileSettings(path=str(tmp_path / "x.jsonl"), sync_every=1000.0))
+
+    def does() -> None:
+        output.offer(entry(1))
+        until(lambda: output.written == 1)
+        assert synced == []
+
+    closed_after(output, does)
 
 
 def test_a_transaction_with_an_entry_is_synced(tmp_path: Path) -> None:
