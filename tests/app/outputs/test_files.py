@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from busmaster.app.outputs import growing_file
 from busmaster.app.outputs.base import Happening
+from busmaster.app.outputs.cells import csv_lines, no_formula, text_cell, text_of
 from busmaster.app.outputs.files import COLUMNS, CsvOutput, JsonlOutput
-from busmaster.app.outputs.settings import DATE_FIELDS, FileSettings
+from busmaster.app.outputs.growing_file import GrowingFile
+from busmaster.app.outputs.settings import DATE_FIELDS, FileSettings, file_mode
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.app.outputs.cycles import cycle
@@ -76,8 +81,9 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
     output.start()
     output.offer(cycle(1, 12.0, NoReply("no reply")))
     output.offer(Happening(time.time(), "winder", "winder is down, was suspect"))
+    output.offer(Happening(1.5, "", "the line is lost"))
     output.close(PATIENCE)
-    first, second = map(json.loads, written(path))
+    first, second, third = map(json.loads, written(path))
     assert first["samples"] == {
         "5/1": {"quality": "good", "value": 12, "error": None, "late": False},
         "5/2": {"quality": "bad", "value": None, "error": "no reply", "late": False, "hint": NoReply.hint},
@@ -85,6 +91,7 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
     assert (first["group"], first["cycle"], first["missed"]) == ("axes", 1, 0)
     assert abs(first["started"] - time.time()) < PATIENCE
     assert (second["event"], second["node"]) == ("winder is down, was suspect", "winder")
+    assert third == {"event": "the line is lost", "node": None, "time": 1.5}
 
 
 def test_a_new_file_begins_when_the_date_in_its_name_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,6 +223,13 @@ def test_no_name_is_a_formula_to_a_spreadsheet(name: str) -> None:
     line, bad = csv.reader((output.format(snapshot) or b"").decode().splitlines())
     assert (line[1], bad[8]) == (f"'{name}", f"'{name}")
     assert line[5] == "-47.6"
+    named = {replace(point, unit=name, item=name): sample for point, sample in snapshot.samples.items()}
+    [row] = csv.reader((output.format(replace(snapshot, samples=named)) or b"").decode().splitlines()[:1])
+    assert (row[4], row[6]) == (f"'{name}", f"'{name}")
+
+
+def test_a_line_end_at_the_beginning_is_a_formula_to_a_spreadsheet_too() -> None:
+    assert no_formula("\r=1+1") == "'\r=1+1"
 
 
 def test_what_was_written_is_synced_when_it_is_due_and_when_the_file_is_closed(
@@ -230,3 +244,148 @@ def test_what_was_written_is_synced_when_it_is_due_and_when_the_file_is_closed(
         output.commit([b"{}\n"])
         output.shut()
         assert len(synced) == times
+
+
+def test_after_a_sync_the_next_one_is_due_after_the_whole_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    clock = [100.0]
+    monkeypatch.setattr(os, "fsync", synced.append)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    file = GrowingFile(str(tmp_path / "x"), sync_every=10.0)
+    times = []
+    for clock[0] in (105.0, 111.0, 112.0, 120.0, 121.0):
+        file.append(b"line\n")
+        times.append(len(synced))
+    assert times == [0, 1, 1, 1, 2]
+    file.close()
+
+
+def open_in(folder: Path) -> list[str]:
+    """The files of a folder, and the folder itself, that this process has open."""
+    found = []
+    for descriptor in os.listdir("/proc/self/fd"):
+        try:
+            name = os.readlink(f"/proc/self/fd/{descriptor}")
+        except OSError:  # the one by which the folder was listed
+            continue
+        if name.startswith(str(folder)):
+            found.append(name)
+    return found
+
+
+def test_files_that_are_left_are_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "one"
+    monkeypatch.setattr(time, "strftime", lambda _: str(tmp_path / name))
+    file = GrowingFile("%d")
+    for name in ("one", "two"):
+        file.append(b"line\n", sync=True)
+        assert open_in(tmp_path) == [str(tmp_path / name)]
+    (tmp_path / "two").unlink()
+    file.append(b"line\n")
+    assert open_in(tmp_path) == [str(tmp_path / "two")]
+    file.close()
+    assert open_in(tmp_path) == []
+    file.close()
+
+
+def test_the_name_of_each_new_file_is_synced_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.readlink(f"/proc/self/fd/{descriptor}")))
+    monkeypatch.chdir(tmp_path)
+    file = GrowingFile("x")  # a path without a folder
+    for moved in (False, False, True, False):
+        if moved:
+            (tmp_path / "x").rename(tmp_path / "old")
+        file.append(b"line\n", sync=True)
+    file.close()
+    assert synced.count(str(tmp_path)) == 2
+    assert synced.count(str(tmp_path / "x")) == 5
+
+
+def test_a_disk_that_is_lost_at_the_close_and_a_folder_that_cannot_be_synced_are_no_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(descriptor: int) -> None:
+        if closing or os.path.isdir(f"/proc/self/fd/{descriptor}"):
+            raise OSError(errno.EIO, "Input/output error")
+
+    closing = False
+    monkeypatch.setattr(os, "fsync", fails)
+    file = GrowingFile(str(tmp_path / "x"))
+    file.append(b"line\n", sync=True)
+    closing = True
+    file.close()
+    assert open_in(tmp_path) == []
+
+
+def test_a_folder_that_has_gone_is_not_made_and_a_dated_one_is_for_its_owner_and_group(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        GrowingFile(str(tmp_path / "gone" / "x-%d")).append(b"line\n")
+    before = os.umask(0)
+    try:
+        file = GrowingFile(str(tmp_path / "in-%Y" / "x"))
+        file.append(b"line\n")
+        file.close()
+    finally:
+        os.umask(before)
+    [folder] = tmp_path.iterdir()
+    assert folder.stat().st_mode & 0o007 == 0
+
+
+def test_a_file_that_must_not_be_read_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    (tmp_path / "x").write_bytes(b"first\n")
+    monkeypatch.setattr(growing_file, "open", refused, raising=False)
+    file = GrowingFile(str(tmp_path / "x"))
+    file.append(b"second\n")
+    file.close()
+    assert (tmp_path / "x").read_bytes() == b"first\nsecond\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "cell"),
+    [
+        ("", "'"),
+        ("winder", "winder"),
+        ("0", "0"),
+        ("15", "15"),
+        (15 * "9", 15 * "9"),
+        (16 * "9", "'" + 16 * "9"),  # a spreadsheet keeps 15 digits
+        ("01", "'01"),
+        ("1.20", "'1.20"),
+        ("4-8", "'4-8"),
+        (",5", "',5"),
+        (".5", "'.5"),
+        (" 5", "' 5"),
+        ("'5", "''5"),
+        ("=1+1", "'=1+1"),
+        ("-5", "'-5"),
+        ("two\nlines", "two\nlines"),
+    ],
+)
+def test_a_text_that_a_spreadsheet_would_change_is_behind_an_apostrophe(text: str, cell: str) -> None:
+    assert text_cell(text) == cell
+    assert text_of(cell) == text
+
+
+def test_a_line_of_csv_keeps_the_spaces_at_its_end_and_quotes_line_ends() -> None:
+    assert csv_lines([["a", "b  "], ["c\r\nd", 'say "x"'], ["e", "f\r"]]) == (b'a,b  \n"c\r\nd","say ""x"""\ne,"f\r"\n')
+
+
+@pytest.mark.parametrize("text", ["640", "0640", "0777", "000"])
+def test_a_mode_is_octal(text: str) -> None:
+    assert file_mode(text) == int(text, 8)
+
+
+@pytest.mark.parametrize("text", ["", "40", "00640", "0o640", "0680", "1777", "rw-", "-640"])
+def test_a_mode_of_something_else_is_refused(text: str) -> None:
+    with pytest.raises(InvalidCommand, match="octal"):
+        file_mode(text)
+
+
+def test_a_buffer_holds_one_value_at_least() -> None:
+    assert FileSettings(path="x", buffer=1).buffer == 1
+    with pytest.raises(InvalidCommand, match="at least one value, not 0"):
+        FileSettings(path="x", buffer=0)

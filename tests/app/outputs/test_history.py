@@ -102,6 +102,7 @@ def test_labels_come_with_the_values(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "x.db")) as database, database:
         database.execute("insert into labels values (1, 2, 'run')")
     assert found.read("5/1", "", 0, 1e11, 10).labels == (("2", "run"),)
+    assert found.read("5/1", "", 0, 1e11, 1).labels == (("2", "run"),), "beside parts too"
 
 
 def test_a_read_that_takes_too_long_ends_with_a_proposal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,3 +140,13 @@ def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
         assert [one.value for one in found.read("5/1", "", 0, 1e11, 10).samples] == [1]
         writer.commit()
         assert [one.value for one in found.read("5/1", "", 0, 1e11, 10).samples] == [1, 2]
+
+
+def test_a_path_may_have_any_characters(tmp_path: Path) -> None:
+    found = recorded(tmp_path / "a b%20c#d.db", cycle(1, 7))
+    assert [one.value for one in found.read("5/1", "", 0, 1e11, 10).samples] == [7]
+
+
+def test_each_part_counts_its_own_errors(tmp_path: Path) -> None:
+    found = with_samples(tmp_path / "x.db", None, None, 1, None, 2, 3)
+    assert [part.errors for part in found.read("5/1", "", FIRST, FIRST + 6, 2).parts] == [2, 1]

@@ -20,6 +20,7 @@ from busmaster.app.outputs.distributor import Distributor, Wanted
 from busmaster.app.outputs.files import CsvOutput, JsonlOutput
 from busmaster.app.outputs.settings import FileSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.app.outputs.sqlite import SqliteOutput
+from busmaster.errors import InvalidCommand
 from tests.app.outputs.cycles import BUS, cycle, settled, until
 from tests.app.outputs.test_audit import WRITE
 from tests.app.outputs.test_distributor import TEXT, opened
@@ -311,3 +312,102 @@ def test_a_disk_that_is_full_again_after_it_took_values_is_told_again(tmp_path: 
             until(lambda: output.spilled == output.statistics().waiting)
         output.close(PATIENCE)
     assert output.statistics().spilled > 0
+
+
+def test_values_on_disk_are_bounded_and_those_that_had_to_go_are_counted(tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()  # which keeps the output down
+    output = CsvOutput(
+        "csv", FileSettings(path=str(tmp_path / "x"), spill=str(tmp_path / "spool"), spill_values=10, mode=0o600)
+    )
+    output.start()
+    for number in range(1, 26):
+        output.offer(cycle(number, number, number))
+        if number % 5 == 0:
+            until(lambda: output.statistics().waiting == output.spilled == min(10, output.offered))
+    counts = output.statistics()
+    output.close(PATIENCE)
+    assert (counts.written, counts.dropped, counts.waiting, counts.spilled) == (0, 40, 10, 10)
+    assert (tmp_path / "spool").stat().st_mode & 0o777 == 0o600
+    assert spooled(tmp_path, "csv") == 10
+
+
+def test_the_reasons_why_the_disk_takes_nothing_are_reported_each_once(tmp_path: Path) -> None:
+    said: list[str] = []
+    (tmp_path / "x").mkdir()  # which keeps the output down
+    output = csv(tmp_path, said.append)
+    errors: list[Exception] = []
+
+    class Broken:
+        values = 0
+
+        def put(self, records: object) -> int:
+            list(records)  # type: ignore[call-overload]
+            raise errors[-1]
+
+        def close(self) -> None:
+            pass
+
+    output._spool = Broken()  # type: ignore[assignment]
+    errors.append(sqlite3.OperationalError("disk is full"))
+    output.offer(cycle(1, 1))
+    output.start()
+    until(lambda: len(said) == 2)
+    errors.append(sqlite3.OperationalError("disk I/O error"))
+    until(lambda: len(said) == 3)
+    output.close(PATIENCE)
+    spool = tmp_path / "spool"
+    assert [text for text in said if "down" not in text] == [f"csv: {spool}: {text}" for text in map(str, errors)]
+    assert output.dropped == 1
+
+
+def test_a_folder_for_values_that_wait_is_looked_for_at_the_start(tmp_path: Path) -> None:
+    with pytest.raises(InvalidCommand, match=r"the folder .* does not exist"):
+        CsvOutput("csv", FileSettings(path=str(tmp_path / "x"), spill=str(tmp_path / "none" / "spool")))
+
+
+def test_an_empty_file_that_is_no_spool_does_not_keep_the_output_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "spool").touch()
+
+    def refused(*_: object, **__: object) -> None:
+        raise InvalidCommand("read-only file system")
+
+    monkeypatch.setattr("busmaster.app.outputs.spilling.Spool", refused)
+    said: list[str] = []
+    output = csv(tmp_path, said.append)
+    output.offer(cycle(1, 1))
+    output.start()
+    until(lambda: output.written == 1)
+    output.close(PATIENCE)
+    assert said == ["csv: read-only file system"]
+
+
+def test_while_values_on_disk_are_sent_new_ones_go_behind_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else memory would overflow while a long queue on disk is sent."""
+    (tmp_path / "x").mkdir()
+    output = csv(tmp_path, lambda _: None)
+    output.start()
+    for number in range(1, 51):
+        output.offer(cycle(number, number))
+    output.close(PATIENCE)
+    monkeypatch.setattr("busmaster.app.outputs.batches.SPILLED_AT_ONCE", 10)
+    (tmp_path / "x").rmdir()
+    again = csv(tmp_path, lambda _: None)
+    commit = again.commit
+    most = 0
+
+    def committed(batch: list[bytes]) -> None:
+        nonlocal most
+        most = max(most, len(again._waiting))
+        commit(batch)
+        if again.written < 30:
+            for _ in range(10):
+                again.offer(cycle(60, 60))
+
+    again.commit = committed  # type: ignore[method-assign]
+    again.start()
+    until(lambda: again.written >= 50 and settled(again))
+    again.close(PATIENCE)
+    assert numbers(tmp_path / "x")[:50] == list(range(1, 51))
+    assert most <= 10

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import os
 import signal
 import socket
 import subprocess
@@ -81,6 +83,34 @@ def test_a_file_that_is_no_spool_is_kept_aside(tmp_path: Path) -> None:
     assert "begun anew" in said[0]
 
 
+@pytest.mark.parametrize(("strict", "level"), [(False, 1), (True, 2)])
+def test_a_spool_has_its_mode_and_survives_a_loss_of_power_at_once_if_it_is_strict(
+    tmp_path: Path, strict: bool, level: int
+) -> None:
+    before = os.umask(0)
+    try:
+        spool = Spool(str(tmp_path / "spool"), 100, "mqtt", mode=0o604, strict=strict)
+    finally:
+        os.umask(before)
+    assert spool._database.execute("pragma synchronous").fetchone() == (level,)
+    spool.close()
+    assert (tmp_path / "spool").stat().st_mode & 0o777 == 0o604
+
+
+def test_a_spool_that_cannot_be_opened_is_an_error_in_words_and_leaves_no_file_open(tmp_path: Path) -> None:
+    (tmp_path / "spool").mkdir()
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(InvalidCommand) as raised:
+        spool_at(tmp_path, 100)
+    assert "another process" not in str(raised.value)
+    (tmp_path / "spool").rmdir()
+    spool_at(tmp_path, 100, "csv").close()
+    with pytest.raises(InvalidCommand, match="contains the stored values of csv; use another file for mqtt"):
+        spool_at(tmp_path, 100, "mqtt")
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
 # with an output
 
 
@@ -156,9 +186,9 @@ async def test_values_at_the_end_with_the_broker_away_are_kept_for_the_next_star
     assert (again.statistics().written, again.statistics().dropped) == (300, 0)
 
 
-def spooled(folder: Path) -> int:
+def spooled(folder: Path, kind: str = "mqtt") -> int:
     """How many values an output that is closed has left on disk."""
-    spool = spool_at(folder, 1_000_000)
+    spool = spool_at(folder, 1_000_000, kind)
     spool.close()
     return spool.values
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import pytest
 
 from busmaster.app.outputs import retention, sqlite
 from busmaster.app.outputs.base import Happening
+from busmaster.app.outputs.damaged import is_damaged
 from busmaster.app.outputs.retention import DAY, Retention
 from busmaster.app.outputs.settings import SqliteSettings
 from busmaster.app.outputs.sqlite import DATED, SqliteOutput, column
@@ -68,6 +70,9 @@ def test_values_events_and_errors_are_there_under_their_names(tmp_path: Path) ->
     assert len(history) == 8
     assert query(path, "select count(*) from points") == [(4,)]
     assert query(path, "select node, text from events") == [("winder", "winder is down, was suspect")]
+    with recording(path) as output:
+        output.offer(Happening(time.time(), "", "the line is lost"))
+    assert query(path, "select node from events where text = 'the line is lost'") == [(None,)]
     [(moment,)] = query(path, "select max(time) from samples")
     assert abs(moment - time.time()) < PATIENCE
 
@@ -245,6 +250,69 @@ def test_a_clock_that_was_set_ahead_deletes_nothing_for_a_day(monkeypatch: pytes
     clocks.run(30 * DAY)
     keeping.apply(database, DATED)
     assert left_in(database) == 0
+
+
+def test_a_clock_that_was_set_back_is_reported_once_and_not_trusted_for_a_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks, told = Clocks(monkeypatch), list[str]()
+    database = database_of(clocks.wall)
+    keeping = Retention(1, None, told.append)
+    keeping.apply(database, DATED)
+    clocks.run(DAY)
+    clocks.wall -= 3600
+    for _ in range(3):
+        keeping.apply(database, DATED)
+        clocks.run(2 * 3600)
+    assert told == ["the clock was set by -3600 s; nothing is deleted for a day"]
+    assert left_in(database) == 1
+    clocks.run(DAY)
+    keeping.apply(database, DATED)
+    assert left_in(database) == 0
+
+
+def test_the_clock_is_right_if_any_table_has_new_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks, told = Clocks(monkeypatch), list[str]()
+    database = database_of(clocks.wall - 365 * DAY)
+    database.execute("insert into events values (?)", (clocks.wall - 60,))
+    Retention(30, None, told.append).apply(database, DATED)
+    assert told == []
+    assert (left_in(database), left_in(database, "events")) == (0, 1)
+
+
+def test_while_nothing_is_too_old_it_is_looked_for_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = Clocks(monkeypatch)
+    database = database_of(clocks.wall - DAY + 10)
+    keeping = Retention(1, None)
+    left = []
+    for _ in range(3):
+        keeping.apply(database, DATED)
+        left.append(left_in(database))
+        clocks.run(retention.EVERY / 2)
+    assert left == [1, 1, 0]
+
+
+def test_with_the_oldest_of_the_largest_table_the_older_rows_of_others_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    database = database_of(*range(5))
+    database.executemany("insert into audit values (?)", [(moment,) for moment in range(50)])
+    database.executemany("insert into events values (?)", [(4,), (5,), (6,)])
+    retention.forget_oldest(database, DATED)
+    assert [left_in(database, table) for table in ("audit", "samples", "events")] == [45, 0, 2]
+
+
+def test_a_limit_in_megabytes_counts_the_pages_that_are_in_use() -> None:
+    database = sqlite3.connect(":memory:")
+    database.executescript(
+        "create table samples (time real, value); create table events (time); create table audit (time)"
+    )
+    rows = [(number, 1000 * "x") for number in range(1_500)]
+    database.executemany("insert into samples values (?, ?)", rows)
+    keeping = Retention(None, 1.5)
+    counts = []
+    for _ in range(6):
+        keeping.apply(database, DATED)
+        counts.append(left_in(database))
+    assert counts[0] == 1350
+    assert counts[-1] == counts[-2] > 1000
+    assert 1_300_000 < retention.used(database) <= 1_500_000
 
 
 def test_a_start_with_a_wrong_clock_deletes_nothing_for_a_day(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -444,3 +512,42 @@ def test_a_damaged_database_is_moved_aside_and_a_new_one_begun(tmp_path: Path) -
     assert said[0].endswith(f"it was moved to {path}.damaged, and a new file was started")
     assert said[1].endswith(f"it was moved to {path}.damaged-2, and a new file was started")
     assert (tmp_path / "x.db.damaged").read_bytes().startswith(bytes(4096))
+
+
+@pytest.mark.parametrize(
+    ("code", "damaged"),
+    [
+        (sqlite3.SQLITE_CORRUPT, True),
+        (sqlite3.SQLITE_CORRUPT_INDEX, True),
+        (sqlite3.SQLITE_NOTADB, True),
+        (sqlite3.SQLITE_BUSY, False),
+        (sqlite3.SQLITE_BUSY_SNAPSHOT, False),
+        (sqlite3.SQLITE_FULL, False),
+        (None, False),
+    ],
+)
+def test_only_a_file_whose_content_is_wrong_is_damaged(code: int | None, damaged: bool) -> None:
+    error = sqlite3.DatabaseError("x")
+    if code is not None:
+        error.sqlite_errorcode = code
+    assert is_damaged(error) is damaged
+
+
+def test_a_database_that_is_closed_leaves_no_file_open(tmp_path: Path) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for number in range(3):
+        with recording(tmp_path / "x.db") as output:
+            output.offer(cycle(number, 1.0))
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_label_that_is_changed_is_kept_as_it_was_last(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with recording(path) as output:
+        for label in ("on", "running"):
+            means = Meaning(labels={2: label})
+            found = cycle(1, 2)
+            samples = {point: sample._replace(value=means.named(2)) for point, sample in found.samples.items()}
+            output.offer(replace(found, samples=samples))
+            until(lambda: settled(output))
+    assert query(path, "select value, label from labels") == [(2, "running")]
