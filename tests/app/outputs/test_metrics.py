@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import importlib
 import os
 import re
@@ -13,17 +14,21 @@ import urllib.request
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
+from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from busmaster import Priority, ext
 from busmaster.app.outputs import metrics as metrics_module
 from busmaster.app.outputs import scrapes
 from busmaster.app.outputs.base import OutputStatistics
 from busmaster.app.outputs.metrics import MetricsOutput, number_of
 from busmaster.app.outputs.settings import MetricsSettings
+from busmaster.app.service.refusals import Refusals
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.health import Health
 from busmaster.bus.bus import Bus
@@ -33,6 +38,7 @@ from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.errors import LineDown, NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.app.outputs.cycles import BUS, until
@@ -76,8 +82,9 @@ def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> None:
 async def count_and_scrape() -> None:
     bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
     controller, absent = Hcp2Controller(bus, 5), Hcp2Controller(bus, 6)
-    counts = OutputStatistics("sqlite", "written", 10, 2, 3, "disk full")
-    output = MetricsOutput("metrics", MetricsSettings(port=0), bus, outputs=lambda: (counts,))
+    counts = OutputStatistics("sqlite", "written", 10, 2, 3, "disk full", 1, 7)
+    other = OutputStatistics("csv", "written", 11, 12, 13, "")
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus, outputs=lambda: (counts, other))
     async with bus:
         output.start()
         group = bus.poll_group("axes", period=0.02, points=[controller.point("1")])
@@ -89,6 +96,7 @@ async def count_and_scrape() -> None:
             await absent.read(1, retries=0)
         await asyncio.to_thread(until, lambda: output.port != 0)
         metrics = await asyncio.to_thread(scraped, output.port)
+        line, achieved = ext.line_statistics(bus), group.statistics().achieved
         await asyncio.to_thread(output.close, PATIENCE)
     assert of(metrics, "node_attempts_total", node="node 5") == 3
     assert of(metrics, "node_exchanges_total", node="node 5", outcome="ok") == 3
@@ -100,10 +108,17 @@ async def count_and_scrape() -> None:
     assert of(metrics, "group_cycles_total", group="axes") == 3
     assert of(metrics, "group_missed_total", group="axes") == group.statistics().missed
     assert of(metrics, "group_period_seconds", group="axes") == 0.02
-    assert of(metrics, "group_achieved_period_seconds", group="axes") > 0.019
+    assert of(metrics, "group_achieved_period_seconds", group="axes") == achieved > 0.019
+    assert of(metrics, "line_quiet_seconds_total") == line.quiet_time != line.busy
+    waits = {priority.name.lower(): line.waits[priority].p99 for priority in Priority}
+    assert len(set(waits.values())) > 1
+    assert {name: of(metrics, "line_wait_p99_seconds", priority=name) for name in waits} == waits
     assert 0 < of(metrics, "line_utilisation_ratio") <= 1
     assert of(metrics, "output_dropped_total", output="sqlite") == 2
     assert of(metrics, "output_up", output="sqlite") == 0
+    of_output = ("written_total", "dropped_total", "waiting", "spilled", "suppressed_total", "up")
+    assert [of(metrics, f"output_{name}", output="sqlite") for name in of_output] == [10, 2, 3, 1, 7, 0]
+    assert [of(metrics, f"output_{name}", output="csv") for name in of_output] == [11, 12, 13, 0, 0, 1]
     # What has not happened yet is there with 0: an alert on an increase sees the first one too.
     for role in ("read", "write", "admin", "safe", "unknown"):
         assert of(metrics, "connections_refused_total", role=role) == 0
@@ -236,6 +251,7 @@ async def test_a_stale_value_is_told_as_such_and_a_lost_one_keeps_its_time(monke
         metrics = await asyncio.to_thread(scraped, output.port)
         await asyncio.to_thread(output.close, PATIENCE)
     assert (of(metrics, "line_up"), of(metrics, "node_up", node="node 5")) == (0, 0)
+    assert of(metrics, "line_lost_seconds_total") > 0
     assert of(metrics, "value_good", **labels) == 0
     assert of(metrics, "value_time_seconds", **labels) == read_at
     assert ("busmaster_value", frozenset(labels.items())) not in metrics
@@ -289,7 +305,24 @@ async def never_opens(*_: object, **__: object) -> None:
     raise LineDown("unplugged")
 
 
-@pytest.mark.parametrize(("value", "number"), [(3, 3.0), (2.5, 2.5), (Health.UP, None), ((1, 2), None), ("on", None)])
+class Mode(Enum):
+    """A word that is no number itself."""
+
+    JOG = 2
+
+
+@pytest.mark.parametrize(
+    ("value", "number"),
+    [
+        (3, 3.0),
+        (2.5, 2.5),
+        (ProgramStatus(65), 65.0),
+        (Mode.JOG, 2.0),
+        (Health.UP, None),
+        ((1, 2), None),
+        ("on", None),
+    ],
+)
 def test_what_is_no_number_is_no_gauge(value: object, number: float | None) -> None:
     assert number_of(value) == number
 
@@ -397,3 +430,239 @@ def test_metrics_can_listen_on_addresses_of_both_families(host: str) -> None:
         socket.create_connection(listener.getsockname()[:2], PATIENCE) as scraper,
     ):
         assert scraper.getpeername()[0] == host
+
+
+def test_a_histogram_adds_what_fine_buckets_have_up_to_each_edge() -> None:
+    added: list[Any] = []
+    family: Any = SimpleNamespace(add_metric=lambda *given: added.append(given))
+    metrics_module.add_histogram(family, "winder", [(0.001, 1), (0.0011, 2), (0.0019, 3), (2.0, 4), (9.0, 5)], 46.5)
+    [(labels, buckets, total)] = added
+    assert (labels, total) == (["winder"], 46.5)
+    assert [(edge, count) for edge, count in buckets if edge in ("0.001", "0.002", "1.0", "2.0", "+Inf")] == [
+        ("0.001", 1),
+        ("0.002", 6),
+        ("1.0", 6),
+        ("2.0", 10),
+        ("+Inf", 15),
+    ]
+
+
+@pytest.mark.parametrize(("sort", "fits"), [("number", True), ("run", False), ("set", False), ("text", False)])
+def test_a_point_that_is_not_one_number_cannot_be_a_gauge(sort: str, fits: bool) -> None:
+    points = {"winder/force": "number", "winder/x": sort}
+    found = metrics_module.unsuitable(MetricsSettings(groups=("axes",)), "axes", points)
+    assert (found is None) is fits
+    assert found is None or (f"cannot take winder/x: it is a {sort}" in found.why and found.key == "groups")
+    assert metrics_module.unsuitable(MetricsSettings(), "axes", points) is None, "without groups only counts are served"
+
+
+@pytest.mark.asyncio
+async def test_values_behind_one_that_is_not_a_number_and_alarms_on_both_sides_are_served() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)], paced=False)))
+    controller = Hcp2Controller(bus, 5)
+    output = MetricsOutput("metrics", MetricsSettings(port=0, groups=("axes",)), bus)
+    async with bus:
+        for item, value in ((1, 10.0), (3, -10.0), (4, 0.0)):
+            await controller.write(item, value)
+        meanings = {"1": Meaning(high=5.0), "3": Meaning(low=-5.0), "4": Meaning(high=5.0)}
+        points = [replace(controller.point(item), meaning=meaning) for item, meaning in meanings.items()]
+        group = bus.poll_group("axes", period=1000.0, points=[points[0], controller.point("outputs"), *points[1:]])
+        async for _ in group:
+            break
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    found = {dict(labels)["item"]: value for (name, labels), value in metrics.items() if name == "busmaster_value"}
+    assert found == {"1": 10, "3": -10, "4": 0}
+    assert [of(metrics, "alarm", node="5", item=item) for item in ("1", "3", "4")] == [1, -1, 0]
+
+
+@pytest.mark.asyncio
+async def test_refusals_of_each_sort_are_counted_by_their_labels() -> None:
+    refusals = Refusals()
+    refusals.connections.update(read=1, write=2, safe=3)
+    refusals.logins.update(web=4, opcua=5)
+    refusals.at_interfaces.update({("modbus-tcp", "requests"): 6, ("modbus-tcp", "connections"): 7})
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [])))
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus, refusals=refusals)
+    async with bus:
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert [of(metrics, "connections_refused_total", role=role) for role in ("read", "write", "safe")] == [1, 2, 3]
+    assert [of(metrics, "logins_failed_total", interface=interface) for interface in ("web", "opcua")] == [4, 5]
+    kinds = ("requests", "connections")
+    assert [of(metrics, "interface_refused_total", interface="modbus-tcp", kind=kind) for kind in kinds] == [6, 7]
+
+
+@pytest.mark.asyncio
+async def test_reads_after_writes_are_counted_by_their_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = SimpleNamespace(read=1, failed=2, shared=3)
+    monkeypatch.setattr("busmaster.ext.reads_after_writes", lambda _: counts)
+    async with served() as output:
+        metrics = await asyncio.to_thread(scraped, output.port)
+    outcomes = ("read", "failed", "shared")
+    assert [of(metrics, "reads_after_writes_total", outcome=outcome) for outcome in outcomes] == [1, 2, 3]
+
+
+@pytest.mark.asyncio
+async def test_a_scrape_while_the_loop_of_the_line_is_busy_is_refused_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics_module, "PATIENCE", 0.01)
+    async with served() as output:
+        with socket.create_connection(("127.0.0.1", output.port), PATIENCE) as scraper:
+            scraper.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+            reply = scraper.recv(4096)  # not asynchronous: meanwhile the loop serves nothing
+    assert reply.startswith(b"HTTP/1.1 503 ")
+    assert b"loop is busy" in reply
+
+
+# the server alone
+
+
+class Scrapes:
+    """A server of scrapes, whose pages wait for `go_on`."""
+
+    def __init__(self) -> None:
+        self.listener = scrapes.listening("127.0.0.1", 0)
+        self.go_on = threading.Event()
+        self.made: list[str] = []
+        self.stop = threading.Event()
+        self.error: Exception | None = None
+        self.inner: Any = None
+
+    def make(self, accept: str) -> tuple[str, bytes]:
+        self.made.append(accept)
+        self.go_on.wait(PATIENCE)
+        if self.error is not None:
+            raise self.error
+        return "text/plain", f"page for {accept}".encode()
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        return await asyncio.open_connection(*self.listener.getsockname())
+
+    async def ask(self, *fields: str) -> asyncio.StreamReader:
+        reader, writer = await self.connect()
+        writer.write("\r\n".join(["GET /metrics HTTP/1.1", *fields, "", ""]).encode())
+        return reader
+
+    async def until_asking(self, count: int) -> None:
+        while len(self.inner._asking) < count:  # noqa: ASYNC110  nothing reports it
+            await asyncio.sleep(0.001)
+
+    async def until_made(self, count: int) -> None:
+        while len(self.made) < count:  # noqa: ASYNC110  it is made in a thread
+            await asyncio.sleep(0.001)
+
+
+@asynccontextmanager
+async def scrape_server(patch: pytest.MonkeyPatch) -> AsyncIterator[Scrapes]:
+    server = Scrapes()
+    made = scrapes._Server
+
+    def noted(*arguments: Any) -> Any:
+        server.inner = made(*arguments)
+        return server.inner
+
+    patch.setattr(scrapes, "_Server", noted)
+    serving = asyncio.ensure_future(scrapes.serve(server.listener, server.make, server.stop))
+    try:
+        async with asyncio.timeout(PATIENCE):
+            yield server
+    finally:
+        server.go_on.set()
+        server.stop.set()
+        await serving
+
+
+@pytest.mark.asyncio
+async def test_scrapers_that_wait_share_a_page_of_their_own_form_and_later_ones_get_a_new_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with scrape_server(monkeypatch) as server:
+        first = await server.ask("ACCEPT: one")
+        await server.until_made(1)
+        others = [await server.ask(f"accept: {accept}") for accept in ("one", "two")]
+        await server.until_asking(3)
+        server.go_on.set()
+        pages = [(await reader.read()).partition(b"\r\n\r\n")[2] for reader in (first, *others)]
+        assert pages == [b"page for one", b"page for one", b"page for two"]
+        assert (await (await server.ask("Accept: one")).read()).endswith(b"page for one")
+    assert server.made[0] == "one"
+    assert sorted(server.made) == ["one", "one", "two"]
+
+
+@pytest.mark.asyncio
+async def test_scrapers_beyond_the_bound_are_refused_until_others_have_their_page(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(scrapes, "MOST_ASKING", 1)
+    async with scrape_server(monkeypatch) as server:
+        first = await server.ask()
+        await server.until_made(1)
+        refused = await (await server.ask()).read()
+        assert refused.startswith(b"HTTP/1.1 503 ")
+        server.go_on.set()
+        assert (await first.read()).startswith(b"HTTP/1.1 200 OK")
+        for _ in range(2):
+            assert (await (await server.ask()).read()).startswith(b"HTTP/1.1 200 OK")
+
+
+@pytest.mark.asyncio
+async def test_of_too_many_silent_connections_the_oldest_is_closed_and_none_that_waits_for_its_page(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(scrapes, "MOST_SILENT", 2)
+    async with scrape_server(monkeypatch) as server:
+        asking = await server.ask()
+        await server.until_made(1)
+        oldest, _ = await server.connect()
+        later = [await server.connect() for _ in range(2)]
+        assert await oldest.read() == b""
+        server.go_on.set()
+        assert (await asking.read()).startswith(b"HTTP/1.1 200 OK")
+        for reader, writer in later:
+            writer.write(b"GET / HTTP/1.1\r\n\r\n")
+            assert (await reader.read()).startswith(b"HTTP/1.1 200 OK")
+
+
+@pytest.mark.asyncio
+async def test_half_a_scrape_is_closed_when_its_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scrapes, "PATIENCE", 0.02)
+    async with scrape_server(monkeypatch) as server:
+        reader, writer = await server.connect()
+        writer.write(b"GET /metrics HT")
+        assert await reader.read() == b""
+
+
+@pytest.mark.asyncio
+async def test_connections_are_closed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with scrape_server(monkeypatch) as server:
+        silent, _ = await server.connect()
+        asking = await server.ask()
+        await server.until_made(1)
+        server.stop.set()
+        server.go_on.set()
+        assert await silent.read() == b""
+        await asking.read()
+
+
+@pytest.mark.asyncio
+async def test_a_page_is_compressed_for_those_who_take_that_and_an_error_is_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with scrape_server(monkeypatch) as server:
+        server.go_on.set()
+        head, _, body = (await (await server.ask("Accept-Encoding: deflate, gzip")).read()).partition(b"\r\n\r\n")
+        assert b"Content-Encoding: gzip" in head
+        assert f"Content-Length: {len(body)}".encode() in head
+        assert gzip.decompress(body) == b"page for "
+        assert b"Content-Encoding" not in await (await server.ask("Accept-Encoding: deflate")).read()
+        server.error = ValueError("a bug")
+        reply = await (await server.ask()).read()
+        assert reply.startswith(b"HTTP/1.1 500 ")
+        assert b"ValueError('a bug')" in reply
+        reader, writer = await server.connect()
+        writer.write(b"POST / HTTP/1.1\r\n\r\n")
+        assert b"\r\nAllow: GET, HEAD\r\n" in await reader.read()
