@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from enum import Enum
 from typing import Any
 
 import jinja2
@@ -93,7 +94,42 @@ def test_each_sort_of_value_is_the_entity_that_shows_it() -> None:
     assert "state_class" not in config
     assert state(config, {"line/values/5/1": {"value": 2, "label": "run"}}) == "run"
     assert state(config, {"line/values/5/1": {"value": 7, "label": ""}}) == "7"
-    assert made(NODE.point("1"), (1, 2)) == []
+    [(component, config)] = made(NODE.point("1"), Mode.JOG)
+    assert (component, "state_class" in config) == ("sensor", False)
+    assert made(NODE.point("1"), (1, 2)) == made(NODE.point("1"), frozenset({1})) == []
+    [(_, config)] = made(replace(NODE.point("1"), meaning=Meaning(precision=0)), 12.5)
+    assert config["suggested_display_precision"] == 0
+    assert "unit_of_measurement" not in config
+
+
+class Mode(Enum):
+    """A word of a device."""
+
+    JOG = 2
+
+
+def test_entities_of_two_lines_and_two_nodes_are_different_and_a_node_belongs_to_its_line() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    configs = [
+        json.loads(config.payload)
+        for prefix in ("line", "hall 3/line")
+        for address in (5, 6)
+        for config in HomeAssistant("homeassistant", prefix, {}).value(Hcp2Controller(bus, address).point("1"), 1.5)
+    ]
+    assert len({config["unique_id"] for config in configs}) == 4
+    assert all(config["unique_id"].startswith("busmaster/") for config in configs)
+    assert len({tuple(config["device"]["identifiers"]) for config in configs}) == 4
+    of_line = json.loads(HomeAssistant("homeassistant", "line", {}).line().payload)
+    assert [config["device"]["via_device"] in of_line["device"]["identifiers"] for config in configs] == [
+        *(True, True, False, False)
+    ]
+
+
+def test_where_the_state_of_the_line_is_not_published_availability_does_not_depend_on_it() -> None:
+    messages = {"line/status": "online", "line/values/5/1": {"quality": "good"}}
+    for reports_line in (True, False):
+        [(_, config)] = made(NODE.point("1"), 1.5, reports_line=reports_line)
+        assert is_available(config, messages) is not reports_line
 
 
 def test_a_point_that_can_be_written_within_limits_is_a_number_too() -> None:
@@ -107,6 +143,30 @@ def test_a_point_that_can_be_written_within_limits_is_a_number_too() -> None:
     assert (number["command_topic"], number["min"], number["max"], number["step"]) == ("line/set/5/10", -5, 400, 0.1)
     assert number["unique_id"] != sensor["unique_id"]
     assert [component for component, _ in made(point, 1.0)] == ["sensor"], "no command is allowed"
+
+
+@pytest.mark.parametrize(("precision", "step"), [(None, 0.001), (0, 1), (2, 0.01), (5, 0.001)])
+def test_the_step_of_a_number_is_that_of_its_digits_if_home_assistant_takes_it(
+    precision: int | None, step: float
+) -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    point = replace(Hcp2Controller(bus, 5).point("10"), meaning=Meaning(precision=precision))
+    point.limit(minimum=0, maximum=1)
+    [(_, number), _] = made(point, 1.0, commands={"5/10": point})
+    assert number["step"] == step
+
+
+def test_the_range_of_a_number_is_that_of_its_own_narrowest_limits() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    controller = Hcp2Controller(bus, 5)
+    point, other = controller.point("10"), controller.point("11")
+    other.limit(minimum=-1, maximum=1)
+    point.limit(minimum=-5, maximum=400)
+    point.limit(minimum=-9, maximum=500)
+    [(_, number), _] = made(point, 1.0, commands={"5/10": point})
+    assert (number["min"], number["max"]) == (-5, 400)
+    point.limit(minimum=400)
+    assert [component for component, _ in made(point, 1.0, commands={"5/10": point})] == ["sensor"], "one value"
 
 
 def test_names_in_topics_have_the_characters_that_are_allowed_and_stay_different() -> None:

@@ -8,16 +8,25 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from busmaster.app.outputs.base import Happening
-from busmaster.app.outputs.mqtt import MqttOutput
+from busmaster.app.config import FileError
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.outputs.base import Happening, OutputLine
+from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, MqttOutput
+from busmaster.app.outputs.mqtt_connection import topic_part, unread
+from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
+from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.payload import NoCommand, Payload, read_payload
 from busmaster.bus.bus import Bus
+from busmaster.bus.meaning import Meaning
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
@@ -394,3 +403,206 @@ def test_a_password_is_the_text_of_its_file_without_the_end_of_its_line(tmp_path
 def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommand, match="No such file"):
         MqttOutput("mqtt", MqttSettings(password_file=str(tmp_path / "none")), BUS)
+
+
+def read_output(**options: Any) -> Any:
+    """The settings of `[outputs.mqtt]` with these keys."""
+    keys = "".join(f"{key} = {json.dumps(value)}\n" for key, value in options.items())
+    return read(Source("line.toml", f"{FILE}[outputs.mqtt]\n{keys}")).outputs["mqtt"]
+
+
+FILE = """
+port = "/dev/ttyUSB0"
+[nodes.winder]
+protocol = "hcp2"
+address = 5
+[groups.fast]
+period = 0.1
+points = "winder/1"
+"""
+
+
+@pytest.mark.parametrize("topic", ["", "a/+", "#", "/a", "a/", "a\tb"])
+@pytest.mark.parametrize("key", ["prefix", "home_assistant"])
+def test_a_topic_without_a_meaning_is_refused(key: str, topic: str) -> None:
+    with pytest.raises(FileError, match=f"{key}: a topic must not contain"):
+        read_output(**{key: topic})
+    assert getattr(read_output(**{key: "a/b"}), key) == "a/b"
+
+
+def test_each_file_is_checked_at_its_own_key(tmp_path: Path) -> None:
+    @contextmanager
+    def at(key: str) -> Iterator[None]:
+        try:
+            yield
+        except InvalidCommand as error:
+            found.append((key, str(error)))
+
+    (tmp_path / "text").write_text("no certificate")
+    none, text = str(tmp_path / "none"), str(tmp_path / "text")
+    results = []
+    for settings in (
+        MqttSettings(password_file=none, tls=True, ca_file=none),
+        MqttSettings(password_file=text, tls=True, ca_file=text),
+        MqttSettings(password_file=text, ca_file=none),  # without TLS it is not used
+    ):
+        found: list[tuple[str, str]] = []
+        settings.check_files(at)
+        results.append(found)
+    assert results == [
+        [
+            ("password_file", f"{none} cannot be read: No such file or directory"),
+            ("ca_file", f"{none} cannot be read: No such file or directory"),
+        ],
+        [("ca_file", f"{text} holds no certificate in PEM form")],
+        [],
+    ]
+
+
+def test_settings_without_commands_permit_none_and_are_the_same_otherwise() -> None:
+    settings = MqttSettings(port=1884, allow_commands=("winder/1",))
+    assert settings.writable == ("allow_commands", ("winder/1",))
+    assert settings.without_commands() == MqttSettings(port=1884)
+    assert settings.destination == "127.0.0.1:1884"
+
+
+@pytest.mark.asyncio
+async def test_the_client_has_the_settings_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "password").write_text("secret\n")
+    settings = MqttSettings(host="192.0.2.7", port=1884, username="op", password_file=str(tmp_path / "password"))
+    output = MqttOutput("mqtt", settings, BUS)
+    main = output._client()
+    client = main._client
+    forbidden = Forbidden(settings, output._secrets, "x/set/#", frozenset(), lambda _: None)
+    for paho in (client, forbidden._client):
+        assert (paho._username, paho._password) == (b"op", b"secret")
+    assert client._will_topic == b"busmaster/status"
+    assert main._keepalive == KEEP_ALIVE
+    assert MqttOutput("mqtt", settings, BUS, in_charge=False)._client()._client._will_topic == b""
+
+
+@pytest.mark.asyncio
+async def test_values_are_not_retained_if_the_file_says_so(broker: Broker) -> None:
+    for messages in ("point", "cycle"):
+        async with publishing(broker, retain=False, messages=messages) as output:
+            output.offer(cycle(1, 1.0))
+            output.offer(Happening(1.5, "", "the line is lost"))
+            await settled(output)
+    async with listening(broker, "line/values/#", "line/cycles/#", "line/status") as client:
+        assert [(topic, payload) for topic, payload, _ in await heard(client, 1)] == [("line/status", "offline")]
+
+
+@pytest.mark.asyncio
+async def test_messages_have_the_quality_of_service_of_the_file_and_an_event_of_the_line_no_node(
+    broker: Broker,
+) -> None:
+    import aiomqtt
+
+    for qos in (0, 1):
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.subscribe("line/events", qos=1)
+            async with publishing(broker, qos=qos) as output:
+                output.offer(Happening(1.5, "", "the line is lost"))
+                message = await anext(aiter(client.messages))
+        assert message.qos == qos
+        assert json.loads(bytes(message.payload)) == {
+            "time": 1.5,
+            "node": None,
+            "text": "the line is lost",
+        }
+
+
+@asynccontextmanager
+async def not_in_charge(broker: Broker, bus: Bus, **options: Any) -> AsyncIterator[MqttOutput]:
+    """An output of a process that does not own the line, or only listens."""
+    line = OutputLine(bus=bus, authorisation=Authorisation(bus), commands={}, **options)
+    output = MQTT.make(MqttSettings(port=broker.port, prefix="line", home_assistant="homeassistant"), line)
+    assert isinstance(output, MqttOutput)
+    output.start()
+    try:
+        yield output
+    finally:
+        await asyncio.to_thread(output.close, PATIENCE)
+
+
+@pytest.mark.asyncio
+async def test_who_does_not_own_the_line_publishes_its_values_and_nothing_of_its_state(broker: Broker) -> None:
+    bus = emulated(Hcp2Controller, 5)
+    Hcp2Controller(bus, 5)
+    async with listening(broker, "#") as client:
+        async with not_in_charge(broker, bus, in_charge=False) as output:
+            output.offer(cycle(1, 1.0))
+            await settled(output)
+        async with not_in_charge(broker, bus, polls=False) as output:
+            output.offer(cycle(1, 2.0))
+            await settled(output)
+        found: list[Heard] = []
+        while not (found and found[-1][:2] == ("line/status", "offline")):
+            found += await heard(client, 1)
+    [first, status, config, second, last] = found
+    assert (first[0], first[1]["value"]) == ("line/values/5/1", 1)
+    assert (status[:2], last[:2]) == (("line/status", "online"), ("line/status", "offline"))
+    assert config[0].startswith("homeassistant/sensor/")
+    assert [one["topic"] for one in config[1]["availability"]] == ["line/status", "line/values/5/1"]
+    assert (second[0], second[1]["value"]) == ("line/values/5/1", 2)
+
+
+@pytest.mark.asyncio
+async def test_the_state_of_the_line_has_its_reason_and_an_alarm_that_is_no_more_is_withdrawn(broker: Broker) -> None:
+    bus = emulated(Hcp2Controller, 5)
+    controller = Hcp2Controller(bus, 5)
+    with_alarm = replace(controller.point("1"), meaning=Meaning(high=5.0))
+    async with listening(broker, "line/line", "line/alarms/#") as client:
+
+        async def until(fact: Callable[[str, Any], bool]) -> Any:
+            while True:
+                [(topic, payload, _)] = await heard(client, 1)
+                if fact(topic, payload):
+                    return payload
+
+        async with bus, publishing(broker, bus):
+            ready = await until(lambda topic, _: topic == "line/line")
+            assert (ready["line"], ready["reason"]) == ("ready", None)
+            await controller.write(1, 7.0)
+            group = bus.poll_group("axes", period=0.02, points=[with_alarm, controller.point("3")])
+            await until(lambda topic, payload: topic == "line/alarms/5/1" and payload["alarm"] == "high")
+            group.remove(with_alarm)
+            await until(lambda topic, payload: topic == "line/alarms/5/1" and payload["alarm"] is None)
+            bus._pump.connection_lost(OSError("unplugged"))
+            lost = await until(lambda topic, payload: topic == "line/line" and payload["line"] == "offline")
+    assert "unplugged" in lost["reason"]
+
+
+@pytest.mark.parametrize(
+    ("messages", "group", "key", "why"),
+    [
+        ("point", "a\tgroup", "winder/force", ""),
+        ("point", "fast", "winder/a\tb", "a topic has no control characters"),
+        ("point", "fast", "winder/" + 70_000 * "x", "longer than a topic may be"),
+        ("cycle", "a\tgroup", "winder/force", "a topic has no control characters"),
+        ("cycle", "fast", "winder/a\tb", ""),
+        ("cycle", 70_000 * "x", "winder/force", "longer than a topic may be"),
+        ("cycle", "fast", "winder/force", ""),
+    ],
+)
+def test_a_name_that_cannot_be_a_part_of_a_topic_is_refused(messages: Any, group: str, key: str, why: str) -> None:
+    found = MQTT.unsuitable(MqttSettings(messages=messages), group, {"winder/first": "number", key: "number"})
+    assert (why in found.why) if why else found is None  # type: ignore[union-attr]
+
+
+def test_names_in_topics_stay_different() -> None:
+    names = ("a", "a+", "a#", "a%2B", "a%23", "a%", "a%25", "a%2525", "+#%")
+    assert len({topic_part(name) for name in names}) == len(names)
+    assert not set("".join(map(topic_part, names))) & set("+#")
+    assert topic_part("+#%") == "%2B%23%25"
+
+
+def test_of_a_connection_that_is_closed_nothing_is_unread() -> None:
+    here, there = socket.socketpair()
+    client: Any = SimpleNamespace(_client=SimpleNamespace(socket=lambda: here))
+    there.sendall(bytes(7))
+    assert unread(client) == 7
+    here.close()
+    there.close()
+    assert unread(client) == 0
+    assert unread(cast("Any", SimpleNamespace(_client=SimpleNamespace(socket=lambda: None)))) == 0

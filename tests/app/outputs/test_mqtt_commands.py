@@ -10,19 +10,20 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 from busmaster.app.outputs import mqtt, mqtt_commands, mqtt_forbidden
 from busmaster.app.outputs.mqtt import MqttOutput
-from busmaster.app.outputs.mqtt_commands import LEAST, Commands
+from busmaster.app.outputs.mqtt_commands import LEAST, Answer, Commands
 from busmaster.app.outputs.mqtt_connection import unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
 from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.record import Outcome, WriteRecord
-from busmaster.bounds import MOST_AT_ONCE, MOST_COMMANDS
+from busmaster.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
@@ -550,3 +551,55 @@ async def test_before_the_connection_ends_every_command_that_has_come_is_answere
     assert len(replies) == 5
     serving.cancel()
     await asyncio.gather(serving, return_exceptions=True)
+
+
+def commands_of(**points: str) -> Commands:
+    """The commands to points of a controller, by their names in topics."""
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    named = {f"5/{item}": Hcp2Controller(bus, 5).point(item) for item in points.values()}
+    return Commands("line", Authorisation(bus), named, lambda: 0.0)
+
+
+def test_as_many_commands_wait_as_the_bound_and_the_next_one_is_refused() -> None:
+    commands = commands_of(one="1")
+    for _ in range(MOST_COMMANDS + 2):
+        commands.arrive(cast("Message", Arrived(b'{"value": 1, "id": "a"}')))
+    assert (len(commands.queued), commands.refused, commands.unanswered) == (MOST_COMMANDS, 2, 0)
+    kept: list[tuple[str, str]] = []
+    for _ in range(2):  # each is kept once, however often it is closed
+        commands.close(lambda request, why: kept.append((request.id, why)))
+    assert len(kept) == MOST_COMMANDS + 2
+    assert {why for _, why in kept[:2]} == {f"{MOST_COMMANDS} commands are already waiting; send fewer at a time"}
+    assert {mark for mark, _ in kept} == {"a"}
+    commands.arrive(cast("Message", Arrived(b"1")))
+    assert (len(commands.queued), commands.refused, commands.unanswered) == (0, 3, 1)
+
+
+def test_of_a_sender_and_of_its_topic_only_so_much_is_kept_as_fits_a_line() -> None:
+    commands = commands_of(one="1")
+    properties = SimpleNamespace(UserProperty=[("by", 5000 * "x")])
+    commands.arrive(cast("Message", Arrived(b"1", properties=properties)))
+    commands.arrive(cast("Message", Arrived(b"1", topic="line/set/" + 5000 * "y")))
+    kept: list[WriteRequest] = []
+    commands.close(lambda request, _: kept.append(request))
+    [unknown, known] = kept
+    assert known.by == f"line/set/5/1, sender {LONGEST_SENDER * 'x'!r} (not verified)"
+    assert len(unknown.by) <= LONGEST_NAME
+    assert unknown.name == 40 * "y"
+
+
+def test_a_command_is_kept_as_it_came_up_to_the_longest_one() -> None:
+    commands = commands_of(one="1")
+    for size in (LONGEST_COMMAND, LONGEST_COMMAND + 1):
+        commands.arrive(cast("Message", Arrived(size * b"x")))
+    kept: list[WriteRequest] = []
+    commands.close(lambda request, _: kept.append(request))
+    assert kept[0].value == LONGEST_COMMAND * "x"
+    assert kept[1].value == f"{100 * 'x'}... ({LONGEST_COMMAND + 1} bytes)"
+
+
+def test_an_answer_has_the_id_of_its_command_and_an_error_only_if_it_failed() -> None:
+    assert Answer("5/1", True, "").fields == {"ok": True}
+    assert Answer("5/1", True, "", "a").fields == {"ok": True, "id": "a"}
+    assert Answer("5/1", False, "refused").fields == {"ok": False, "error": "refused"}
+    assert Answer("5/1", False, "refused", "a").fields == {"ok": False, "error": "refused", "id": "a"}
