@@ -182,3 +182,54 @@ def test_the_bound_leaves_descriptors_free(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(resource, "getrlimit", lambda _, soft=soft: (soft, soft))
         assert Crowd(print).most == most, soft
     assert most_connections() == 100 - RESERVED
+
+
+class Written:
+    """What the library does with a connection."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.transport: Any = self
+
+    def abort(self) -> None:
+        self.calls.append("abort")
+
+    def pause_writing(self) -> None:
+        self.calls.append("pause")
+
+    def resume_writing(self) -> None:
+        self.calls.append("resume")
+
+    def connection_lost(self, _: Exception | None) -> None:
+        self.calls.append("lost")
+
+
+class Reader(connections._Taken, Written):
+    """A connection whose client reads, or does not."""
+
+    def timer(self) -> asyncio.TimerHandle | None:
+        return self._reading
+
+
+@pytest.mark.asyncio
+async def test_the_time_in_which_a_client_must_read_begins_once_and_ends_when_it_reads_or_leaves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connections, "SEND_WITHIN", PATIENCE)
+    for end in (Reader.resume_writing, lambda one: one.connection_lost(None)):
+        one = Reader()
+        one.pause_writing()
+        timer = one.timer()
+        one.pause_writing()
+        assert timer is not None
+        assert one.timer() is timer
+        end(one)
+        assert one.timer() is None
+        assert timer.cancelled()
+        end(one)
+        assert "abort" not in one.calls
+        assert one.calls[:3] == ["pause", "pause", one.calls[-1]]
+    monkeypatch.setattr(connections, "SEND_WITHIN", 0.0)
+    one = Reader()
+    one.pause_writing()
+    await until(lambda: "abort" in one.calls)

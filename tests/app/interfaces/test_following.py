@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from busmaster.app.interfaces import following
 from busmaster.app.interfaces.following import Connected, Following, Lost
 from busmaster.app.service.permission import Access
+from busmaster.app.service.picture import Frame, Group, Row
 from busmaster.errors import InvalidCommand, LineDown, NotStarted
 from tests.app.interfaces.lines import READS, assert_goes_on_alone, followed, poll, shows
 from tests.app.service.lines import served, until
@@ -166,3 +170,214 @@ async def test_times_of_the_line_are_times_of_day(tmp_path: Path) -> None:
         poll(line)
         await shows(interface)
         assert abs(interface.wall_time(line.bus.now() - 3600) - interface.wall_time(line.bus.now()) + 3600) < PATIENCE
+
+
+# without an owner
+
+
+def row(**given: Any) -> Row:
+    """One row of a picture."""
+    fields: dict[str, Any] = {"group": "axes", "node": "winder", "protocol": "hcp2", "address": 5, "item": "10"}
+    fields |= {"key": f"winder/{given.get('item', '10')}", "quality": "good", "asked": 100.0, **given}
+    return Row(**fields)
+
+
+def shown_frame(**given: Any) -> Frame:
+    """The frame of a picture."""
+    texts: dict[str, Any] = {"title": "", "line": "slitter", "settings": "", "state": "ready", "events": ()}
+    counts = {"backlog": 3, "losses": 2, "groups": 9, "nodes": 9, "points": 1, "left_out": 0}
+    times = {"now": 100.0, "elapsed": 60.0, "utilisation": 0.5, "read_only": False}
+    return Frame(**{**texts, **counts, **times, **given})
+
+
+class Remote:
+    """The bus of an owner, as far as its clock."""
+
+    def __init__(self, now: float = 100.0) -> None:
+        self.time = now
+
+    def now(self) -> float:
+        return self.time
+
+
+def connected(remote: Any, **about: Any) -> Following:
+    """A line whose owner is there."""
+    line = Following(lambda: "")
+    line._remote = remote
+    line.state = Connected({"read_only": False, **about})
+    return line
+
+
+def test_a_group_is_old_after_three_of_its_periods_as_configured_or_as_seen_and_a_second_at_least() -> None:
+    line = connected(Remote())
+    line.picture.frame = shown_frame()
+    line.picture._groups[0] = [Group("fast", 0.02), Group("slow", 10.0), Group("overloaded", 0.02, achieved=2.0)]
+    names = ("fast", "slow", "overloaded", "unknown")
+
+    def old(age: float) -> set[str]:
+        return line.old_groups(dict.fromkeys(names, 100.0), 100.0 + age)
+
+    assert old(0.9) == set()
+    assert old(1.1) == {"fast", "unknown"}
+    assert old(5.9) == {"fast", "unknown"}
+    assert old(6.1) == {"fast", "overloaded", "unknown"}
+    assert old(29.9) == {"fast", "overloaded", "unknown"}
+    assert old(30.1) == set(names)
+
+
+def test_a_value_is_current_while_its_owner_is_there_and_its_group_goes_on() -> None:
+    remote = Remote(100.5)
+    line = connected(remote)
+    line.picture.frame = shown_frame()
+    line.picture._groups[0] = [Group("axes", 0.02)]
+    assert line.is_current(row())
+    assert line.is_current(row(quality="late"))
+    assert not line.is_current(row(quality="stale"))
+    assert not line.is_current(row(quality="bad"))
+    assert not line.is_current(row(asked=None))
+    remote.time = 102.0
+    assert not line.is_current(row())
+    remote.time = 100.5
+    line._remote = None
+    assert not line.is_current(row())
+
+
+@pytest.mark.parametrize(
+    ("of_interface", "of_role", "of_owner"),
+    [(False, False, None), (True, False, False), (False, True, None), (False, False, True), (False, False, False)],
+)
+def test_an_interface_writes_nothing_if_it_or_its_role_or_its_owner_is_read_only(
+    of_interface: bool, of_role: bool, of_owner: bool | None
+) -> None:
+    line = Following(lambda: "", read_only=of_interface)
+    line.state = Connected({"read_only": of_role})
+    line.picture.frame = None if of_owner is None else shown_frame(read_only=of_owner)
+    assert line.read_only is (of_interface or of_role or bool(of_owner))
+
+
+def test_of_one_loss_the_first_time_and_the_latest_reason_are_known_and_each_change_is_told_once() -> None:
+    line = connected(Remote())
+    line.picture._rows[0] = [row()]
+    told: list[object] = []
+
+    def once() -> None:
+        told.append("once")
+        leave()
+
+    leave = line.on_state(once)
+    line.on_state(lambda: told.append(line.state))
+    line._change(Lost("closed", since=1.0))
+    line._change(Lost("no program serves it", since=2.0))
+    line._change(Lost("no program serves it", since=3.0))
+    assert told == ["once", Lost("closed"), Lost("no program serves it")]
+    assert cast("Lost", line.state).since == 1.0
+    assert (line.picture.rows[0].quality, line.picture.rows[0].error) == ("bad", "no program serves it")
+    line._change(Connected({}))
+    line._change(Lost("closed", since=4.0))
+    assert cast("Lost", line.state).since == 4.0
+
+
+def test_all_who_want_a_message_get_it_until_they_leave_also_while_it_is_sent() -> None:
+    line = connected(Remote())
+    told: list[str] = []
+
+    def once(*_: object) -> None:
+        told.append("once")
+        leave()
+        leave_touched()
+
+    leave, leave_touched = line.on_picture(once), line.on_touched(once)
+    line.on_picture(lambda method, _: told.append(method))
+    line.on_touched(lambda params: told.append(params["protocol"]))
+    touched = {"protocol": "hcp2", "address": 5, "when": 101.0, "items": None, "all": False}
+    leave_again = line.on_touched(once)
+    leave_again()
+    line._receive("groups", {"first": 0, "groups": []})
+    assert told == ["once", "groups"]
+    told.clear()
+    leave_touched = line.on_touched(once)
+    leave = line.on_picture(once)
+    line.picture._rows[0] = [row()]
+    line._receive_touched(touched)
+    line._receive_touched(touched)
+    assert told == ["hcp2", "once", "hcp2"]
+    assert line.picture.rows[0].quality == "stale"
+
+
+@pytest.mark.asyncio
+async def test_pauses_between_tries_to_connect_are_doubled_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(following, "FIRST_PAUSE", 0.25)
+    monkeypatch.setattr(following, "LONGEST_PAUSE", 2.0)
+    pauses: list[float] = []
+    tokens: list[str | None] = []
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 7:
+            raise asyncio.CancelledError
+
+    class Gone:
+        """A connection that ends at once; the first four tries fail."""
+
+        def __init__(self, _address: str, *, token: str | None) -> None:
+            tokens.append(token)
+
+        async def __aenter__(self) -> Any:
+            if len(tokens) < 5:
+                raise LineDown("no program serves it")
+            return SimpleNamespace(about={"read_only": False}, on_access=[], on_touched=[], overview=self._overview)
+
+        async def __aexit__(self, *_: object) -> None:
+            pass
+
+        async def _overview(self, _receive: object) -> Any:
+            raise LineDown("closed")
+
+    monkeypatch.setattr(following, "connect", Gone)
+    monkeypatch.setattr(following, "asyncio", SimpleNamespace(sleep=sleep, to_thread=asyncio.to_thread))
+    line = Following(lambda: "unix:x", token="secret")
+    with pytest.raises(asyncio.CancelledError):
+        await line.follow()
+    assert pauses == [0.25, 0.5, 1.0, 2.0, 0.25, 0.25, 0.25]
+    assert set(tokens) == {"secret"}
+
+
+@pytest.mark.asyncio
+async def test_while_a_line_is_being_connected_nothing_is_written_and_its_values_are_prepared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    entered = asyncio.Event()
+
+    class Slow:
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        async def __aenter__(self) -> Any:
+            return SimpleNamespace(about={"read_only": False}, on_access=[], on_touched=[], overview=self._overview)
+
+        async def __aexit__(self, *_: object) -> None:
+            pass
+
+        async def _overview(self, receive: Any) -> Any:
+            described = {"group": "g", "key": "5/1", "node": "n", "protocol": "hcp2", "address": 5, "item": "1"}
+            receive("rows", {"set": 1, "first": 0, "rows": [described]})
+            receive("values", {"set": 1, "first": 0, "values": [["x", "good", 4.0, "", ""]]})
+            entered.set()
+            await asyncio.Event().wait()
+
+    monkeypatch.setattr(following, "connect", Slow)
+    line = Following(lambda: "unix:x", clean=lambda value: f"clean {value}")
+    before = time.time()
+    following_it = asyncio.ensure_future(line.follow())
+    await entered.wait()
+    assert line.is_connected
+    assert line.picture.rows[0].value == "clean x"
+    with pytest.raises(NotStarted, match="is not there: its program is being connected"):
+        await line.write("g", "5/1", 1)
+    with pytest.raises(LineDown, match="its program is being connected"):
+        await line.details("g", "5/1")
+    following_it.cancel()
+    await asyncio.gather(following_it, return_exceptions=True)
+    with pytest.raises(LineDown):
+        _ = line.remote
+    assert before <= Lost("x").since <= time.time()

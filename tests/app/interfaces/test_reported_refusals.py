@@ -10,7 +10,7 @@ import pytest
 
 from busmaster.app.interfaces import reported_refusals
 from busmaster.app.interfaces.following import Following
-from busmaster.app.interfaces.reported_refusals import ReportedRefusals
+from busmaster.app.interfaces.reported_refusals import FailedLogins, ReportedRefusals
 from busmaster.errors import LineDown
 
 
@@ -51,3 +51,59 @@ async def test_each_refusal_is_reported_once_and_kept_while_the_owner_is_away(mo
     refusals.note("connections", "10.0.0.2")
     await owner.got.wait()
     assert owner.reported == [("modbus-tcp", "connections", {"10.0.0.2": 1})]
+
+
+def refusals_of(owner: Owner, *kinds: str) -> ReportedRefusals:
+    return ReportedRefusals("modbus-tcp", cast("Following", cast("Any", owner)), *kinds)
+
+
+async def until_reported(owner: Owner) -> list[tuple[str, str, dict[str, int]]]:
+    """What is reported next."""
+    await owner.got.wait()
+    owner.got.clear()
+    reported, owner.reported = owner.reported, []
+    return reported
+
+
+@pytest.mark.asyncio
+async def test_refusals_while_the_owner_is_away_are_tried_again_without_a_change_of_state(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reported_refusals, "REPORT_EVERY", 0.0)
+    owner = Owner()
+    refusals = refusals_of(owner, "connections", "requests")
+    refusals.note("requests", "10.0.0.1")
+    refusals.note("connections", "10.0.0.2")
+    for _ in range(3):
+        await asyncio.sleep(0)
+    owner.is_connected = True
+    assert await until_reported(owner) == [
+        ("modbus-tcp", "connections", {"10.0.0.2": 1}),
+        ("modbus-tcp", "requests", {"10.0.0.1": 1}),
+    ]
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert owner.reported == []
+
+
+@pytest.mark.asyncio
+async def test_of_too_many_peers_the_others_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reported_refusals, "MOST_REPORTED", 2)
+    monkeypatch.setattr(reported_refusals, "REPORT_EVERY", 0.0)
+    owner = Owner()
+    owner.is_connected = True
+    refusals = refusals_of(owner, "requests")
+    for peer in ("a", "b", "c", "d", "a"):
+        refusals.note("requests", peer)
+    assert await until_reported(owner) == [("modbus-tcp", "requests", {"a": 2, "b": 1, "others": 2})]
+
+
+@pytest.mark.asyncio
+async def test_a_failed_login_is_reported_here_and_to_the_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reported_refusals, "REPORT_EVERY", 0.0)
+    owner = Owner()
+    owner.is_connected = True
+    reports: list[str] = []
+    FailedLogins("web", cast("Following", cast("Any", owner)), reports.append).note("10.0.0.1")
+    assert reports == ["1 failed login at web: 1 from 10.0.0.1"]
+    assert await until_reported(owner) == [("web", "logins", {"10.0.0.1": 1})]
