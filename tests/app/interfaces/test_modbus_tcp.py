@@ -15,15 +15,17 @@ import subprocess
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from busmaster import Priority
+from busmaster import Priority, Quality, Snapshot
 from busmaster.app.interfaces import modbus_tcp
+from busmaster.app.interfaces.following import Connected, Following, Lost
 from busmaster.app.interfaces.modbus_tcp import (
     UNIT_REFUSED,
     Answers,
@@ -43,13 +45,26 @@ from busmaster.app.interfaces.modbus_tcp import (
     read_reply,
     request_of,
 )
+from busmaster.app.service.picture import Row
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
-from busmaster.errors import InvalidCommand, NodeDown, NoReply, NotStarted, Refused, WriteUnconfirmed
+from busmaster.errors import (
+    BacklogFull,
+    InvalidCommand,
+    LineDown,
+    NodeDown,
+    NoReply,
+    NotStarted,
+    Refused,
+    Superseded,
+    WriteUnconfirmed,
+)
 from busmaster.protocols.modbus.codec import EXCEPTIONS
 from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Command, busmaster, owner, serve, started
+from tests.app.interfaces.test_following import Remote, connected, row, shown_frame
+from tests.app.outputs.cycles import cycle
 from tests.patience import PATIENCE
 
 __all__ = ["busmaster"]
@@ -971,3 +986,500 @@ def test_wrong_usage_is_an_error(busmaster: Command, arguments: tuple[str, ...],
 def test_a_map_without_points_has_no_addresses() -> None:
     with pytest.raises(ExceptionReply):
         RegisterMap().whole("holding", 0, 1)
+
+
+# the values, beside an owner that the test plays
+
+
+class Group:
+    """A poll group of an owner: its cycles are what the test puts into a queue."""
+
+    def __init__(self) -> None:
+        self.cycles: asyncio.Queue[Snapshot | Exception] = asyncio.Queue()
+        self.subscriptions = 0
+        self.closes = 0
+        self.dropped = 0
+
+    def __aiter__(self) -> Group:
+        self.subscriptions += 1
+        return self
+
+    async def __anext__(self) -> Snapshot:
+        found = await self.cycles.get()
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def close(self) -> None:
+        self.closes += 1
+
+
+class Owner(Remote):
+    """The bus of an owner, with its clock and poll groups."""
+
+    def __init__(self, now: float = 100.0) -> None:
+        super().__init__(now)
+        self.groups: dict[str, Group] = {}
+
+    def group(self, name: str) -> Group:
+        return self.groups.setdefault(name, Group())
+
+
+def values_of(line: Following, *rows: Row, **options: Any) -> Values:
+    """The values of a line that has these points."""
+    show(line, *rows)
+    return Values(line, **options)
+
+
+def show(line: Following, *rows: Row) -> None:
+    line.picture._rows = {0: list(rows)}
+    line.picture.frame = shown_frame(points=len(rows))
+
+
+def read_cycle(*values: Any, at: float = 100.0, quality: Quality = Quality.GOOD) -> Snapshot:
+    """A cycle of the elements 1, 2, ... of node 5, requested at `at`."""
+    snapshot = cycle(1, *values, at=at)
+    samples = {
+        point: sample if sample.error else sample._replace(quality=quality)
+        for point, sample in snapshot.samples.items()
+    }
+    return replace(snapshot, samples=samples)
+
+
+def row_of(item: str, group: str = "axes", **given: Any) -> Row:
+    return row(item=item, group=group, key=f"winder/{item}", **given)
+
+
+async def look(values: Values) -> None:
+    """Have the values look at the line, and its cycles arrive."""
+    await values._look()
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+async def story_of_values() -> None:
+    owner = Owner()
+    line = connected(owner)
+    values = values_of(line, row_of("1"), row_of("2"), row_of("3"))
+    assert values.look_up(["winder/1"]) == {"winder/1": (None, 3)}
+    await look(values)
+    assert values.known.is_set()
+    group = owner.groups["axes"]
+    assert values.look_up(["winder/1"]) == {"winder/1": (None, 4)}
+    group.cycles.put_nowait(read_cycle(1.5, NoReply("no reply"), 3.5))
+    await look(values)
+    keys = ["winder/1", "winder/2", "winder/3", "winder/9"]
+    assert values.look_up(keys) == dict(zip(keys, [(1.5, 0), (None, 4), (3.5, 0), (None, 4)], strict=True))
+    # a value that could not be read any more, and one behind it
+    group.cycles.put_nowait(read_cycle(NoReply("no reply"), 2.5, 4.5, at=101.0))
+    await look(values)
+    assert values.look_up(keys[:3]) == {"winder/1": (1.5, 2), "winder/2": (2.5, 0), "winder/3": (4.5, 0)}
+    group.cycles.put_nowait(read_cycle(1.5, 2.5, at=102.0, quality=Quality.STALE))
+    await look(values)
+    assert values.look_up(keys[:3]) == {"winder/1": (1.5, 1), "winder/2": (2.5, 1), "winder/3": (4.5, 0)}
+    # a write to the second, and then one that its owner does not name
+    group.cycles.put_nowait(read_cycle(1.0, 2.0, 3.0, at=103.0))
+    await look(values)
+    values._receive_touched({"protocol": "hcp2", "address": 5, "when": 103.5, "items": ["2"], "all": False})
+    assert [status for _, status in values.look_up(keys[:3]).values()] == [0, 1, 0]
+    # cycles that do not come any more
+    owner.time = 105.0
+    assert [status for _, status in values.look_up(keys[:3]).values()] == [1, 1, 1]
+    owner.time = 103.1
+    # a line that is lost: values that were read before are of no use
+    line.picture.frame = shown_frame(points=3, now=103.0, state="offline")
+    assert [status for _, status in values.look_up(keys[:3]).values()] == [3, 3, 3]
+    group.cycles.put_nowait(read_cycle(1.0, at=104.0))
+    await look(values)
+    assert [status for _, status in values.look_up(keys[:3]).values()] == [0, 3, 3]
+    # an owner that is away, and another one with another clock
+    line.state = Lost("gone")
+    assert values.look_up(keys) == dict(zip(keys, [(1.0, 3), (2.0, 3), (3.0, 3), (None, 3)], strict=True))
+    line._remote = None
+    await look(values)
+    assert values.look_up(keys[:1]) == {"winder/1": (1.0, 3)}
+    again = Owner(7.0)
+    line._remote, line.state = cast("Any", again), Connected({"read_only": False})
+    show(line, row_of("1"), row_of("2"))
+    await look(values)
+    assert values.look_up(keys[:2]) == {"winder/1": (None, 4), "winder/2": (None, 4)}
+    again.groups["axes"].cycles.put_nowait(read_cycle(1.0, 2.0, at=7.0))
+    await look(values)
+    assert values.look_up(keys[:2]) == {"winder/1": (1.0, 0), "winder/2": (2.0, 0)}, "no write is known of this owner"
+    await values._leave_groups(set())
+
+
+def test_a_value_has_the_status_of_its_read_its_group_its_line_and_its_owner() -> None:
+    asyncio.run(story_of_values())
+
+
+def test_a_value_is_of_the_time_of_its_request() -> None:
+    async def story() -> None:
+        owner = Owner()
+        values = values_of(connected(owner), row_of("1"))
+        await look(values)
+        snapshot = read_cycle(1.0)
+        [(point, sample)] = snapshot.samples.items()
+        later = {point: sample._replace(started=100.0, finished=100.4)}
+        owner.groups["axes"].cycles.put_nowait(replace(snapshot, samples=later))
+        await look(values)
+        values._receive_touched({"protocol": "hcp2", "address": 5, "when": 100.2, "items": ["1"], "all": False})
+        assert values.look_up(["winder/1"]) == {"winder/1": (1.0, 1)}, "the write ended while it was read"
+        await values._leave_groups(set())
+
+    asyncio.run(story())
+
+
+def test_a_point_of_two_groups_has_the_values_of_the_first_and_a_group_that_has_gone_leaves_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(modbus_tcp, "ASK_AGAIN", 0.0)
+
+    async def story() -> None:
+        owner = Owner()
+        line = connected(owner)
+        values = values_of(line, row_of("1", "fast"), row_of("1", "slow", writable=True), row_of("2", "slow"))
+        await look(values)
+        assert not values.rows["winder/1"].writable
+        owner.groups["fast"].cycles.put_nowait(read_cycle(1.0))
+        await look(values)
+        owner.groups["slow"].cycles.put_nowait(read_cycle(2.0, 3.0))
+        await look(values)
+        assert values.look_up(["winder/1", "winder/2"]) == {"winder/1": (1.0, 0), "winder/2": (3.0, 0)}
+        # a group that ends is requested again; its values get old meanwhile
+        owner.groups["slow"].cycles.put_nowait(LineDown("closed"))
+        await look(values)
+        await look(values)
+        assert (owner.groups["slow"].subscriptions, owner.groups["slow"].closes) == (2, 1)
+        assert values.look_up(["winder/2"]) == {"winder/2": (3.0, 0)}
+        # the group has gone, and its points are of another one
+        show(line, row_of("1", "fast"), row_of("2", "other"))
+        values._receive("rows", {})
+        await look(values)
+        assert values.look_up(["winder/1", "winder/2"]) == {"winder/1": (1.0, 0), "winder/2": (None, 4)}
+        owner.groups["other"].cycles.put_nowait(read_cycle(1.0, 7.0))
+        await look(values)
+        assert values.look_up(["winder/2"]) == {"winder/2": (7.0, 0)}
+        await values._leave_groups(set())
+        assert all(group.subscriptions == group.closes for group in owner.groups.values())
+
+    asyncio.run(story())
+
+
+def test_points_keep_their_addresses_and_what_has_none_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story() -> None:
+        warnings: list[str] = []
+        line = connected(Owner())
+        values = values_of(line, row_of("1"), row_of("2"), type_="float32", warn=warnings.append)
+        await look(values)
+        show(line, row_of("0"), row_of("1"), row_of("3"))
+        line.picture.frame = shown_frame(points=4)  # a part of the rows is still to come
+        values._receive("rows", {})
+        await look(values)
+        assert [entry.point for entry in values.map.entries] == ["winder/1", "winder/2"]
+        assert warnings == []
+        line.picture.frame = shown_frame(points=3)
+        await look(values)
+        found = {entry.point: entry.address for entry in values.map.entries}
+        assert found == {"winder/1": 0, "winder/2": 2, "winder/0": 4, "winder/3": 6}
+        assert [text.partition(":")[0] for text in warnings] == ["the points have changed"]
+        monkeypatch.setattr(modbus_tcp, "ADDRESSES", 8)
+        show(line, *(row_of(str(number)) for number in range(6)))
+        values._receive("rows", {})
+        await look(values)
+        assert len(values.map.entries) == 4
+        assert warnings[-1] == "2 points have no address: 65536 are in use"
+        await values._leave_groups(set())
+
+    asyncio.run(story())
+
+
+def test_every_entry_of_the_map_that_is_no_point_is_reported() -> None:
+    async def story() -> None:
+        warnings: list[str] = []
+        fixed = RegisterMap.of([Entry(f"winder/{item}", 4 * number) for number, item in enumerate("123")], False)
+        values = values_of(connected(Owner()), row_of("2"), fixed=fixed, warn=warnings.append)
+        await look(values)
+        assert [text.split()[3] for text in warnings] == ["'winder/1',", "'winder/3',"]
+        assert values.map is fixed
+        await values._leave_groups(set())
+
+    asyncio.run(story())
+
+
+def test_the_values_follow_the_line_until_they_are_cancelled() -> None:
+    async def story() -> None:
+        owner = Owner()
+        line = connected(owner)
+        values = values_of(line, row_of("1"))
+        running = asyncio.ensure_future(values.run())
+        async with asyncio.timeout(PATIENCE):
+            await values.known.wait()
+            owner.groups["axes"].cycles.put_nowait(read_cycle(1.0))
+            while values.look_up(["winder/1"]) != {"winder/1": (1.0, 0)}:  # noqa: ASYNC110  nothing reports it
+                await asyncio.sleep(0)
+        line._receive_touched({"protocol": "hcp2", "address": 5, "when": 100.2, "items": ["1"], "all": False})
+        assert values.look_up(["winder/1"]) == {"winder/1": (1.0, 1)}
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert (line._listeners, line._watchers, line._touch_listeners) == ([], [], [])
+        assert owner.groups["axes"].closes == 1
+
+    asyncio.run(story())
+
+
+# the replies, with values that the test gives
+
+
+class Given:
+    """The values of a line, and what is written to it."""
+
+    def __init__(self, shown: RegisterMap, **values: tuple[Any, int]) -> None:
+        self.map = shown
+        self.rows = {f"a/{name}": row(item=name, key=f"a/{name}", writable=name != "fixed") for name in values}
+        self.known = asyncio.Event()
+        self.known.set()
+        self.line = self
+        self.is_connected = True
+        self.read_only = False
+        self.picture = SimpleNamespace(nodes={("modbus", 3): None})
+        self.remote = self
+        self.writes: list[tuple[str, str, Any]] = []
+        self.error: Exception | None = None
+        self.requests: list[str] = []
+        self._values = values
+
+    def look_up(self, keys: Any) -> dict[str, tuple[Any, int]]:
+        return {key: self._values.get(key.removeprefix("a/"), (None, 4)) for key in keys}
+
+    async def write(self, group: str, key: str, value: Any) -> None:
+        if self.error is not None and self.writes:
+            raise self.error
+        self.writes.append((group, key, value))
+
+    def find(self, _protocol: str, unit: int) -> Any:
+        assert unit == 3
+        return self
+
+    async def request(self, command: Any, **_options: Any) -> Any:
+        self.requests.append(str(command))
+        if self.error is not None:
+            raise self.error
+        return (1, 0)
+
+
+ENTRIES = (
+    Entry("a/x", 0, type="int16", status=1),
+    Entry("a/y", 2, type="int32", status=4),
+    Entry("a/fixed", 5, type="int16"),
+    Entry("a/gone", 6, type="int16"),
+    Entry("a/on", 0, table="coil", type="bit", status=1),
+    Entry("a/off", 0, table="discrete", type="bit", status=1),
+)
+
+
+def answering(last: bool = False, **rules: Any) -> tuple[Given, Callable[..., bytes], list[str], list[tuple[str, str]]]:
+    """Values, what replies to a request for them, and what is reported and refused."""
+    entries = [entry for entry in ENTRIES if entry.status is not None or not last]
+    given = Given(RegisterMap.of(entries, last), x=(5, 0), y=(-2, 1), fixed=(1, 0), on=(1, 0), off=(0, 2), bad=(1, 0))
+    reports: list[str] = []
+    refused: list[tuple[str, str]] = []
+
+    def reply(pdu: str, unit: int = 1, peer: str = "127.0.0.1") -> bytes:
+        async def run() -> bytes:
+            answers = Answers(cast("Values", given), Rules(**rules), reports.append, lambda *what: refused.append(what))
+            return await answers.reply(peer, unit, bytes.fromhex(pdu))
+
+        return asyncio.run(run())
+
+    return given, reply, reports, refused
+
+
+@pytest.mark.parametrize(
+    ("pdu", "last", "reply"),
+    [
+        ("03 0000 0001", False, "03 02 0005"),
+        ("03 0000 0002", False, "03 04 0005 0000"),
+        ("03 0001 0001", False, "03 02 0000"),
+        ("03 0002 0002", False, "83 0b"),  # its value is stale
+        ("03 0002 0002", True, "03 04 ffff fffe"),
+        ("03 0002 0003", True, "03 06 ffff fffe 0001"),
+        ("03 0004 0001", False, "03 02 0001"),
+        ("03 0006 0001", False, "83 0a"),  # it is not a point of the line
+        ("01 0000 0002", False, "01 01 01"),
+        ("02 0001 0001", False, "02 01 01"),  # a status bit is 0 or 1
+        ("02 0000 0001", False, "82 0b"),
+        ("04 0000 0001", False, "84 02"),
+    ],
+)
+def test_a_value_that_is_not_current_is_only_sent_where_its_status_is(pdu: str, last: bool, reply: str) -> None:
+    _, answer, _, _ = answering(last)
+    assert answer(pdu) == bytes.fromhex(reply)
+
+
+def test_a_value_that_does_not_fit_its_registers_is_a_failure_and_no_map_is_no_reply() -> None:
+    given, answer, _, _ = answering()
+    given._values["x"] = (40_000, 0)
+    assert answer("03 0000 0001") == bytes.fromhex("83 04")
+    given.known.clear()  # the points are not known yet: the map may have more
+    assert answer("03 0006 0001") == bytes.fromhex("83 0b")
+    given.map = RegisterMap()
+    assert answer("03 0000 0001") == bytes.fromhex("83 0b")
+
+
+@pytest.mark.parametrize(
+    ("pdu", "reply", "written"),
+    [
+        ("06 0000 0007", "06 0000 0007", [("a/x", 7)]),
+        ("10 0002 0002 04 ffff fffe", "10 0002 0002", [("a/y", -2)]),
+        ("05 0000 ff00", "05 0000 ff00", [("a/on", 1)]),
+        ("06 0001 0007", "86 03", []),  # a status
+        ("06 0005 0007", "86 03", []),  # a point that cannot be written
+        ("06 0006 0007", "86 0a", []),  # no point of the line
+        ("10 0000 0002 04 0007 0007", "90 03", []),
+    ],
+)
+def test_a_write_has_the_values_of_whole_points_that_may_be_written(
+    pdu: str, reply: str, written: list[tuple[str, int]]
+) -> None:
+    given, answer, reports, _ = answering(allow=("a/x", "a/*"))
+    assert answer(pdu) == bytes.fromhex(reply)
+    assert given.writes == [("axes", *one) for one in written]
+    lines = [f"client 127.0.0.1: {key} = {value}: written" for key, value in written]
+    assert [text for text in reports if "written" in text] == lines
+
+
+def test_of_several_points_in_one_request_each_gets_its_own_registers_and_an_error_says_how_many_were_written() -> None:
+    given, answer, reports, _ = answering(allow=("a/*",))
+    given.map = RegisterMap.of([Entry("a/x", 0, type="int16"), Entry("a/y", 1, type="int32")], False)
+    assert answer("10 0000 0003 06 0007 0001 0000") == bytes.fromhex("10 0000 0003")
+    assert given.writes == [("axes", "a/x", 7), ("axes", "a/y", 65536)]
+    given.writes.clear()
+    given.error = WriteUnconfirmed("no reply")
+    assert answer("10 0000 0003 06 0007 0001 0000") == bytes.fromhex("90 0b")
+    assert reports[-1].endswith(f"a/y = 65536: {given.error}; of this request 1 of 2 points were written")
+    assert answer("06 0000 0007") == bytes.fromhex("86 0b")
+    assert reports[-1] == f"client 127.0.0.1: a/x = 7: {given.error}"
+    given.is_connected = False
+    assert answer("06 0000 0007") == bytes.fromhex("86 0b")
+
+
+@pytest.mark.parametrize(
+    ("rules", "peer", "code"),
+    [
+        ({}, "127.0.0.1", 1),
+        ({"allow": ("a/y",)}, "127.0.0.1", 3),
+        ({"allow": ("a/x",), "peers": (ipaddress.ip_network("10.0.0.0/8"),)}, "127.0.0.1", 1),
+        ({"allow": ("a/x",), "peers": (ipaddress.ip_network("10.0.0.0/8"),)}, "10.1.2.3", 0),
+        ({"allow": ("a/x",), "units": frozenset((3,))}, "127.0.0.1", 0),
+        ({"units": frozenset((3,))}, "127.0.0.1", 1),
+    ],
+)
+def test_a_write_that_is_not_allowed_is_refused_counted_and_reported(
+    rules: dict[str, Any], peer: str, code: int
+) -> None:
+    given, answer, reports, refused = answering(**rules)
+    assert answer("06 0000 0007", peer=peer) == bytes.fromhex(f"86 {code:02x}" if code else "06 0000 0007")
+    assert len(given.writes) == (not code)
+    assert refused == ([("requests", peer)] if code else [])
+    assert any(text.startswith("1 write requests of Modbus TCP were refused") for text in reports) is bool(code)
+    given.read_only = True
+    assert answer("06 0000 0007", peer=peer) == bytes.fromhex("86 01")
+
+
+def test_units_of_the_line_are_written_if_they_are_named_and_their_errors_are_reported() -> None:
+    given, answer, reports, refused = answering(pass_through=True, allow=("a/x",), units=frozenset((3,)))
+    assert answer("01 0000 0002", unit=3) == bytes.fromhex("01 01 01")
+    assert answer("02 0000 0002", unit=3) == bytes.fromhex("02 01 01")
+    assert answer("04 0000 0002", unit=3) == bytes.fromhex("04 04 0001 0000")
+    assert answer("06 0000 0007", unit=3) == bytes.fromhex("06 0000 0007")
+    assert reports == ["client 127.0.0.1: unit 3, 1 from holding 0: written"]
+    assert [text.split()[:2] for text in given.requests] == [
+        *(["read", "coil"], ["read", "discrete"], ["read", "input"], ["write", "holding"])
+    ]
+    given.error = Refused("refused: illegal data address")
+    assert answer("06 0000 0007", unit=3) == bytes.fromhex("86 02")
+    assert reports[-1] == f"client 127.0.0.1: unit 3, 1 from holding 0: {given.error}"
+    assert answer("03 0000 0001", unit=4) == bytes.fromhex("83 0a")
+    given.error = None
+    for own in (0, 255):
+        assert answer("03 0000 0001", unit=own) == bytes.fromhex("03 02 0005")
+    assert refused == []
+    assert answer("06 0000 0007", unit=4) == bytes.fromhex("86 03")
+    assert refused == [("requests", "127.0.0.1")]
+    given.is_connected = False
+    assert answer("03 0000 0001", unit=3) == bytes.fromhex("83 0b")
+    _, answer, _, refused = answering(pass_through=True, allow=("a/x",))
+    assert answer("06 0000 0007", unit=3) == bytes.fromhex("86 01")
+    _, answer, _, _ = answering(units=frozenset((3,)))
+    assert answer("03 0000 0001", unit=3) == bytes.fromhex("03 02 0005"), "without pass-through every unit is its own"
+
+
+def test_the_places_of_an_address_on_the_line_are_free_again_after_errors() -> None:
+    given, _, _, _ = answering()
+    given.error = NoReply("no reply")
+
+    async def run() -> list[bytes]:
+        answers = Answers(cast("Values", given), Rules(pass_through=True), lambda _: None)
+        async with asyncio.timeout(PATIENCE):
+            waiting = (answers.reply("10.0.0.1", 3, READ) for _ in range(3 * modbus_tcp.MOST_ON_LINE))
+            return await asyncio.gather(*waiting)
+
+    assert set(asyncio.run(run())) == {b"\x83\x0b"}
+
+
+def test_busy_is_what_was_not_sent_because_of_others() -> None:
+    for kind in (NotStarted, BacklogFull, Superseded):
+        assert code_of(kind("x")) == 6
+
+
+def test_the_map_as_csv_has_the_unit_of_each_point_and_who_may_write_it() -> None:
+    shown = RegisterMap.of(
+        [
+            Entry("a/x", 0, type="int16", scale=0.1, status=1),
+            Entry("a/x", 0, table="input", type="int16"),
+            Entry("a/on", 0, table="coil", type="bit"),
+            Entry("a/fixed", 2, type="int16"),
+            Entry("a/other", 3, type="int16"),
+            Entry("a/none", 4, type="int16"),
+        ],
+        False,
+    )
+    rows = {f"a/{name}": row(item=name, unit="mm", writable=name != "fixed") for name in ("x", "on", "fixed", "other")}
+    lines = modbus_tcp.map_as_csv(shown, rows, ("a/x", "a/on", "a/fixed", "a/none")).splitlines()[1:]
+    assert lines == [
+        "holding,0,1,int16,big,big,0.1,1,a/x,mm,yes",
+        "input,0,1,int16,big,big,1,,a/x,mm,no",
+        "coil,0,1,bit,big,big,1,,a/on,mm,yes",
+        "holding,2,1,int16,big,big,1,,a/fixed,mm,no",
+        "holding,3,1,int16,big,big,1,,a/other,mm,no",
+        "holding,4,1,int16,big,big,1,,a/none,,no",
+    ]
+
+
+def test_values_are_rounded_to_registers_and_shown_with_the_digits_that_they_have() -> None:
+    assert Entry("a/x", 0, type="int16").registers(2.6) == [3]
+    assert Entry("a/x", 0, type="int16").registers(-2.6) == [0xFFFD]
+    assert Entry("a/x", 0).value(Entry("a/x", 0).registers(16777215)) == 16777215
+    assert type(Entry("a/x", 0).value([0x40E0, 0])) is int  # a point of whole numbers is written 7 and not 7.0
+    assert read_reply(1, 8 * [1]) == bytes.fromhex("01 01 ff")
+    assert read_reply(2, [0] * 9) == bytes.fromhex("02 02 00 00")
+    with pytest.raises(ValueError, match="inf"):
+        Entry("a/x", 0).value([0x7F80, 0])
+    assert automatic_map(map(str, range(32_768)), "float32", False).entries[-1].address == 65534
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("registers = [1]", "there is no [[registers]]"),
+        ("registers = []", "there is no [[registers]]"),
+        (MAP.replace("status = 2", "scale = inf"), "scale is a number that is not 0"),
+    ],
+)
+def test_a_map_of_something_else_is_no_map(tmp_path: Path, text: str, complaint: str) -> None:
+    with pytest.raises(InvalidCommand, match=re.escape(complaint)):
+        read_map(written(tmp_path, text))
+    (tmp_path / "map.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(InvalidCommand, match=r"map\.toml: "):
+        read_map(str(tmp_path / "map.toml"))
