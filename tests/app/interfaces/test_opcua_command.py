@@ -22,6 +22,7 @@ from busmaster.app.interfaces import opcua
 from busmaster.app.interfaces.opcua import read_trusted
 from busmaster.app.interfaces.opcua_access import Rules
 from busmaster.emulator.serve import TcpServer
+from busmaster.errors import InvalidCommand
 from tests.app.cli.conftest import Command, busmaster, owner, serve, started
 from tests.app.interfaces.opcua_client import other_client
 from tests.patience import PATIENCE
@@ -150,7 +151,21 @@ def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:
     folder = tmp_path / "trusted"
     for name in ("first", "second"):
         certificate(folder, name)
-    assert len(read_trusted(str(folder))) == 2
+    trusted = read_trusted(str(folder))
+    assert len(trusted) == 2
+    for number, der in enumerate(trusted):  # in the other form, under any name
+        pem = x509.load_der_x509_certificate(der).public_bytes(serialization.Encoding.PEM)
+        (folder / f"{number}").write_bytes(pem)
+    assert read_trusted(str(folder)) == trusted
+
+
+def test_a_folder_without_a_certificate_or_with_something_else_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidCommand, match="has no certificate, so no client could connect"):
+        read_trusted(str(tmp_path))
+    for content in (b"a note", b"-----BEGIN CERTIFICATE-----"):
+        (tmp_path / "note").write_bytes(content)
+        with pytest.raises(InvalidCommand, match=r"note is not a certificate; .* is for those of trusted clients"):
+            read_trusted(str(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 from asyncua import ua
+from asyncua.common.utils import ServiceError
 
 from busmaster.app.interfaces.opcua_access import Rules, Users
 from busmaster.app.interfaces.opcua_terms import (
     CODES,
+    is_beyond,
     range_of,
     status_of_sample,
     status_of_write,
+    time_of,
     type_of,
     unit_of,
     variant_of,
@@ -27,6 +31,7 @@ from busmaster.errors import (
     GarbledReply,
     InvalidCommand,
     LineDown,
+    LineNoisy,
     NodeDown,
     NoReply,
     NoSuchParameter,
@@ -55,6 +60,7 @@ def sample(error: BusError | None, quality: Quality) -> Sample[Any]:
         (NodeDown("x"), Quality.BAD, CODES.BadNoCommunication),
         (LineDown("x"), Quality.BAD, CODES.BadNoCommunication),
         (GarbledReply("x"), Quality.BAD, CODES.BadCommunicationError),
+        (LineNoisy("x"), Quality.BAD, CODES.BadCommunicationError),
         (Refused("x"), Quality.BAD, CODES.BadDeviceFailure),
         (NoSuchParameter("x"), Quality.BAD, CODES.BadConfigurationError),
         (BusError("x"), Quality.BAD, CODES.BadNoCommunication),
@@ -119,6 +125,38 @@ def test_the_range_of_a_point_is_what_may_be_written_else_its_limits_of_alarm() 
     assert limits(1, 2, name="force", minimum=None, maximum=5) == (1, 2)
     assert limits(1, 2, name="another", minimum=-5, maximum=5) == (1, 2)
     assert limits(None, 2) is None
+    assert limits(float("-inf"), 2) is None
+    assert limits(1, 2, name="force", minimum=-5, maximum=float("inf")) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("value", "beyond"),
+    [
+        (5, False),
+        (-5, False),
+        (5.1, True),
+        (-5.1, True),
+        ((1, 2), False),
+        ((1, 6), True),
+        ((-6, 1), True),
+        ("x", False),
+    ],
+)
+def test_a_value_is_beyond_the_limits_for_writes_of_its_own_point_alone(value: Any, beyond: bool) -> None:
+    limits = [
+        {"name": "force", "minimum": -5, "maximum": None},
+        {"name": "force", "minimum": None, "maximum": 5},
+        {"name": "another", "minimum": 1000, "maximum": 1000},
+    ]
+    assert is_beyond({"low": 0, "high": 1, "limits": limits}, "force", value) is beyond
+
+
+def test_lists_and_times_are_as_opcua_has_them() -> None:
+    numbers = variant_of((1, 2.5), KINDS.Double)
+    assert (numbers.Value, numbers.VariantType) == ([1.0, 2.5], KINDS.Double)
+    assert variant_of((1, 2), KINDS.Int64).Value == [1, 2]
+    assert variant_of("x", KINDS.String).Value == "x"
+    assert time_of(86_400.5) == datetime(1970, 1, 2, 0, 0, 0, 500_000, UTC)
 
 
 def test_who_may_write_is_who_shows_a_token_where_there_are_tokens_or_others_may_come() -> None:
@@ -143,6 +181,7 @@ def test_who_says_things_openly_or_is_not_trusted_is_not_let_in() -> None:
     with_tokens = Users(Rules(is_signed=True, secrets={"scada": digest_of(TOKEN)}))
     assert with_tokens.get_user(None, "scada", TOKEN) is None
     assert with_tokens.get_user(None, "scada", TOKEN, b"own") is not None
+    assert Users(Rules(trusted=[])).get_user(None, certificate=b"own") is None, "nobody is trusted"
     trusting = Users(Rules(is_signed=True, trusted=[b"own"]))
     assert trusting.get_user(None, certificate=b"another") is None
     assert trusting.get_user(None, certificate=b"own") is not None
@@ -153,3 +192,21 @@ def test_what_may_be_written_is_what_is_named() -> None:
     assert [rules.may_be_written(key) for key in ("winder/force", "drive7/speed", "winder/forces", "drive7/mode")] == [
         *(True, True, False, False),
     ]
+
+
+def test_a_client_that_guesses_is_slowed_down_and_each_failure_is_reported() -> None:
+    failed: list[str] = []
+    users = Users(Rules(secrets={"scada": digest_of(TOKEN)}), failed.append)
+    users.peer = "10.0.0.1"
+
+    def guess() -> None:
+        for number in range(100):
+            assert users.get_user(None, "scada", f"wrong {number}") is None
+
+    with pytest.raises(ServiceError) as raised:
+        guess()
+    assert raised.value.code == CODES.BadServerTooBusy
+    assert set(failed) == {"10.0.0.1"}
+    assert len(failed) >= 1
+    users.peer = "10.0.0.2"
+    assert users.get_user(None, "scada", TOKEN) is not None
