@@ -7,29 +7,45 @@ import json
 import os
 import socket
 import threading
+import time
 from math import inf
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import httpx2 as httpx
 import pytest
 from jsonschema import Draft202012Validator
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Hcp2Controller, MicroFlexDrive
-from busmaster.app.interfaces import audience, following
+from busmaster.app.interfaces import audience, following, web
 from busmaster.app.interfaces.audience import MOST_EXCHANGES, Seat
-from busmaster.app.interfaces.web import PAGE, serving
+from busmaster.app.interfaces.following import Lost
+from busmaster.app.interfaces.guard import Guard
+from busmaster.app.interfaces.web import PAGE, application, serving
 from busmaster.app.outputs.history import History, HistoryFile, PastSample
 from busmaster.app.outputs.settings import SqliteSettings
 from busmaster.app.outputs.sqlite import SqliteOutput
 from busmaster.app.service.permission import Access, Permission, digest_of
+from busmaster.app.service.picture import Row
 from busmaster.app.service.rights import Role
 from busmaster.bounds import HISTORY_THREADS, LONGEST_COMMAND, MOST_HISTORY
 from busmaster.bus.limits import Limit
-from busmaster.errors import InvalidCommand
+from busmaster.errors import (
+    BacklogFull,
+    BusClosed,
+    GarbledReply,
+    InvalidCommand,
+    LineDown,
+    NoReply,
+    NotStarted,
+    Refused,
+)
 from busmaster.registry import kinds
 from tests.app.interfaces.lines import HERE, ONE, READS, Page, Past, assert_goes_on_alone, page, poll, shows
+from tests.app.interfaces.test_following import Remote, connected, row, shown_frame
 from tests.app.service.lines import Served, served, until
 from tests.patience import PATIENCE
 
@@ -645,3 +661,216 @@ async def test_a_request_with_two_lengths_is_refused_and_its_connection_closed(t
         assert "connection: close" in answer.lower()
         assert answer.count("HTTP/1.1") == 1
         assert "must not have both" in answer
+
+
+# without a server, beside an owner that the test plays
+
+
+class Overview:
+    """What an owner knows of its points, and what becomes of writes to them."""
+
+    def __init__(self) -> None:
+        self.writes: list[tuple[str, str, Any]] = []
+        self.error: Exception | None = None
+
+    async def details(self, _group: str, key: str) -> dict[str, Any]:
+        return {"command": f"read {key}"}
+
+    async def write(self, *what: Any) -> None:
+        self.writes.append(what)
+        if self.error is not None:
+            raise self.error
+
+
+class Local:
+    """The page of a line whose owner the test plays, requested without a connection."""
+
+    def __init__(self, *rows: Row, secrets: dict[str, bytes] | None = None, history: Past | None = None) -> None:
+        self.overview = Overview()
+        self.line = connected(Remote())
+        self.line._overview = cast("Any", self.overview)
+        self.line.picture._rows = {0: list(rows or (row(value=7, writable=True),))}
+        self.line.picture.frame = shown_frame(events=((90.0, "winder is down"),))
+        self.reports: list[str] = []
+        guarded = application(self.line, Guard(HERE, secrets or {}), self.reports.append, history)
+        self.client = httpx.AsyncClient(transport=httpx.ASGITransport(app=guarded), base_url="http://localhost")
+
+    async def get(self, path: str) -> Any:
+        answer = await self.client.get(f"/api/{path}")
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    async def put(self, body: bytes = b'{"value": 1}', **headers: str) -> httpx.Response:
+        headers = {"content-type": "application/json"} | {key.replace("_", "-"): text for key, text in headers.items()}
+        return await self.client.put("/api/points/axes/winder/10", content=body, headers=headers)
+
+
+@pytest.mark.asyncio
+async def test_times_of_the_line_are_times_of_day_and_none_while_they_are_unknown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(following, "time", SimpleNamespace(time=lambda: 1000.0))
+    of = Local(row(value=7, asked=95.0), row(item="11", asked=None, quality=""))
+    of.line.picture.rows[0].past.append((94.0, 6))
+    assert await of.get("events") == [{"time": 990.0, "text": "winder is down"}]
+    assert [one["time"] for one in await of.get("points")] == [995.0, None]
+    one = await of.get("points/axes/winder/10")
+    assert (one["past"], one["details"]) == ([[994.0, 6]], {"command": "read winder/10"})
+    assert (await of.get("line"))["since"] is None
+    of.line.picture.frame = shown_frame(state="offline", why="unplugged", since=80.0)
+    said = await of.get("line")
+    assert (said["connected"], said["since"], said["why"]) == (True, 980.0, "unplugged")
+    of.line._remote = None
+    assert [one["time"] for one in await of.get("points")] == [None, None]
+    of.line.state = Lost("gone", since=900.0)
+    said = await of.get("line")
+    assert (said["connected"], said["since"], said["why"]) == (False, 900.0, "gone")
+
+
+@pytest.mark.asyncio
+async def test_a_point_of_two_groups_is_found_by_its_group() -> None:
+    of = Local(row(value=7), row(group="slow", value=8))
+    assert [(await of.get(f"points/{group}/winder/10"))["value"] for group in ("axes", "slow")] == [7, 8]
+
+
+@pytest.mark.parametrize(
+    ("of_owner", "of_interface", "read_only"), [(False, False, False), (True, False, True), (False, True, True)]
+)
+@pytest.mark.asyncio
+async def test_it_is_read_only_if_its_owner_or_the_interface_is(
+    of_owner: bool, of_interface: bool, read_only: bool
+) -> None:
+    of = Local()
+    of.line.picture.frame = shown_frame(read_only=of_owner)
+    of.line._read_only = of_interface
+    assert (await of.get("line"))["read_only"] is read_only
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        (b'{"value": 1}', "application/json; charset=utf-8", 200),
+        (b'{"value": 1}', "Application/JSON", 200),
+        (b'{"value": 1}'.ljust(LONGEST_COMMAND), "application/json", 200),
+        (b'{"value": 1}'.ljust(LONGEST_COMMAND + 1), "application/json", 413),
+        (b'{"value": true}', "application/json", 200),
+        (b'{"value": "jog"}', "application/json", 200),
+        (b'{"value": 1, "more": 2}', "application/json", 400),
+        (b'["value"]', "application/json", 400),
+    ],
+)
+@pytest.mark.asyncio
+async def test_a_body_is_a_value_as_json_of_at_most_its_bound(body: bytes, kind: str, status: int) -> None:
+    of = Local()
+    assert (await of.put(body, content_type=kind)).status_code == status
+    assert len(of.overview.writes) == (status == 200)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (InvalidCommand("above its maximum"), 400),
+        (Refused("refused"), 409),
+        (BacklogFull("full"), 503),
+        (NotStarted("busy"), 503),
+        (LineDown("lost"), 503),
+        (BusClosed("closed"), 503),
+        (NoReply("no reply"), 504),
+        (GarbledReply("garbled"), 502),
+    ],
+)
+@pytest.mark.asyncio
+async def test_a_write_that_fails_has_the_status_of_its_error_and_is_reported(error: Exception, status: int) -> None:
+    of = Local()
+    of.overview.error = error
+    answer = await of.put()
+    assert (answer.status_code, answer.json()["error"]) == (status, type(error).__name__)
+    assert answer.json()["what"] == str(error)
+    assert of.reports == [f"winder/10 = 1, from a page from 127.0.0.1: {error}"]
+
+
+@pytest.mark.asyncio
+async def test_who_guesses_tokens_is_told_how_many_whole_seconds_to_wait() -> None:
+    of = Local(secrets={"hmi": digest_of(TOKEN)})
+    said = await of.get("line")
+    assert (said["wants_token"], said["read_only"], said["history"]) == (True, False, False)
+    assert (await of.put()).status_code == 401
+    for _ in range(100):
+        answer = await of.put(authorization="Bearer wrong")
+        if answer.status_code != 401:
+            break
+    assert answer.status_code == 429
+    assert int(answer.headers["retry-after"]) >= 1
+    assert of.overview.writes == []
+    assert (await of.put(authorization=f"Bearer {TOKEN}")).status_code == 429
+    of = Local(secrets={"hmi": digest_of(TOKEN)})
+    assert (await of.put(authorization=f"Bearer {TOKEN}")).status_code == 200
+    assert of.reports == ["winder/10 = 1, from token hmi from 127.0.0.1: written"]
+
+
+@pytest.mark.asyncio
+async def test_history_is_requested_in_the_unit_of_the_point_for_the_last_hour_unless_it_has_a_range() -> None:
+    past = Past(History(labels=(("1", "jog"),)))
+    of = Local(row(unit="mm"), history=past)
+    before = time.time()
+    found = await of.get("history/axes/winder/10?limit=10000")
+    [(key, unit, begin, end, limit)] = past.requests
+    assert (key, unit, limit) == ("winder/10", "mm", 10_000)
+    assert end - begin == pytest.approx(3600)
+    assert before <= end <= time.time()
+    assert (found["unit"], found["labels"]) == ("mm", {"1": "jog"})
+    assert (await of.get("line"))["history"]
+
+
+@pytest.mark.asyncio
+async def test_pages_beyond_the_bound_are_refused_until_another_one_has_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "MOST_PAGES", 1)
+    async with page(tmp_path) as of:
+        for _ in range(2):
+            stream = await joined(of)
+            await hear(stream, "state")
+            with pytest.raises(InvalidStatus, match="403"):
+                await stream_of(of)
+            await stream.close()
+
+
+async def joined(of: Page) -> ClientConnection:
+    """A page's stream, as soon as there is a place for it."""
+    while True:
+        try:
+            return await stream_of(of)
+        except InvalidStatus:
+            await asyncio.sleep(0.001)
+
+
+@pytest.mark.asyncio
+async def test_the_page_of_a_proxy_is_served_with_its_history_and_its_writes_are_reported() -> None:
+    line = connected(Remote())
+    line._overview = cast("Any", Overview())
+    line.picture._rows = {0: [row(value=7, writable=True)]}
+    line.picture.frame = shown_frame()
+    urls: asyncio.Queue[str] = asyncio.Queue()
+    reports: list[str] = []
+
+    async def follow() -> None:
+        await asyncio.Event().wait()
+
+    line.follow = follow  # type: ignore[method-assign,assignment]
+    secrets = {"hmi": digest_of(TOKEN)}
+    serving_it = asyncio.ensure_future(
+        web.serve(line, HERE, secrets, ("plant.example",), urls.put_nowait, reports.append, Past())
+    )
+    async with httpx.AsyncClient(base_url=await urls.get(), timeout=PATIENCE, trust_env=False) as client:
+        headers = {"Host": "plant.example", "Authorization": f"Bearer {TOKEN}"}
+        answer = await client.get("/api/line", headers=headers)
+        assert (answer.status_code, answer.json()["history"]) == (200, True)
+        assert "server" not in answer.headers
+        answer = await client.put("/api/points/axes/winder/10", json={"value": 1}, headers=headers)
+        assert answer.status_code == 200
+        answer = await client.get("/page/page.js")
+        assert answer.status_code == 200
+    assert reports == ["winder/10 = 1, from token hmi from 127.0.0.1: written"]
+    serving_it.cancel()
+    await asyncio.gather(serving_it, return_exceptions=True)
