@@ -366,12 +366,19 @@ async def test_while_a_line_is_being_connected_nothing_is_written_and_its_values
             await asyncio.Event().wait()
 
     monkeypatch.setattr(following, "connect", Slow)
-    line = Following(lambda: "unix:x", clean=lambda value: f"clean {value}")
+    cleaned: list[Any] = []
+
+    def clean(decoded: Any) -> Any:
+        cleaned.append(decoded)
+        return dict(decoded)
+
+    line = Following(lambda: "unix:x", clean=clean)
     before = time.time()
     following_it = asyncio.ensure_future(line.follow())
     await entered.wait()
     assert line.is_connected
-    assert line.picture.rows[0].value == "clean x"
+    assert line.picture.rows[0].value == "x"
+    assert [sorted(decoded) for decoded in cleaned] == [["first", "rows", "set"], ["first", "set", "values"]]
     with pytest.raises(NotStarted, match="is not there: its program is being connected"):
         await line.write("g", "5/1", 1)
     with pytest.raises(LineDown, match="its program is being connected"):

@@ -243,7 +243,7 @@ async def test_a_read_that_is_not_supported_is_refused_beside_others_that_are(cl
     reads = [wanted(), wanted(part="0:1"), wanted(encoding="Default Binary"), wanted(encoding="Default XML")]
     results = await session.read(ua.ReadParameters(NodesToRead=reads))
     assert names(results) == ["Good", "BadIndexRangeInvalid", "Good", "BadDataEncodingUnsupported"]
-    assert (results[0].Value.Value, results[1].Value) == (1.0, None)
+    assert (results[0].Value.Value, results[1].Value.Value) == (1.0, None)
     for age, code in ((0.0, ""), (1000.0, ""), (-1.0, "BadMaxAgeInvalid"), (math.nan, "BadMaxAgeInvalid")):
         assert await code_of(session.read(ua.ReadParameters(age, NodesToRead=reads))) == code
 

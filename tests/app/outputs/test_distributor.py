@@ -299,8 +299,10 @@ async def test_of_outputs_that_are_replaced_each_gets_each_cycle_and_event_once(
         after = listed(outputs)
         await Node.of(Hcp2Controller(bus, 6)).probe()
         async with asyncio.timeout(PATIENCE):
-            while any(len(output.cycles) < 2 for output in after.values()):  # noqa: ASYNC110  nothing reports it
-                await asyncio.sleep(0.001)
+            while any(len({item.group for item in of.items if isinstance(item, Snapshot)}) < 2 for of in after.values()):
+                one.demand()
+                two.demand()
+                await asyncio.sleep(0.01)
     await outputs.close()
     assert list(after) == ["kept", "changed"]
     assert after["kept"] is before["kept"]

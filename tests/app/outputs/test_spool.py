@@ -99,6 +99,7 @@ def test_a_spool_has_its_mode_and_survives_a_loss_of_power_at_once_if_it_is_stri
 
 def test_a_spool_that_cannot_be_opened_is_an_error_in_words_and_leaves_no_file_open(tmp_path: Path) -> None:
     (tmp_path / "spool").mkdir()
+    gc.collect()
     before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(InvalidCommand) as raised:
         spool_at(tmp_path, 100)
@@ -108,7 +109,7 @@ def test_a_spool_that_cannot_be_opened_is_an_error_in_words_and_leaves_no_file_o
     with pytest.raises(InvalidCommand, match="contains the stored values of csv; use another file for mqtt"):
         spool_at(tmp_path, 100, "mqtt")
     gc.collect()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(os.listdir("/proc/self/fd")) <= before
 
 
 # with an output
