@@ -299,7 +299,9 @@ async def test_of_outputs_that_are_replaced_each_gets_each_cycle_and_event_once(
         after = listed(outputs)
         await Node.of(Hcp2Controller(bus, 6)).probe()
         async with asyncio.timeout(PATIENCE):
-            while any(len({item.group for item in of.items if isinstance(item, Snapshot)}) < 2 for of in after.values()):
+            while any(
+                len({item.group for item in of.items if isinstance(item, Snapshot)}) < 2 for of in after.values()
+            ):
                 one.demand()
                 two.demand()
                 await asyncio.sleep(0.01)
