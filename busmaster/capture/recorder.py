@@ -200,7 +200,7 @@ class Recorder:
             self._file_ended = False
 
     def _resume(self) -> None:
-        """Retry what has failed: a flush of the old file proves nothing about the next one."""
+        """Retry the failed step: a flush of the old file proves nothing about the next one."""
         if self._files.full:
             self._begin_next()
         else:

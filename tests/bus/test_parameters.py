@@ -391,6 +391,7 @@ def test_parameters_are_counted_each_once_and_known_by_any_form_of_their_item() 
         ModbusUnit(Bus(MemoryPort(Line(ModbusUnit.profile.line))), 17).parameters()
 
 
+@pytest.mark.slow
 def test_a_set_has_a_bounded_number_of_parameters() -> None:
     unit = ModbusUnit(Bus(MemoryPort(Line(ModbusUnit.profile.line))), 17)
     assert len(unit.parameters(["coil:0:20000"])) == 20_000

@@ -104,7 +104,7 @@ class Described:
 
 def described(command: click.Command, name: str = "") -> Described:
     """What a command says of itself."""
-    top = click.Context(cli, info_name="busmaster")
+    top = click.Context(cli, info_name="busmaster", **cli.context_settings)
     context = click.Context(command, top, info_name=name) if name else top
     usage = " ".join(command.collect_usage_pieces(context))
     text = inspect.cleandoc(command.help or "")
@@ -143,7 +143,7 @@ def _said(option: click.Option, context: click.Context) -> str:
 
 def commands(group: click.Group = cli, before: str = "") -> Iterator[Described]:
     """Every command, in the order of the help; those of a group behind it, as `params save`."""
-    context = click.Context(group)
+    context = click.Context(group, **group.context_settings)
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         assert command is not None

@@ -28,8 +28,8 @@ PORT_KEY = re.compile(r"^(port = )(\d{4,5})$", re.MULTILINE)
 NUMBER = r"(?<![\d.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
 OWN_BINDS = {
     name: str(option.default)
-    for name in cli.list_commands(click.Context(cli))
-    if (command := cli.get_command(click.Context(cli), name)) is not None
+    for name in cli.list_commands(click.Context(cli, **cli.context_settings))
+    if (command := cli.get_command(click.Context(cli, **cli.context_settings), name)) is not None
     for option in command.params
     if option.name == "bind"
 }

@@ -155,7 +155,7 @@ def said_of_busmaster(page: Path) -> list[str]:
 def test_commands_that_a_page_names_have_the_options_that_it_gives_them(page: Path) -> None:
     for text in said_of_busmaster(page):
         name, *words = text.split()
-        context = click.Context(cli)
+        context = click.Context(cli, **cli.context_settings)
         command = cli if name.startswith("-") else cli.get_command(context, name)
         if isinstance(command, click.Group) and command is not cli and words:
             command = command.get_command(context, words[0])

@@ -39,11 +39,11 @@ def test_all_libraries_that_are_missing_are_named(
 def test_installed_interfaces_are_listed_by_name_and_replace_no_command(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [EntryPoint(name, "nowhere:command", app.INTERFACES) for name in ("zinc", "read", "alloy")]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: entries if group == app.INTERFACES else [])
-    assert cli.list_commands(click.Context(cli)) == [*COMMANDS, "alloy", "zinc"]
+    assert cli.list_commands(click.Context(cli, **cli.context_settings)) == [*COMMANDS, "alloy", "zinc"]
 
 
 def test_completion_has_the_line_of_each_command() -> None:
-    offered = {item.value: item.help for item in cli.shell_complete(click.Context(cli), "re")}
+    offered = {item.value: item.help for item in cli.shell_complete(click.Context(cli, **cli.context_settings), "re")}
     assert offered == {name: COMMANDS[name] for name in ("read", "replay")}
 
 

@@ -29,11 +29,13 @@ from busmaster.transport.tcp import TcpPort
 from tests.app.cli.conftest import Command
 
 HCP2 = find("hcp2").profile
+TOP = click.Context(cli, **cli.context_settings)
+"""click keeps the names of the help option of the first context in which a command is used."""
 
 
 @pytest.fixture
 def context() -> Iterator[click.Context]:
-    with click.Context(read) as context:
+    with click.Context(read, TOP) as context:
         yield context
 
 
@@ -183,9 +185,9 @@ def test_beside_a_file_only_options_that_do_not_describe_its_line_are_permitted(
     command: click.Command | None = cli
     for part in name.split():
         assert isinstance(command, click.Group)
-        command = command.get_command(click.Context(cli), part)
+        command = command.get_command(TOP, part)
     assert command is not None
-    for option in command.get_params(click.Context(command)):
+    for option in command.get_params(click.Context(command, TOP)):
         if not isinstance(option, click.Option) or "--help" in option.opts:
             continue
         given = [option.opts[0], *([] if option.is_flag else ["1"])]

@@ -89,7 +89,7 @@ def promised(name: str) -> set[str]:
 
 def found(name: str) -> Iterator[str]:
     """The same words, of the command as it is."""
-    context = click.Context(cli)
+    context = click.Context(cli, **cli.context_settings)
     command: click.Command | None = cli
     for part in name.split():
         assert isinstance(command, click.Group)
@@ -107,7 +107,10 @@ def found(name: str) -> Iterator[str]:
 
 
 def test_the_commands_are_those_that_are_promised() -> None:
-    found = {name: cli.get_command(click.Context(cli), name) for name in cli.list_commands(click.Context(cli))}
+    found = {
+        name: cli.get_command(click.Context(cli, **cli.context_settings), name)
+        for name in cli.list_commands(click.Context(cli, **cli.context_settings))
+    }
     groups = {name: list(group.commands) for name, group in found.items() if isinstance(group, click.Group)}
     assert {*found, *(f"{name} {one}" for name, names in groups.items() for one in names)} == set(PROMISED)
     assert set(kinds()) >= SPOKEN

@@ -368,6 +368,7 @@ def test_a_misspelt_option_behind_a_number_is_not_a_number(busmaster: Command) -
     assert "no such option '--wihtin'" in ran.err
 
 
+@pytest.mark.slow
 def test_a_reply_in_json_has_the_node_by_the_name_of_the_file_and_the_names_of_bits(
     busmaster: Command, file: Path, drive: TcpServer
 ) -> None:

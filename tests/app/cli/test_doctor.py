@@ -414,6 +414,7 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("hasty")
 @pytest.mark.filterwarnings("default:.*RTS is switched by software")
 @pytest.mark.parametrize(

@@ -176,6 +176,7 @@ async def test_a_click_selects_the_row_under_it_wherever_the_table_is_scrolled_t
             assert screen.table.selected.name.split() == second[:3]
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_keys_move_the_selection_by_a_row_a_page_or_to_an_end() -> None:
     async with drawn(tell(Picture(), *(row(number) for number in range(1, 41))), (60, 20)) as (screen, _, pilot):
@@ -243,6 +244,7 @@ async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
         assert "trouble" in lines(screen)[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_an_empty_filter_shows_all_rows_again_and_escape_keeps_the_filter() -> None:
     async with drawn(tell(Picture(), *three_drives())) as (screen, _, pilot):
@@ -333,6 +335,7 @@ async def test_points_beyond_those_that_are_shown_are_counted() -> None:
         assert " 7 points more than are shown" in "\n".join(lines(screen))
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_help_shows_what_q_does_here_and_each_of_its_keys_opens_and_closes_it() -> None:
     async with drawn(tell(Picture(), row()), leave="end the run") as (screen, _, pilot):
@@ -498,6 +501,7 @@ async def test_it_is_said_what_became_of_a_write() -> None:
         assert "node 5 outputs = 2: no reply within 100 ms" in "\n".join(lines(screen))
 
 
+@pytest.mark.slow
 @pytest.mark.asyncio
 async def test_the_dialog_of_a_write_shows_the_unit_and_why_a_value_is_none() -> None:
     async with drawn(tell(Picture(), row(unit="mm"))) as (screen, line, pilot):

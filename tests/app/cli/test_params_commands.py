@@ -90,6 +90,7 @@ def test_only_the_named_items_are_saved(busmaster: Command, controllers: TcpServ
     assert "exists and is not overwritten" in again.err
 
 
+@pytest.mark.slow
 def test_a_node_of_a_file_is_saved_and_compared_in_the_units_of_its_points(
     busmaster: Command, file: Path, three_controllers: TcpServer, tmp_path: Path
 ) -> None:
@@ -240,6 +241,7 @@ def test_an_interrupted_save_reports_how_many_it_has_and_continues_with_the_othe
 # loading
 
 
+@pytest.mark.slow
 def test_a_set_is_loaded_into_a_node_of_a_file_and_each_write_is_in_the_audit_log(
     busmaster: Command, file: Path, three_controllers: TcpServer, tmp_path: Path
 ) -> None:

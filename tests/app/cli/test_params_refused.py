@@ -53,6 +53,7 @@ CASES: Mapping[str, tuple[str, Start, Held, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", CASES)
 def test_a_drive_in_operation_is_refused_unless_that_is_permitted(
     busmaster: Command, tmp_path: Path, protocol: str

@@ -109,6 +109,7 @@ def test_only_some_silent_nodes_are_tried_and_only_those_that_the_protocol_can_h
     assert tried == [("near", address) for address in range(scan.STRANGERS)]
 
 
+@pytest.mark.slow
 def test_what_replies_in_another_protocol_is_reported(
     busmaster: Command, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,7 @@ def test_points_of_an_owned_line_are_read_over_its_owner(
     assert connected == [service.address]
 
 
+@pytest.mark.slow
 def test_the_values_of_a_run_are_on_one_line_each_with_the_precision_of_the_point(
     busmaster: Command, tmp_path: Path
 ) -> None:
@@ -149,6 +150,7 @@ def test_what_is_sent_on_the_line_of_a_file_is_recorded(
         assert len(list(read_packets(file))) >= 2
 
 
+@pytest.mark.slow
 def test_a_node_without_a_reply_ends_a_read_with_its_error(
     busmaster: Command, points: Path, three_controllers: TcpServer
 ) -> None:
@@ -226,6 +228,7 @@ def test_points_of_a_file_are_written_through_the_owner_which_keeps_the_record(
     assert rows == [("service",)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("owned", [False, True])
 @pytest.mark.parametrize("named", ["PORT", "FILE"])
 def test_a_value_that_does_not_read_back_is_found_only_with_verify(
@@ -330,6 +333,7 @@ def test_a_poll_ends_with_the_owner_of_its_line_and_reports_why(
     assert "no live view of another program's line here, showing plain lines; use busmaster top" in ran.err
 
 
+@pytest.mark.slow
 def test_a_trend_through_the_owner_samples_each_point_at_its_period_and_ends_by_itself(
     busmaster: Command, points: Path, three_controllers: TcpServer
 ) -> None:
@@ -632,6 +636,7 @@ def test_a_line_that_is_read_only_takes_no_write_of_a_program(
 # what is printed of a write
 
 
+@pytest.mark.slow
 def test_each_item_of_a_write_is_printed_and_listed_in_json(
     busmaster: Command, three_controllers: TcpServer, tmp_path: Path
 ) -> None:
@@ -780,6 +785,7 @@ def test_the_options_of_a_read_reach_each_item(
     assert requested == [("1.17", {}), ("1.18", {})]
 
 
+@pytest.mark.slow
 def test_the_decimals_of_a_write_are_those_of_each_item(busmaster: Command, mentor: TcpServer) -> None:
     node = (mentor.path, "--protocol", "mentor", "--node", "12")
     ran = busmaster("write", *node, "1.17=1.5", "1.18:2=2.5,3.5", "--decimals", "1")

@@ -601,6 +601,7 @@ def test_a_plot_takes_the_terminal_and_gives_it_back(capsys: pytest.CaptureFixtu
     assert left.endswith("\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plain", "as_json", "terminal", "drawn"),
     [(False, False, True, True), (True, False, True, False), (False, True, True, False), (False, False, False, False)],

@@ -185,6 +185,7 @@ def test_a_run_ends_with_its_screen(busmaster: Command, file: Path, terminal: Te
     assert "the terminal was closed" not in ran.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [("--plain",), ("--json",)])
 def test_a_run_prints_each_group_and_reports_where_it_is_served_only_to_a_service(
     busmaster: Command, file: Path, ctrl_c_after: Callable[[int], None], options: tuple[str, ...]

@@ -97,6 +97,7 @@ def test_a_spool_has_its_mode_and_survives_a_loss_of_power_at_once_if_it_is_stri
     assert (tmp_path / "spool").stat().st_mode & 0o777 == 0o604
 
 
+@pytest.mark.slow
 def test_a_spool_that_cannot_be_opened_is_an_error_in_words_and_leaves_no_file_open(tmp_path: Path) -> None:
     (tmp_path / "spool").mkdir()
     gc.collect()

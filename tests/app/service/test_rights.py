@@ -76,6 +76,7 @@ def test_a_role_that_changes_holds_for_the_next_read(tmp_path: Path) -> None:
     as_role(tmp_path, Role.READ, story)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", Role)
 @pytest.mark.parametrize(
     ("step", "beyond"),
