@@ -194,3 +194,16 @@ def test_r9_line_time_that_the_owner_used_long_ago_is_not_counted_against_it_bes
         desk.ask(client(desk, WRITER), 500, URGENT)
     owners_part(desk, 16)
     assert owners_part(desk, 100) >= 0.45
+
+
+def test_r9_a_user_that_connects_again_has_the_line_time_that_it_had_used() -> None:
+    desk = Desk()
+    first = client(desk, WRITER, user="one")
+    account = first.account
+    desk.arbiter.remove_client(first)
+    assert client(desk, WRITER, user="one").account is account
+    without = client(desk, WRITER)
+    account = without.account
+    desk.arbiter.remove_client(without)
+    assert client(desk, WRITER).account is not account
+

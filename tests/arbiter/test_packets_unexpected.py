@@ -276,3 +276,26 @@ def test_bytes_that_begin_no_packet_get_no_ack_on_an_idle_line() -> None:
     line.hear("00 55")
     line.wait(1.0)
     assert line.sent() == ""
+
+
+def test_r3_an_ack_that_leaves_late_delays_the_end_of_the_silence() -> None:
+    waited = []
+    for late in (0.0, 0.05):
+        line = bench()
+        node = line.node(1, msc.PROFILE)
+        line.wait(1.0)
+        line.ask(node, msc.DataRead(2008), retries=0)
+        line.sent()
+        line.hear("00", after=0.3)
+        line.until_sent()
+        line.sent()
+        line.hear(REPLY_1234, after=0.1)
+        assert line.sent() == ACK
+        acknowledged = line.now
+        line.now += late
+        line.arbiter.transmitted(line.now)
+        line.ask(node, msc.DataRead(2008))
+        line.until_sent()
+        waited.append(line.now - acknowledged)
+    assert waited[1] - waited[0] == pytest.approx(0.05)
+
