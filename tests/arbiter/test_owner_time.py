@@ -206,4 +206,3 @@ def test_r9_a_user_that_connects_again_has_the_line_time_that_it_had_used() -> N
     account = without.account
     desk.arbiter.remove_client(without)
     assert client(desk, WRITER).account is not account
-

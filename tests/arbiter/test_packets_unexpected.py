@@ -298,4 +298,3 @@ def test_r3_an_ack_that_leaves_late_delays_the_end_of_the_silence() -> None:
         line.until_sent()
         waited.append(line.now - acknowledged)
     assert waited[1] - waited[0] == pytest.approx(0.05)
-

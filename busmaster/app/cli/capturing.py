@@ -96,4 +96,5 @@ def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = F
     if recorder.error is not None:
         note(f"capture stopped: {recorder.path}: {recorder.error.strerror}")
     if recorder.dropped:
-        note(f"the capture lacks {recorder.dropped} events, which could not be written in time")
+        events = "1 event" if recorder.dropped == 1 else f"{recorder.dropped} events"
+        note(f"the capture lacks {events} that could not be written in time")

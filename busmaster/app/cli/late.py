@@ -50,7 +50,7 @@ class LateNodes:
 
 def advice(age: float, *, in_file: bool = False) -> str:
     """Return advice for a node with a reply after `age` seconds: an option, or a key of LINE.toml if `in_file`."""
-    window = math.ceil(ROOM * age / STEP) * STEP
+    window = math.ceil(round(ROOM * age / STEP, 6)) * STEP  # 0.2 s times 1.5 is a little more than 0.3 s in floats
     what = (
         f"set timing = {{ window = {window:g} }} in its section of the file"
         if in_file

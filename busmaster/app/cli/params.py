@@ -361,8 +361,13 @@ def load_command(
 
 
 def default_undo(path: str) -> str:
-    """Return the name of a file beside a set for what a load of it overwrites."""
-    return f"{path.removesuffix('.toml')}.undo-{datetime.now(UTC):%Y%m%dT%H%M%S}.toml"
+    """Return the name of a new file beside a set for what a load of it overwrites."""
+    stem = f"{path.removesuffix('.toml')}.undo-{datetime.now(UTC):%Y%m%dT%H%M%S}"
+    path, number = f"{stem}.toml", 1
+    while os.path.exists(path):  # a set can be loaded into several nodes within a second
+        number += 1
+        path = f"{stem}-{number}.toml"
+    return path
 
 
 async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabled: bool, undo: str, node: str) -> int:

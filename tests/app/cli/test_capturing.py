@@ -124,8 +124,11 @@ def test_a_file_that_exists_is_kept_and_the_other_name_is_printed(
     assert capfd.readouterr().err == f"busmaster: {path} exists; the capture goes to {recorder.path}\n"
 
 
-def test_events_that_are_not_in_the_capture_are_counted(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("count", "events"), [(1, "1 event"), (2, "2 events")])
+def test_events_that_are_not_in_the_capture_are_counted(
+    count: int, events: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     with capturing(str(tmp_path / "line.pcapng"), port="COM1") as recorder:
         assert recorder is not None
-        recorder.dropped = 1
-    assert capfd.readouterr().err == ("busmaster: the capture lacks 1 events, which could not be written in time\n")
+        recorder.dropped = count
+    assert capfd.readouterr().err == f"busmaster: the capture lacks {events} that could not be written in time\n"

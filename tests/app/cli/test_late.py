@@ -100,6 +100,7 @@ def node(address: int) -> Any:
 def test_the_advice_is_a_window_half_as_long_again_in_steps_of_50_ms() -> None:
     assert advice(0.13) == "late reply, 130 ms after the request; try --timeout 200"
     assert advice(0.19) == "late reply, 190 ms after the request; try --timeout 300"
+    assert advice(0.2) == "late reply, 200 ms after the request; try --timeout 300"
     assert advice(0.21, in_file=True) == (
         "late reply, 210 ms after the request; set timing = { window = 0.35 } in its section of the file"
     )

@@ -9,6 +9,7 @@ import re
 import sqlite3
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, closing
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -583,6 +584,17 @@ def test_the_line_of_a_file_is_recorded_as_the_file_describes_it(
 def test_the_old_values_are_saved_beside_the_set_with_the_time() -> None:
     assert re.fullmatch(r"/sets/one\.undo-\d{8}T\d{6}\.toml", params.default_undo("/sets/one.toml"))
     assert re.fullmatch(r"one\.undo-\d{8}T\d{6}\.toml", params.default_undo("one"))
+
+
+def test_a_set_can_be_loaded_into_several_nodes_within_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(params, "datetime", SimpleNamespace(now=lambda zone: datetime(2026, 11, 27, 8, 5, tzinfo=zone)))
+    stem = str(tmp_path / "one.undo-20261127T080500")
+    for expected in (f"{stem}.toml", f"{stem}-2.toml", f"{stem}-3.toml"):
+        undo = params.default_undo(str(tmp_path / "one.toml"))
+        assert undo == expected
+        Path(undo).touch()
 
 
 def test_a_port_may_have_the_sign_that_separates_it_from_the_node() -> None:
