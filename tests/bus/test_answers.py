@@ -16,7 +16,7 @@ NODE: Any = "node 1"
 
 def batch(first: int, *values: float, started: float = 1.0) -> Answer:
     """The reply to a run of parameters, each of which is a point of the group."""
-    points = [Point(NODE, f"1.{first + i}", Read(1, first + i)) for i in range(len(values))]
+    points: list[Point[Any]] = [Point(NODE, f"1.{first + i}", Read(1, first + i)) for i in range(len(values))]
     return Answer(
         NODE, ReadRun(1, first, len(values)), [(point, i) for i, point in enumerate(points)], list(values), started
     )
