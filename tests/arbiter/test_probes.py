@@ -373,3 +373,14 @@ def test_r15_one_nak_to_a_read_that_is_not_repeated_strikes_it_not_from_those_th
     bench.arbiter.cancel(read, bench.now)
     bench.hear(NAK, after=0.004)
     assert read.command in [*record.sync_reads()]
+
+
+def test_r11_free_probes_are_counted_for_their_node_too() -> None:
+    bench = Bench()
+    record = dead(bench)
+    before = record.counters.probes
+    for _ in range(3):
+        bench.until_sent()
+        bench.sent()
+        bench.wait(MAX_REPLY_DELAY)
+    assert record.counters.probes == before + 3

@@ -61,6 +61,41 @@ def test_warnings_go_to_standard_error_and_are_no_problems(busmaster: Command, p
     assert "warning: nothing is polled" in checked.err
 
 
+def test_the_second_table_of_a_kind_is_reported_too(busmaster: Command, path: Path) -> None:
+    path.write_text(
+        """\
+port = "/dev/nothing-is-there?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 500
+[nodes.unwinder]
+protocol = "hcp2"
+address = 501
+[nodes.cutter]
+protocol = "hcp2"
+address = 5
+points.speed = { item = "1", precision = -1 }
+points.force = { item = "2", precision = -2 }
+actions.slow = { "1" = 1, odd = 2 }
+actions.fast = { "1" = 2, odd = 3 }
+[groups.axes]
+period = -1
+points = ["cutter/speed"]
+[groups.forces]
+period = -2
+points = ["cutter/force"]
+[outputs.mqtt]
+buffer = -1
+[outputs.csv]
+buffer = -2
+"""
+    )
+    checked = busmaster("check", str(path))
+    assert checked.status == 1
+    lines = {int(line.split(":")[1]) for line in checked.lines[:-1]}
+    assert {4, 7, 11, 12, 16, 19, 22, 24} <= lines, checked.out
+
+
 @pytest.fixture
 def reported(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
     """What is printed on standard error. Each file has a problem and two warnings."""
@@ -94,6 +129,14 @@ def test_json_has_each_warning_and_fails_as_the_text_does(busmaster: Command, pa
 def test_completion_of_the_schema_option_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     check.command.make_context("check", ["--schema"], resilient_parsing=True).close()
     assert capsys.readouterr().out == ""
+
+
+def test_json_of_a_file_with_warnings_only_is_ok(busmaster: Command, path: Path) -> None:
+    path.write_text(GOOD.partition("[groups")[0])
+    checked = busmaster("check", str(path), "--json")
+    found = json.loads(checked.out)
+    assert (checked.status, found["ok"]) == (0, True)
+    assert found["warnings"]
 
 
 def test_json_has_problems_with_file_line_and_key_and_warnings(busmaster: Command, path: Path) -> None:
