@@ -180,11 +180,13 @@ VALUES: list[tuple[str, str, dict[str, Any]]] = [
         node(
             "msc",
             1,
-            "address_step = 4\nsymbols = { count = 2008, cam = 3000 }\npoints = { count = { factor = 0.001 } }",
-            "values = { count = 1.25, cam = [5, -6, 7], 'flag:5-6' = true, status = 72 }",
+            "address_step = 4\nsymbols = { count = 2008, cam = 3000, sizes = 4000 }\n"
+            "points = { count = { factor = 0.001 }, lengths = { item = 'sizes:2', factor = 0.1 } }",
+            "values = { count = 1.25, cam = [5, -6, 7], lengths = [0.5, 1.5], 'flag:5-6' = true, status = 72 }",
         ),
         "msc",
-        {"count": 1.25, "cam:3": (5, -6, 7), "3004": -6, "flag:5": True, "flag:6": True, "flag:7": False, "status": 72},
+        {"count": 1.25, "cam:3": (5, -6, 7), "3004": -6, "flag:5": True, "flag:6": True, "flag:7": False, "status": 72}
+        | {"lengths": (0.5, 1.5), "4004": 15},
     ),
     (
         node("mentor", 14, "points.ref = { item = '1.17', decimals = 1 }", "values = { ref = -47.6, '7.05' = 9 }"),
