@@ -128,6 +128,7 @@ def test_r9_a_program_with_thousands_of_requests_delays_anothers_by_two_exchange
             await asyncio.gather(flooding.read(1), asking.read(1))
             flooder, asker = payer(asked[0]), payer(asked[1])
             assert flooder is not asker
+            await asking.write(1, -1)  # the first write of a line waits for a maximum reply delay, reads do not
             flood = [asyncio.ensure_future(flooding.read(1)) for _ in range(MANY)]
             await until(lambda: ext.line_statistics(line.bus).backlog > MOST_UNDER_WAY / 2)
             for number in range(20):
