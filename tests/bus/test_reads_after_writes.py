@@ -18,6 +18,7 @@ from busmaster.bus.snapshots import Outdated, ReadAfterWrite, Snapshot
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.errors import WriteUnconfirmed
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 
@@ -242,3 +243,18 @@ def test_a_write_to_all_nodes_is_not_followed_by_reads() -> None:
             assert [(type(one), one[point].quality) async for one in changes] == [(Outdated, Quality.STALE)]
 
     run_in_virtual_time(run())
+
+
+def test_all_points_that_a_write_makes_stale_are_read_in_each_group() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        points = [point_of(bus, item, read_after_write=True) for item in ("10", "11", "12")]
+        first, second = await polled(bus, *points[:2]), await polled(bus, *points[2:], name="second")
+        await settle()
+        # It is not known what the command of a handle changes, so all points of its node are stale.
+        await Hcp2Controller(bus, 5).node.request(hcp2.Write(10, (7.0,)))
+        await settle()
+        assert bus._reads_after_writes.read == 3
+        assert [held(first, point)[1] for point in points[:2]] == [Quality.GOOD] * 2
+        assert held(second, points[2])[1] is Quality.GOOD
+
+    on_a_line(story)

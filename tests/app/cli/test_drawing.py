@@ -8,14 +8,19 @@ import signal
 import subprocess
 import sys
 import termios
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import anyio
 import pytest
 
+from busmaster import Bus, Hcp2Controller, MemoryPort
 from busmaster.app.cli import drawing
-from busmaster.app.cli.drawing import LEAVE_SCREEN, draw, end_view, restore_terminal, terminal_state
+from busmaster.app.cli.drawing import LEAVE_SCREEN, draw, end_view, restore_terminal, served_here, terminal_state
+from busmaster.app.service.authorisation import Authorisation
+from busmaster.emulator.line import Line
+from tests.patience import PATIENCE
 
 
 class Process:
@@ -68,6 +73,44 @@ def test_a_view_that_does_not_end_is_killed() -> None:
     assert prompt.done == ["terminate"]
     assert deaf.done == ["terminate", "kill"]
     assert deaf.returncode == -9
+
+
+@pytest.mark.asyncio
+async def test_a_view_that_is_cancelled_is_ended_before_the_terminal_is_given_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Running(Process):
+        """A view that runs until it is terminated."""
+
+        def __init__(self) -> None:
+            super().__init__(-signal.SIGTERM)
+            self.ended = threading.Event()
+
+        def wait(self, timeout: float | None = None) -> int:
+            self.ended.wait(PATIENCE)
+            return super().wait()
+
+        def terminate(self) -> None:
+            super().terminate()
+            self.ended.set()
+
+    view = Running()
+    given_back: list[object] = []
+    monkeypatch.setattr(subprocess, "Popen", lambda command: view)
+    monkeypatch.setattr(drawing, "terminal_state", lambda: ["as before"])
+    monkeypatch.setattr(drawing, "restore_terminal", lambda before: given_back.append((before, view.done.copy())))
+    async with anyio.create_task_group() as group:
+        group.start_soon(draw, "unix:/a")
+        await anyio.wait_all_tasks_blocked()
+        group.cancel_scope.cancel()
+    assert given_back == [(["as before"], ["terminate"])]
+
+
+@pytest.mark.asyncio
+async def test_a_view_of_a_line_that_is_not_shared_has_the_title_of_the_file() -> None:
+    line = Line(Hcp2Controller.profile.line, [], paced=False)
+    async with Bus(MemoryPort(line)) as bus, served_here(Authorisation(bus), "Slitter 2") as service:
+        assert service.line.title == "Slitter 2"
 
 
 @pytest.fixture

@@ -122,6 +122,18 @@ def test_what_is_said_of_a_range_of_nodes_a_table_of_one_goes_before() -> None:
     assert found == [(100, 5), (100, 6), (100, 5)]
 
 
+def test_what_the_file_says_of_all_nodes_is_so_for_those_without_a_table_of_their_own_too() -> None:
+    text = (
+        f'{HEAD}[nodes.d4-6]\nprotocol = "mentor"\naddress = "14-16"\n'
+        "[emulator]\nlively = false\nreply_delay = 0.03\nfaults = { lost = 0.1, late = 0.2 }\n"
+        "[emulator.nodes.d5]\nfaults = { lost = 0.5 }\n"
+    )
+    drives = emulated_line(read(Source("line.toml", text))).devices
+    assert [(drive.faults.lost, drive.faults.late) for drive in drives] == [(0.1, 0.2), (0.5, 0.2), (0.1, 0.2)]
+    assert len({id(drive.faults) for drive in drives}) == 3  # those of one can be changed while it is emulated
+    assert [drive.delay.low for drive in drives] == [0.03] * 3
+
+
 def test_a_microflex_in_torque_mode_refuses_a_speed_and_takes_a_torque() -> None:
     drive = device_of(node("microflex", 7, emulated="current_control = true\nlively = false"))
     assert drive.writable(116)
