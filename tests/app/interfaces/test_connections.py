@@ -121,6 +121,21 @@ async def test_a_connection_that_became_a_pages_waits_for_no_request_and_is_not_
         end[1].transport.abort()
 
 
+@pytest.mark.asyncio
+async def test_a_connection_that_ends_before_its_request_no_longer_waits_for_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crowds: list[Crowd] = []
+    monkeypatch.setattr(connections.Crowd, "protocols", _noted(crowds))
+    async with page(tmp_path) as of:
+        end = await end_of(of.url)
+        await until(lambda: len(crowds[0]._waiting) == 1)
+        [connection] = crowds[0]._waiting
+        end[1].transport.abort()
+        await until(lambda: not crowds[0]._waiting)
+        assert connection._request is None
+
+
 @pytest.mark.slow
 @pytest.mark.asyncio
 async def test_a_client_that_does_not_read_its_replies_is_let_go(
