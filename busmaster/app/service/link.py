@@ -11,7 +11,7 @@ from typing import Any
 
 from busmaster.app.service.client_messages import CancelParams, HelloParams
 from busmaster.app.service.connection import OutgoingConnection, check_installed
-from busmaster.app.service.failures import error_of
+from busmaster.app.service.failures import START_OWNER, error_of
 from busmaster.app.service.folder import socket_path
 from busmaster.app.service.messages import (
     VERSIONS,
@@ -238,7 +238,7 @@ class Link:
     def lost(self) -> None:
         """End all requests, because the connection is over."""
         if self._connection is not None and self._connection.owner_ended:
-            self._end(LineDown, ENDED, "start it, and connect again")
+            self._end(LineDown, ENDED, START_OWNER)
         self._end(LineDown, GONE, AGAIN)
 
     # inside

@@ -11,7 +11,7 @@ from typing import Any
 from busmaster import Priority
 from busmaster.app.service.client_messages import RequestParams, SafeParams, WriteParams
 from busmaster.app.service.client_requests import BY_OWNER, ClientRequest, RequestSender, Writing, client_request_of
-from busmaster.app.service.failures import REFUSED, refusal_of
+from busmaster.app.service.failures import REFUSED, START_OWNER, refusal_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import Malformed, encode_value
 from busmaster.app.service.safe import SafeResult
@@ -89,7 +89,10 @@ class Requests:
         for number, request in list(self._under_way.items()):
             if request is not None:
                 request.cancel(BY_OWNER)
-                self._refuse(number, _unreported(request, BusClosed, "the program that owns the line ends"))
+                error = _unreported(request, BusClosed, "the program that owns the line ends")
+                if isinstance(error, BusClosed):
+                    error.hint = START_OWNER  # its own is for the program that has closed its bus
+                self._refuse(number, error)
 
     async def give_up(self) -> None:
         """Cancel all requests, and return when they have ended. The safe state continues."""
