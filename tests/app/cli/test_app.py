@@ -65,6 +65,10 @@ def test_wrong_usage_refers_to_the_help_of_its_command(busmaster: Command) -> No
     assert busmaster("items").err.endswith("; see busmaster items --help\n")
 
 
+def test_a_mistyped_option_has_its_suggestion_and_no_reference_to_the_help(busmaster: Command) -> None:
+    assert busmaster("read", "PORT", "--protocl", "hcp2").err.endswith("did you mean '--protocol'?\n")
+
+
 def test_version_of_a_tree_that_is_not_installed(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(_: str) -> str:
         raise importlib.metadata.PackageNotFoundError

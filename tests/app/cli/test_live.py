@@ -12,7 +12,7 @@ from rich.cells import cell_len
 from textual.pilot import Pilot
 
 from busmaster.app.cli import live
-from busmaster.app.cli.live import Screen
+from busmaster.app.cli.live import Screen, keys_line
 from busmaster.app.cli.terminal import made_printable
 from busmaster.app.service.picture import Picture
 from busmaster.errors import InvalidCommand, LineDown, WriteUnconfirmed
@@ -678,3 +678,10 @@ async def test_nothing_that_the_owner_says_is_obeyed_by_a_terminal() -> None:
             shown = "".join(lines(screen))
             assert shown.isprintable()
             assert r"\u001b[2J" in shown
+
+
+@pytest.mark.parametrize("leave", ["leave", "end the run"])
+def test_the_line_of_keys_shows_what_leaving_does_here(leave: str) -> None:
+    shown = keys_line(200, leave, "").plain
+    assert f"q {leave}  " in shown
+    assert shown.count(leave) == 1
