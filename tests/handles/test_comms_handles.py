@@ -106,6 +106,15 @@ async def test_priority_and_idempotence_are_handed_on(controller: CommsHandle, l
 
 
 @pytest.mark.asyncio
+async def test_an_element_can_be_given_by_its_number_as_text(controller: CommsHandle, line: CommsArray) -> None:
+    await controller.write("7", 12.5, 13.5)
+    assert await controller.read("7") == await controller.read(7) == 12.5
+    assert await controller.read("7", 2) == (12.5, 13.5)
+    with pytest.raises(InvalidCommand, match="no such item '7x'"):
+        await controller.read("7x")
+
+
+@pytest.mark.asyncio
 async def test_a_number_is_a_point(controller: CommsHandle, line: CommsArray) -> None:
     point = controller.point("7")
     await point.write(2.5)

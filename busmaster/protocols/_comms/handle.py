@@ -31,6 +31,11 @@ LONGEST_HANDOVER = 2.0
 """Seconds for which a command holds the line: three exchanges, each with its retries."""
 
 
+def _number_or_name(item: int | str) -> int | str:
+    """Return an element's number, also of one that is given as decimal text, or else its name."""
+    return int(item) if isinstance(item, str) and is_decimal(item) else item
+
+
 class CommsHandle(Handle):
     """A handle of a node with a comms array. Each protocol defines the commands and the names of the elements."""
 
@@ -52,9 +57,8 @@ class CommsHandle(Handle):
 
     def point(self, item: str) -> Point[Any]:
         """Return an element as a point, by its number, decimal, or by its name."""
-        if is_decimal(item_text(item)):
-            return self.element(int(item))
-        return self.named(self._lookup(item))
+        element = _number_or_name(item_text(item))
+        return self.element(element) if isinstance(element, int) else self.named(self._lookup(element))
 
     def element(self, number: int) -> Point[float]:
         """Return the point of an element number.
@@ -97,6 +101,7 @@ class CommsHandle(Handle):
 
         Raises Refused for an element that the node does not have.
         """
+        item = _number_or_name(item)
         number = item if isinstance(item, int) else self._lookup(item).number
         if count is None:
             return await self.node.request(self._read_command(number), **options)
@@ -126,6 +131,7 @@ class CommsHandle(Handle):
         Raises InvalidCommand for a value that cannot be sent or violates a limit; a `stop` is not limited. Also for a
         read-only name, or a list that reaches one. If the map is definite, this applies to numbers too.
         """
+        element = _number_or_name(element)
         number = element if isinstance(element, int) else self._lookup(element).number
         if self._definite or not isinstance(element, int):
             for known in self.elements.values():
@@ -139,9 +145,8 @@ class CommsHandle(Handle):
 
     def _prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Return the write of consecutive elements, in as many telegrams as necessary."""
-        element = int(item) if is_decimal(item) else item
-        self._writes(element, values, stop=options.get("safe"))
-        return [lambda: self.write(element, *values, **options)]
+        self._writes(item, values, stop=options.get("safe"))
+        return [lambda: self.write(item, *values, **options)]
 
     def _listed(self) -> Iterable[Parameter]:
         """Return the elements of the Mint program, if the map has them, then the named elements."""
