@@ -11,9 +11,9 @@ from busmaster.errors import BusError, InvalidCommand, Refused
 
 FIELDS = ("what", "line", "label", "address", "command", "attempts", "hint")
 DEEPEST = 5
-START_OWNER = "start it, and connect again"
-"""What a program can do when the program that owns the line has ended."""
 """Maximum number of causes of an error that are sent."""
+START_OWNER = "start it, and connect again"
+"""Advice for a program whose line has lost its owner."""
 REFUSED = (
     BusError,
     Malformed,
