@@ -415,7 +415,7 @@ async def test_a_write_is_not_sent_if_the_node_refuses_to_read_the_value_from_wh
 @in_virtual_time
 async def test_a_write_that_does_not_declare_its_changes_is_refused_by_a_node_with_limits() -> None:
     class Opaque:
-        """A write of an element, which does not declare what it changes."""
+        """A write of an element, which does not declare its changes."""
 
         writes, idempotent, open = True, False, hcp2.Write(11, (5.0,)).open
 

@@ -126,8 +126,13 @@ async def test_each_parameter_that_is_not_read_is_reported_with_its_reason_and_t
         saved = await drive.save_parameters(drive.parameters(["3:6"]), progress=found.append, by="ada")
     assert (list(saved.entries), saved.by) == (["3", "5", "6"], "ada")
     assert [(one.parameter.item, one.gap) for one in found] == [
-        ("3", False), ("4", False), ("5", False), ("6", False), ("7", True), ("8", True)
-    ]  # fmt: skip
+        ("3", False),
+        ("4", False),
+        ("5", False),
+        ("6", False),
+        ("7", True),
+        ("8", True),
+    ]
     assert found[1].why == "no reply within 200 ms, though the node replies to other reads"
     assert found[4].why
 
@@ -158,8 +163,10 @@ async def test_neighbouring_parameters_are_read_in_one_exchange_and_by_themselve
         assert Node.of(unit).statistics().attempts == 1
         beyond = await unit.save_parameters(unit.parameters(["holding:7:5"]))
         assert [(item, entry.value) for item, entry in beyond.entries.items()] == [
-            ("holding:7", 107), ("holding:8", 108), ("holding:9", 109)
-        ]  # fmt: skip
+            ("holding:7", 107),
+            ("holding:8", 108),
+            ("holding:9", 109),
+        ]
 
 
 @in_virtual_time
@@ -209,8 +216,10 @@ async def test_a_parameter_that_one_of_two_sets_does_not_have_differs() -> None:
     first = replace(saved, entries={item: saved.entries[item] for item in ("4", "5")})
     second = changed(replace(saved, entries={item: saved.entries[item] for item in ("5", "6")}), p5=9)
     assert [(one.parameter.item, one.one, one.other) for one in drive.differences(first, second)] == [
-        ("4", 0, None), ("5", 0, 9), ("6", None, 0)
-    ]  # fmt: skip
+        ("4", 0, None),
+        ("5", 0, 9),
+        ("6", None, 0),
+    ]
 
 
 @in_virtual_time
@@ -225,8 +234,9 @@ async def test_a_load_states_why_it_does_not_write_a_parameter() -> None:
         described = [Parameter(item="6", access="read"), Parameter(item="7", kept="it is the address")]
         load = await drive.prepare_load(wanted, parameters=described, by="ada")
         assert [(change.parameter.item, change.before, change.value) for change in load.changes] == [
-            ("3", 0, 7), ("5", 0, 50)
-        ]  # fmt: skip
+            ("3", 0, 7),
+            ("5", 0, 50),
+        ]
         left = {one.parameter.item: (one.before, one.value, one.why, one.expected) for one in load.left}
         assert left["4"][2:] == (f"{drive.node.label}: 4 = 51 is above its maximum of 50", False)
         assert left["6"] == (0, 7, "it is read-only", True)

@@ -24,6 +24,10 @@ def attempt() -> Attempt:
     return Attempt("hcp2", 2, READ, hcp2.PROFILE.timings, transaction=1)
 
 
+def until_larger(path: Path, size: int) -> None:
+    until(lambda: path.stat().st_size > size)
+
+
 def test_an_exchange_is_on_disk_when_the_recorder_is_closed(tmp_path: Path) -> None:
     path = tmp_path / "line.pcapng"
     before = time.time()
@@ -86,7 +90,7 @@ def test_a_capture_of_a_silent_line_is_on_disk_before_it_is_closed(
         for _ in range(2):  # the silence is noticed each time
             size = path.stat().st_size
             tap.overheard(time.monotonic(), REQUEST)
-            until(lambda before=size: path.stat().st_size > before)  # type: ignore[misc]
+            until_larger(path, size)
     with path.open("rb") as file:
         packets = list(read_packets(file))
     assert [(packet.protocol, packet.frame, packet.outcome) for packet in packets] == [
@@ -115,7 +119,7 @@ def test_events_that_are_lost_are_counted_once_each(tmp_path: Path, monkeypatch:
             tap.received(time.monotonic(), b"\xff", None)
             size = path.stat().st_size
             tap.transmitted(time.monotonic(), REQUEST, attempt())
-            until(lambda before=size: path.stat().st_size > before)  # type: ignore[misc]
+            until_larger(path, size)
     with path.open("rb") as file:
         assert [packet.dropped for packet in read_packets(file) if packet.dropped] == [2, 3]
     assert path.read_bytes()[-16:-8] == (5).to_bytes(8, "little")

@@ -318,7 +318,7 @@ def test_only_floats_are_not_rounded_when_they_are_scaled() -> None:
 
 def test_of_several_values_that_no_coil_can_have_the_first_is_named() -> None:
     with pytest.raises(InvalidCommand, match="a coil is written 1 or 0, not 7"):
-        WriteCoils(0, (True, 7, 9))  # type: ignore[arg-type]
+        WriteCoils(0, (True, 7, 9))  # type: ignore[arg-type]  # a stand-in
 
 
 def test_a_reply_without_its_end_is_reported_with_its_length() -> None:

@@ -400,17 +400,39 @@ def test_errors_of_polls_and_of_calls_are_counted_too() -> None:
 
 def test_the_workload_of_a_report_is_what_was_wanted() -> None:
     report = bench(
-        "hcp2", [1], baud=9600, virtual=True, seconds=1, callers=2, every=0.5, period=0.25, priorities="urgent=3",
-        items=("7",), seed=5, delay=Delay(0.001, 0.003), faults=["lost=0"],
-    )  # fmt: skip
+        "hcp2",
+        [1],
+        baud=9600,
+        virtual=True,
+        seconds=1,
+        callers=2,
+        every=0.5,
+        period=0.25,
+        priorities="urgent=3",
+        items=("7",),
+        seed=5,
+        delay=Delay(0.001, 0.003),
+        faults=["lost=0"],
+    )
     assert report.workload == {
-        "nodes": [1], "seconds": 1, "callers": 2, "priorities": {"urgent": 3}, "every": 0.5, "period": 0.25,
-        "items": ["7"], "seed": 5,
-    }  # fmt: skip
+        "nodes": [1],
+        "seconds": 1,
+        "callers": 2,
+        "priorities": {"urgent": 3},
+        "every": 0.5,
+        "period": 0.25,
+        "items": ["7"],
+        "seed": 5,
+    }
     assert report.line == {
-        "protocol": "hcp2", "port": "emulated", "baudrate": 9600, "framing": "8N1", "virtual": True,
-        "reply_delay": [0.001, 0.003], "faults": ["lost=0"],
-    }  # fmt: skip
+        "protocol": "hcp2",
+        "port": "emulated",
+        "baudrate": 9600,
+        "framing": "8N1",
+        "virtual": True,
+        "reply_delay": [0.001, 0.003],
+        "faults": ["lost=0"],
+    }
     assert set(report.priorities) == {"urgent"}
 
 

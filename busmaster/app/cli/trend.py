@@ -125,7 +125,7 @@ class How(NamedTuple):
     plain: bool
     span: float
     csv_path: str | None
-    in_file: bool = False
+    in_file: bool
 
 
 # the sampled items

@@ -89,10 +89,10 @@ class Requests:
         for number, request in list(self._under_way.items()):
             if request is not None:
                 request.cancel(BY_OWNER)
-                error = _unreported(request, BusClosed, "the program that owns the line ends")
-                if isinstance(error, BusClosed):
-                    error.hint = START_OWNER  # its own is for the program that has closed its bus
-                self._refuse(number, error)
+                # The advice of BusClosed is for the program that has closed its bus.
+                self._refuse(
+                    number, _unreported(request, BusClosed, "the program that owns the line ends", START_OWNER)
+                )
 
     async def give_up(self) -> None:
         """Cancel all requests, and return when they have ended. The safe state continues."""
@@ -134,11 +134,11 @@ class Requests:
             self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
 
 
-def _unreported(request: ClientRequest, kind: type[BusError], what: str) -> BusError:
-    """Return the error for a request whose result is unknown: `kind`, unless it may have written."""
+def _unreported(request: ClientRequest, kind: type[BusError], what: str, hint: str | None = None) -> BusError:
+    """Return the error for a request whose result is unknown: `kind` with `hint`, unless it may have written."""
     if request.command.writes and request.sent:
-        kind = WriteUnconfirmed
-    return kind(what, node=request.node, command=str(request.command))
+        kind, hint = WriteUnconfirmed, None
+    return kind(what, node=request.node, command=str(request.command), hint=hint)
 
 
 def _is_urgent(params: RequestParams | WriteParams) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from rich.text import Text
 
 from busmaster.app.cli.cells import (
     age_text,
@@ -122,9 +123,9 @@ def test_the_gauge_line_counts_disconnects_and_names_a_line_that_takes_no_writes
     assert both.plain.endswith("2 queued  2 disconnects  read-only")
 
 
-def styles(line: object) -> dict[str, str]:
+def styles(line: Text) -> dict[str, str]:
     """The style of each part of a line that has one."""
-    return {line.plain[span.start : span.end].strip(): str(span.style) for span in line.spans}  # type: ignore[attr-defined]
+    return {line.plain[span.start : span.end].strip(): str(span.style) for span in line.spans}
 
 
 def test_a_load_that_leaves_no_room_and_a_lost_line_stand_out() -> None:

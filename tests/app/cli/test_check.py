@@ -98,7 +98,7 @@ buffer = -2
 
 @pytest.fixture
 def reported(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
-    """What is printed on standard error. Each file has a problem and two warnings."""
+    """The lines on standard error. Each file has a problem and two warnings."""
     notes: list[tuple[str, Level]] = []
     problem = FileError("line.toml", 0, "", "the port is missing")
     monkeypatch.setattr(check, "check", lambda path: Report((problem,), ("nothing is polled", "no output")))

@@ -132,7 +132,7 @@ def test_position_velocity_speed_and_torque_are_polled() -> None:
 
 
 class Watched:
-    """What was shown."""
+    """The calls of the view."""
 
     def __init__(self) -> None:
         self.shown: list[str] = []

@@ -161,7 +161,7 @@ def test_a_port_that_is_not_there_is_an_error_of_the_line(busmaster: Command) ->
     assert "does not exist" in done.err
 
 
-# what is tried
+# steps of a search
 
 
 @pytest.mark.parametrize("port", ["/dev/ttyS0", "socket://server:4001", "rfc2217://server:4001"])
@@ -290,7 +290,7 @@ def test_a_file_that_appears_during_the_search_is_kept(
 
 
 class FakeSearch:
-    """A search with these results, which notes what it did."""
+    """A search with these results, which notes its steps."""
 
     talk = ""
     result = Discovery()

@@ -68,8 +68,8 @@ def test_only_a_person_ends_it_well_and_a_view_that_was_killed_does_not_keep_the
 
 def test_a_view_that_does_not_end_is_killed() -> None:
     prompt, deaf = Process(0), Process(-9, deaf=True)
-    end_view(prompt)  # type: ignore[arg-type]
-    end_view(deaf)  # type: ignore[arg-type]
+    end_view(prompt)  # type: ignore[arg-type]  # a stand-in
+    end_view(deaf)  # type: ignore[arg-type]  # a stand-in
     assert prompt.done == ["terminate"]
     assert deaf.done == ["terminate", "kill"]
     assert deaf.returncode == -9

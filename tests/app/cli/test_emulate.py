@@ -43,7 +43,7 @@ HCP2 = ("--protocol", "hcp2")
 
 @dataclass
 class Served:
-    """What was served: the line, where, and for how long."""
+    """The lines that were served, with their address and time."""
 
     line: Line
     link: str | None

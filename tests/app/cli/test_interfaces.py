@@ -1,4 +1,4 @@
-"""What the commands that open an interface share: the line that is meant, its token, and what is reported of it."""
+"""The common part of the commands that open an interface: their line, its token, and the reports of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from busmaster.errors import InvalidCommand, LineDown
 
 @pytest.fixture
 def notes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
-    """What is printed on standard error."""
+    """The lines on standard error."""
     found: list[tuple[str, Level]] = []
     monkeypatch.setattr(interfaces, "note", lambda text, level=Level.INFO: found.append((text, level)))
     return found

@@ -117,7 +117,7 @@ def test_each_node_that_is_late_has_its_advice_once_with_the_latest_reply(monkey
     ]
 
     async def story() -> None:
-        async with late_nodes(Late(happened), in_file=True) as found:  # type: ignore[arg-type]
+        async with late_nodes(Late(happened), in_file=True) as found:  # type: ignore[arg-type]  # a stand-in
             await asyncio.sleep(0)
             first = len(asyncio.all_tasks())
             found.print_advice()
@@ -140,7 +140,7 @@ def test_an_error_is_explained_by_the_reply_that_comes_after_it_and_reported_onl
 ) -> None:
     async def story() -> None:
         bus = Late([RepliesLate(node(1), 0.2, 0.1)])
-        async with late_nodes(bus) as found:  # type: ignore[arg-type]
+        async with late_nodes(bus) as found:  # type: ignore[arg-type]  # a stand-in
             error, other, nameless = NoReply("no reply"), NoReply("no reply"), NoReply("no reply")
             error.address, other.address = 1, 2
             for one in (error, other, nameless):
@@ -162,7 +162,7 @@ def test_events_of_the_last_moment_are_reported(capfd: pytest.CaptureFixture[str
                 yield RepliesLate(node(1), 0.2, 0.1)
                 await asyncio.Event().wait()
 
-        async with late_nodes(Quiet()):  # type: ignore[arg-type]
+        async with late_nodes(Quiet()):  # type: ignore[arg-type]  # a stand-in
             came.set()
 
     asyncio.run(story())

@@ -41,7 +41,7 @@ class Outputs:
 
 @pytest.fixture
 def notes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
-    """What is printed on standard error. Outputs have little time."""
+    """The lines on standard error. Outputs have little time."""
     found: list[tuple[str, Level]] = []
     monkeypatch.setattr(lines, "note", lambda text, level=Level.INFO: found.append((text, level)))
     monkeypatch.setattr(lines, "LOOK", 0.001)

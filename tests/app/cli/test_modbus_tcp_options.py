@@ -17,7 +17,7 @@ LINE = ("modbus-tcp", "unix:/nobody")
 
 
 class Served:
-    """What was served, and where."""
+    """The lines that were served, with their address."""
 
     rules: Rules
     listen: tuple[str, int]

@@ -214,8 +214,9 @@ async def test_of_several_failures_of_the_output_the_first_counts() -> None:
 
 @pytest.mark.asyncio
 async def test_bytes_that_may_have_waited_while_the_program_was_stopped_have_an_earlier_time() -> None:
-    clock, heard, tap = Clock(), list[Frame](), Tap()
-    listener = Listener(Decoder(find("hcp2").protocol.dialect()), heard.append, tap, clock)  # type: ignore[arg-type]
+    clock, heard = Clock(), list[Frame]()
+    tap: Any = Tap()
+    listener = Listener(Decoder(find("hcp2").protocol.dialect()), heard.append, tap, clock)
     clock.now += 0.01
     before = time.monotonic()
     listener.data_received(REQUEST)
@@ -263,8 +264,9 @@ async def test_the_port_is_closed_however_listening_ends() -> None:
             listener.connection_lost(None)
             return SimpleNamespace(close=lambda: closed.append(True))
 
+    port: Any = Port()
     with pytest.raises(LineDown):
-        await listen(Port(), Decoder(find("hcp2").protocol.dialect()), lambda _: None)  # type: ignore[arg-type]
+        await listen(port, Decoder(find("hcp2").protocol.dialect()), lambda _: None)
     assert closed == [True]
 
 

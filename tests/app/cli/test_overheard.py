@@ -231,9 +231,9 @@ def test_a_listener_takes_no_commands_from_any_output(tmp_path: Path) -> None:
     )
     file = load(path)
     outputs = silent(file).outputs
-    assert outputs["mqtt"].allow_commands == ()  # type: ignore[attr-defined]
+    assert outputs["mqtt"].allow_commands == ()  # type: ignore[attr-defined]  # of the subclass
     assert outputs["sqlite"] == file.outputs["sqlite"]
-    assert file.outputs["mqtt"].allow_commands  # type: ignore[attr-defined]
+    assert file.outputs["mqtt"].allow_commands  # type: ignore[attr-defined]  # of the subclass
 
 
 @pytest.mark.parametrize(
@@ -242,13 +242,13 @@ def test_a_listener_takes_no_commands_from_any_output(tmp_path: Path) -> None:
 )
 def test_a_listener_reads_the_one_protocol_of_the_file(kinds: list[str], protocol: str) -> None:
     nodes = {str(number): SimpleNamespace(protocol=kind) for number, kind in enumerate(kinds)}
-    assert only_protocol(SimpleNamespace(nodes=nodes)) == protocol  # type: ignore[arg-type]
+    assert only_protocol(SimpleNamespace(nodes=nodes)) == protocol  # type: ignore[arg-type]  # a stand-in
 
 
 def test_a_listener_reads_no_file_with_two_protocols() -> None:
     nodes = {str(number): SimpleNamespace(protocol=kind) for number, kind in enumerate(("mentor", "hcp2"))}
     with pytest.raises(InvalidCommand, match="one protocol per line, and the file has hcp2, mentor"):
-        only_protocol(SimpleNamespace(nodes=nodes))  # type: ignore[arg-type]
+        only_protocol(SimpleNamespace(nodes=nodes))  # type: ignore[arg-type]  # a stand-in
 
 
 FED = """
@@ -289,12 +289,12 @@ def test_each_group_is_fed_at_its_period_and_what_is_left_at_the_end_is_written_
             await anyio.lowlevel.checkpoint()
             tasks.start_soon(feed, line, overheard, shown.append)
             with anyio.fail_after(PATIENCE):
-                while len(overheard.groups) < 3:  # noqa: ASYNC110
+                while len(overheard.groups) < 3:  # noqa: ASYNC110  nothing reports it
                     await anyio.sleep(0.001)
                 for value in (4.0, 9.0):
                     overheard._deliver({points[0]: value, points[1]: value + 1}, time.monotonic())
                     count = len(shown)
-                    while {one.group for one in shown[count:]} != {"fast", "slow"}:  # noqa: ASYNC110
+                    while len({one.group for one in shown[count:]}) < 2:  # noqa: ASYNC110  nothing reports it
                         await anyio.sleep(0.001)
             tasks.cancel_scope.cancel()
 
@@ -369,7 +369,7 @@ def test_a_value_that_a_point_cannot_have_does_not_keep_the_others_from_being_he
 
     class Refusing:
         def value_of(self, raw: Any) -> Any:
-            raise GarbledReply("it is no value")
+            raise GarbledReply("it is not a value")
 
     overheard = Overheard(find("hcp2").protocol, [], lambda: 5.0)
     overheard.groups += [HeardGroup("more", 10.0, [a, b], 100.0), group]

@@ -520,7 +520,7 @@ def test_excluded_parameters_are_warnings_only_if_they_were_not_to_be_expected(
     monkeypatch.setattr(params, "note", lambda text, level=6: levels.append(level))
     left = [Left(Parameter(item="10"), 1, 2, "why", expected) for expected in (True, False)]
     plan: Any = SimpleNamespace(changes=(), left=left, equal=0)
-    params.print_plan(plan, SimpleNamespace(kind=find("hcp2"), label="node 1"))  # type: ignore[arg-type]
+    params.print_plan(plan, SimpleNamespace(kind=find("hcp2"), label="node 1"))  # type: ignore[arg-type]  # a stand-in
     assert levels == [6, 4, 6]
 
 

@@ -1,4 +1,4 @@
-"""The arguments of commands: which text is accepted, what it means, and what is refused."""
+"""The arguments of commands: which text is accepted, its meaning, and which text is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`busmaster run` in this process: what its options change, what a reload replaces, what it reports, how it ends."""
+"""`busmaster run` in this process: its options, reloads, reports and ends."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_the_status_is_how_the_run_was_ended_or_1_for_an_unconfirmed_safe_state(
 
 
 class Reports(list[tuple[str, Level]]):
-    """What is reported on standard error, each with its level."""
+    """The lines on standard error, each with its level."""
 
     def note(self, text: str, level: Level = Level.INFO) -> None:
         self.append((text, level))
@@ -180,7 +180,7 @@ def write(path: Path, text: str) -> None:
 
 
 class Manager:
-    """A service manager that keeps what it receives."""
+    """A service manager that keeps its messages."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
@@ -200,7 +200,7 @@ def on_a_run(file: Path, story: Story) -> Running:
     hangups = Hangups()
     running = Running(ConfiguredLine(load(file), wait_for_port=True), str(file), View(silent=True), hangups, None)
     running._manager.close()
-    running._manager = manager = Manager()  # type: ignore[assignment]
+    running._manager = manager = Manager()  # type: ignore[assignment]  # replaced here
 
     async def reload() -> None:
         count = len(manager.said)

@@ -1,4 +1,4 @@
-"""`busmaster safe` and the service of a line: what they report, and which keys of the file have an effect."""
+"""`busmaster safe` and the service of a line: their reports, and the keys of the file that have an effect."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from busmaster.events import LineChange, LineChanged, PortFailed
 
 @pytest.fixture
 def reported(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
-    """What is reported on standard error, each with its level."""
+    """The lines on standard error, each with its level."""
     found: list[tuple[str, Level]] = []
 
     def note(text: str, level: Level = Level.INFO) -> None:

@@ -1,4 +1,4 @@
-"""`busmaster scan`: what it makes of each reply, and which silent nodes it tries in other protocols."""
+"""`busmaster scan`: its report of each reply, and the silent nodes that it tries in other protocols."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Protocol:
 def others(
     monkeypatch: pytest.MonkeyPatch, silent: list[int], replying: int
 ) -> tuple[list[tuple[str, int]], list[str]]:
-    """Which nodes are tried in which protocol, and what is reported."""
+    """The nodes that are tried in each protocol, and the reports."""
     own = Protocol("own", range(256), shares=True)
     offered = [own, Protocol("far", range(256), shares=False), Protocol("near", range(100), shares=True)]
     tried: list[tuple[str, int]] = []

@@ -43,7 +43,7 @@ def test_a_sign_of_life_is_wanted_of_the_process_that_is_named(environment: dict
 
 
 class Line:
-    """What is known of a line: the exchanges so far, its poll groups, its nodes and its state."""
+    """A line with its exchanges so far, its poll groups, its nodes and its state."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.time = 100.0
@@ -122,7 +122,7 @@ def test_a_line_on_which_nothing_is_due_may_stand_still(
     assert goes_on_after(movement, line, 1.0) is expected
 
 
-# what is sent
+# messages
 
 
 @pytest.fixture

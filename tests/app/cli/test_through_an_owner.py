@@ -374,7 +374,7 @@ def test_status_prints_one_row_for_each_line_and_what_its_owner_refused(
 
 @pytest.fixture
 def owners(monkeypatch: pytest.MonkeyPatch) -> list[Owner]:
-    """The owners that there are."""
+    """The running owners."""
     found: list[Owner] = []
     for module in ("status", "top"):
         monkeypatch.setattr(f"busmaster.app.cli.{module}.owners", lambda: iter(found))
@@ -633,7 +633,7 @@ def test_a_line_that_is_read_only_takes_no_write_of_a_program(
         assert "read-only" in ran.err
 
 
-# what is printed of a write
+# the report of a write
 
 
 @pytest.mark.slow

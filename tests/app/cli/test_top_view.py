@@ -1,4 +1,4 @@
-"""`busmaster top` in this process: what it shows on a screen that draws nothing, and how it ends."""
+"""`busmaster top` in this process: its rows on a screen that draws nothing, and its end."""
 
 from __future__ import annotations
 

@@ -509,7 +509,7 @@ def test_samples_are_in_the_file_at_once_and_printed_too(tmp_path: Path, capsys:
 
 
 class Plotter:
-    """A plot that keeps what is drawn."""
+    """A plot that keeps its data."""
 
     def __init__(self) -> None:
         self.shown: list[tuple[str, str, list[tuple[float, float]]]] = []
@@ -623,7 +623,7 @@ def test_a_plot_is_drawn_on_a_terminal_unless_lines_are_wanted(
     async def story() -> int:
         bus = memory_bus()
         traces = traces_of(bus, "1/10", "2/10")
-        return await trend.trend(bus, traces, 0.05, 0.6, trend.How(as_json, plain, 0.3, None))
+        return await trend.trend(bus, traces, 0.05, 0.6, trend.How(as_json, plain, 0.3, None, False))
 
     assert anyio.run(story) == 0
     out, err = capsys.readouterr()
@@ -648,7 +648,7 @@ async def test_a_trend_has_values_if_any_point_has_one(monkeypatch: pytest.Monke
         monkeypatch.setattr(trend, "run", run)
         bus = memory_bus()
         traces = traces_of(bus, "1/10", "2/10")
-        assert await trend.trend(bus, traces, 0.1, 3.0, trend.How(False, True, 60.0, None)) == status
+        assert await trend.trend(bus, traces, 0.1, 3.0, trend.How(False, True, 60.0, None, False)) == status
 
 
 @in_virtual_time

@@ -1,4 +1,4 @@
-"""`poll` and `run` on a terminal, in this process: when a screen is drawn, what it replaces, and how it ends."""
+"""`poll` and `run` on a terminal, in this process: when a screen is drawn, the lines that it replaces, and its end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ POLL = ("--protocol", "hcp2", "--nodes", "1-2", "--items", "1,axis0.idle", "--pe
 
 
 class Terminal:
-    """Standard streams that are terminals, and what is drawn there."""
+    """Standard streams that are terminals, and the text on them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.drawn: list[str] = []
@@ -225,8 +225,8 @@ def watch_of(monkeypatch: pytest.MonkeyPatch, **view: Any) -> tuple[Watch, list[
     """A watch of no bus, and the events of its screen."""
     bus: Any = SimpleNamespace(now=lambda: 5.0, events=lambda: None)
     journal: list[str] = []
-    watch = Watch(bus, "test", View(**view), authorisation=SimpleNamespace())  # type: ignore[arg-type]
-    watch.service = SimpleNamespace(  # type: ignore[assignment]
+    watch = Watch(bus, "test", View(**view), authorisation=SimpleNamespace())  # type: ignore[arg-type]  # a stand-in
+    watch.service = SimpleNamespace(  # type: ignore[assignment]  # replaced here
         line=SimpleNamespace(journal=SimpleNamespace(note=journal.append))
     )
     return watch, journal

@@ -1232,7 +1232,7 @@ def test_the_values_follow_the_line_until_they_are_cancelled() -> None:
 
 
 class Given:
-    """The values of a line, and what is written to it."""
+    """The values of a line, and the writes to it."""
 
     def __init__(self, shown: RegisterMap, **values: tuple[Any, int]) -> None:
         self.map = shown
@@ -1279,7 +1279,7 @@ ENTRIES = (
 
 
 def answering(last: bool = False, **rules: Any) -> tuple[Given, Callable[..., bytes], list[str], list[tuple[str, str]]]:
-    """Values, what replies to a request for them, and what is reported and refused."""
+    """Values, the reply to a request for them, the reports and the refusals."""
     entries = [entry for entry in ENTRIES if entry.status is not None or not last]
     given = Given(RegisterMap.of(entries, last), x=(5, 0), y=(-2, 1), fixed=(1, 0), on=(1, 0), off=(0, 2), bad=(1, 0))
     reports: list[str] = []

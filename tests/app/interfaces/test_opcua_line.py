@@ -100,7 +100,7 @@ class Overview:
 
 
 class Story:
-    """A line, its owner, and what is shown of it."""
+    """A line, its owner, and the nodes that show it."""
 
     def __init__(self, *rows: Row, rules: Rules | None = None) -> None:
         self.owner = Owner()
@@ -467,14 +467,14 @@ async def test_a_line_is_shown_until_it_is_cancelled() -> None:
     async def begin() -> None:
         """Make nothing."""
 
-    story.shown.begin = begin  # type: ignore[attr-defined]
+    story.shown.begin = begin  # type: ignore[attr-defined]  # of the subclass
     running = asyncio.ensure_future(story.server.run())
     await story.server.has_points.wait()
     story.owner.groups["axes"].cycles.put_nowait(read_cycle(1.0))
     while "winder/1" not in story.shown.values:  # noqa: ASYNC110  nothing reports it
         await asyncio.sleep(0)
     story.line._receive_touched(touched("1", 100.5))
-    while story.shown.state("winder/1") != [(1.0, "UncertainLastUsableValue")]:  # noqa: ASYNC110
+    while story.shown.state("winder/1") != [(1.0, "UncertainLastUsableValue")]:  # noqa: ASYNC110  nothing reports it
         await asyncio.sleep(0)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
@@ -503,7 +503,7 @@ async def test_a_variable_has_the_type_of_its_values_and_keeps_its_value_while_i
     assert shown.kinds["p"] == (ua.VariantType.Double, False)
     assert shown.values["p"] == (1.5, CODES.UncertainLastUsableValue, 4.0)
     await variable.doubt()
-    assert len(shown.puts) == 4, "it is doubted already"
+    assert len(shown.puts) == 4, "it is uncertain already"
     await variable.put(2, CODES.Good, 5.0)
     await variable.doubt()
     assert shown.values["p"] == (2.0, CODES.UncertainLastUsableValue, 5.0)

@@ -46,7 +46,7 @@ class Clients:
                 data.attributes[attribute] = AttributeValue(ua.DataValue(value))
 
         async def dispatch(*_: object) -> None:
-            """Call nobody back."""
+            """Keep no callback."""
 
         self.server: Any = SimpleNamespace(
             callback_service=SimpleNamespace(dispatch=dispatch),
@@ -368,7 +368,7 @@ async def test_an_item_that_is_deleted_is_told_nothing_more(clients: Clients) ->
     assert not callbacks
 
 
-# who writes, and what is offered
+# writers, and the policies that are offered
 
 
 async def test_what_clients_write_is_handed_on_one_by_one_and_changes_nothing_here(clients: Clients) -> None:
@@ -392,7 +392,7 @@ async def test_what_clients_write_is_handed_on_one_by_one_and_changes_nothing_he
     assert value() == 1.0
     params.NodesToWrite = params.NodesToWrite[:1]
     assert names(await writes.write(params)) == ["Good"]
-    assert (value(), len(written)) == (5.0, 2), "the server itself writes what it shows"
+    assert (value(), len(written)) == (5.0, 2), "the server itself writes the values"
 
 
 class Guarded:

@@ -181,7 +181,7 @@ def test_who_says_things_openly_or_is_not_trusted_is_not_let_in() -> None:
     with_tokens = Users(Rules(is_signed=True, secrets={"scada": digest_of(TOKEN)}))
     assert with_tokens.get_user(None, "scada", TOKEN) is None
     assert with_tokens.get_user(None, "scada", TOKEN, b"own") is not None
-    assert Users(Rules(trusted=[])).get_user(None, certificate=b"own") is None, "nobody is trusted"
+    assert Users(Rules(trusted=[])).get_user(None, certificate=b"own") is None, "no certificate is trusted"
     trusting = Users(Rules(is_signed=True, trusted=[b"own"]))
     assert trusting.get_user(None, certificate=b"another") is None
     assert trusting.get_user(None, certificate=b"own") is not None

@@ -58,7 +58,7 @@ def refusals_of(owner: Owner, *kinds: str) -> ReportedRefusals:
 
 
 async def until_reported(owner: Owner) -> list[tuple[str, str, dict[str, int]]]:
-    """What is reported next."""
+    """The next reports."""
     await owner.got.wait()
     owner.got.clear()
     reported, owner.reported = owner.reported, []

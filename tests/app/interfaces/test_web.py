@@ -857,7 +857,7 @@ async def test_the_page_of_a_proxy_is_served_with_its_history_and_its_writes_are
     async def follow() -> None:
         await asyncio.Event().wait()
 
-    line.follow = follow  # type: ignore[method-assign,assignment]
+    line.follow = follow  # type: ignore[method-assign,assignment]  # replaced here
     secrets = {"hmi": digest_of(TOKEN)}
     serving_it = asyncio.ensure_future(
         web.serve(line, HERE, secrets, ("plant.example",), urls.put_nowait, reports.append, Past())

@@ -297,7 +297,7 @@ def test_another_reason_is_reported_while_an_output_is_down_and_the_same_one_is_
     def rest(seconds: float) -> None:
         tries.append(seconds)
 
-    output.rest = rest  # type: ignore[method-assign]
+    output.rest = rest  # type: ignore[method-assign]  # replaced here
     output.broken = OSError("full")
     offer(output, 1, 1)
     output.start()
@@ -326,7 +326,7 @@ def test_pauses_between_tries_are_doubled_up_to_a_bound_and_short_again_after_a_
         if len(pauses) in (7, 8):
             output.broken = None
 
-    output.rest = rest  # type: ignore[method-assign]
+    output.rest = rest  # type: ignore[method-assign]  # replaced here
     output.broken = OSError("gone")
     offer(output, 1, 1)
     output.start()
@@ -348,7 +348,7 @@ def test_an_output_that_is_ended_while_a_try_fails_tries_once_more() -> None:
     def shut() -> None:
         output.broken = None
 
-    output.shut = shut  # type: ignore[method-assign]
+    output.shut = shut  # type: ignore[method-assign]  # replaced here
     output.start()
     offer(output, 1, 1)
     until(lambda: not output._waiting)  # the thread has it, and is stuck

@@ -190,7 +190,7 @@ def test_an_output_is_another_one_if_its_settings_or_what_it_lets_others_write_d
 
 
 class Listed(Output):
-    """Keeps what it is offered. Its thread does nothing."""
+    """Keeps its items. Its thread does nothing."""
 
     order: ClassVar[list[str]] = []
 

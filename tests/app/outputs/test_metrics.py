@@ -305,7 +305,7 @@ async def never_opens(*_: object, **__: object) -> None:
 
 
 class Mode(Enum):
-    """A word that is no number itself."""
+    """A word that is not a number itself."""
 
     JOG = 2
 

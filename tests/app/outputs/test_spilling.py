@@ -341,13 +341,13 @@ def test_the_reasons_why_the_disk_takes_nothing_are_reported_each_once(tmp_path:
         values = 0
 
         def put(self, records: object) -> int:
-            list(records)  # type: ignore[call-overload]
+            list(records)  # type: ignore[call-overload]  # a wrong argument
             raise errors[-1]
 
         def close(self) -> None:
             pass
 
-    output._spool = Broken()  # type: ignore[assignment]
+    output._spool = Broken()  # type: ignore[assignment]  # replaced here
     errors.append(sqlite3.OperationalError("disk is full"))
     output.offer(cycle(1, 1))
     output.start()
@@ -405,7 +405,7 @@ def test_while_values_on_disk_are_sent_new_ones_go_behind_them(tmp_path: Path, m
             for _ in range(10):
                 again.offer(cycle(60, 60))
 
-    again.commit = committed  # type: ignore[method-assign]
+    again.commit = committed  # type: ignore[method-assign]  # replaced here
     again.start()
     until(lambda: again.written >= 50 and settled(again))
     again.close(PATIENCE)

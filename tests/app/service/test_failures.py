@@ -103,9 +103,9 @@ def test_an_error_without_a_class_is_the_owners() -> None:
 
 
 def test_an_exception_of_a_value_is_refused_with_its_method() -> None:
-    refused = refusal_of("write", TypeError("a list is no number"))
+    refused = refusal_of("write", TypeError("a list is not a number"))
     assert isinstance(refused, InvalidParams)
-    assert str(refused).startswith("write: TypeError: a list is no number; ")
+    assert str(refused).startswith("write: TypeError: a list is not a number; ")
     for error in (NoReply("x"), InvalidCommand("x"), Malformed("x")):
         assert refusal_of("write", error) is error
 

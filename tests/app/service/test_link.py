@@ -30,7 +30,7 @@ def _by_the_schema() -> None:
 
 
 class Way:
-    """A connection that keeps what is sent."""
+    """A connection that keeps its messages."""
 
     status, complaint, close_reason = None, None, ""
 
@@ -287,7 +287,7 @@ def test_a_program_that_was_not_admitted_gets_the_cause_and_what_to_do(
     link = Link("tcp://here", None, lambda *_: None, lambda: None)
     known = {"status": None, "refusal": "", "close_reason": "", "complaint": None}
     if connection is not None:
-        link._connection = SimpleNamespace(**{**known, **connection})  # type: ignore[assignment]
+        link._connection = SimpleNamespace(**{**known, **connection})  # type: ignore[assignment]  # replaced here
     shut = link._shut("here", error)
     assert shut is not None
     assert shut.what == text
@@ -298,7 +298,8 @@ def test_an_error_with_another_cause_is_raised_as_it_is() -> None:
     link = Link("tcp://here", "secret", lambda *_: None, lambda: None)
     assert link._shut("here", asyncio.CancelledError()) is None
     assert link._shut("here", LineDown("the owner has ended")) is None
-    link._connection = SimpleNamespace(status=401, refusal="", close_reason="", complaint="401")  # type: ignore[assignment]
+    connection: Any = SimpleNamespace(status=401, refusal="", close_reason="", complaint="401")
+    link._connection = connection
     shut = link._shut("here", OSError())
     assert shut is not None
     assert shut.what == "here does not accept this token"

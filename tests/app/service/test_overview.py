@@ -502,7 +502,7 @@ async def test_each_part_names_its_place_and_a_screen_that_joins_later_gets_all_
 
 
 @in_virtual_time
-async def test_unchanged_values_and_rows_are_sent_once() -> None:
+async def test_unchanged_values_and_rows_are_sent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
         group = polled(bus, "axes", "1", address=1, period=0.1)
         await anext(aiter(group))
@@ -512,7 +512,7 @@ async def test_unchanged_values_and_rows_are_sent_once() -> None:
         pictures.join(screen, 1)
         await asyncio.sleep(1.0)
         seen: list[str] = []
-        screen.notify_surely = lambda stream, method, body, part=0: seen.append(method)  # type: ignore[method-assign]
+        monkeypatch.setattr(screen, "notify_surely", lambda stream, method, body, part=0: seen.append(method))
         await asyncio.sleep(5.0)
         assert set(seen) == {"frame", "groups", "nodes"}
         assert seen.count("frame") == pytest.approx(5.0 / INTERVAL, abs=1)

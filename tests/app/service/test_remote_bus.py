@@ -769,7 +769,7 @@ def test_a_node_of_another_line_counts_its_stops_at_once_and_has_merged_reads(tm
     async def story(line: Served, remote: RemoteBus) -> None:
         node = Hcp2Controller(remote, 5).node
         node.note_stop()
-        assert node.stops == 1, "what was decided before it is superseded already here"
+        assert node.stops == 1, "a write that was decided before it is superseded already here"
         assert node.line == "the emulated line"
         unit = remote.node(MODBUS, 3)
         assert unit.profile.merge is not None

@@ -567,7 +567,7 @@ def test_a_program_with_a_stream_is_notified_of_values_that_a_write_makes_stale(
     on_a_line(tmp_path, story)
 
 
-# writes to points, and what is made of a request
+# writes to points, and the parts of a request
 
 
 def test_a_value_for_a_point_is_a_label_or_a_number_and_is_on_record_if_it_is_refused(tmp_path: Path) -> None:

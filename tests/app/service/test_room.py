@@ -187,7 +187,7 @@ async def test_many_readers_of_a_stream_get_a_message_a_few_in_each_turn_of_the_
 
 
 class News(Broadcast):
-    """A source of which messages are sent when a test says so."""
+    """A source whose messages are sent on demand of a test."""
 
     def __init__(self) -> None:
         self.begun = self.ended = 0
@@ -206,7 +206,7 @@ class News(Broadcast):
 
 
 class NewsReader:
-    """A client that keeps what it is sent."""
+    """A client that keeps its messages."""
 
     def __init__(self) -> None:
         self.received: list[tuple[int, str]] = []

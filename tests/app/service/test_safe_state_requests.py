@@ -121,20 +121,25 @@ def test_it_is_sent_to_the_end_when_whoever_asked_for_it_has_gone(tmp_path: Path
     on_a_line(tmp_path, TEXT + BOTH, story)
 
 
+def held_back(monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
+    """Do not send the safe state before the event that is returned is set."""
+    send, go_on = SafeStateRequests._send, asyncio.Event()
+
+    async def hold(requests: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
+        await go_on.wait()
+        return await send(requests, state, by)
+
+    monkeypatch.setattr(SafeStateRequests, "_send", hold)
+    return go_on
+
+
 def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
-    send = SafeStateRequests._send
 
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
-        meant = asyncio.Event()
-
-        async def hold(wishes: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
-            await meant.wait()
-            return await send(wishes, state, by)
-
-        monkeypatch.setattr(SafeStateRequests, "_send", hold)
+        meant = held_back(monkeypatch)
         asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
         await until(lambda: service.line.safe_writes.under_way)
         assert service.clients[0].requests.sends_safe_state, "it keeps its place for that long"
@@ -149,16 +154,8 @@ def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
 
 
 def test_its_number_is_that_of_no_other_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    send = SafeStateRequests._send
-
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
-        go_on = asyncio.Event()
-
-        async def hold(requests: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
-            await go_on.wait()
-            return await send(requests, state, by)
-
-        monkeypatch.setattr(SafeStateRequests, "_send", hold)
+        go_on = held_back(monkeypatch)
         served: Any = service
         for method in ("safe", "request"):
             params = {"writes": {"winder/speed": 0}} if method == "safe" else READ
@@ -231,16 +228,9 @@ def test_ordinary_requests_that_wait_do_not_keep_it_from_the_line(
 ) -> None:
     monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
     monkeypatch.setattr("busmaster.app.service.requests.MOST_URGENT", 1)
-    send = SafeStateRequests._send
 
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
-        go_on = asyncio.Event()
-
-        async def hold(requests: SafeStateRequests, state: SafeWrites, by: str) -> dict[str, Any]:
-            await go_on.wait()
-            return await send(requests, state, by)
-
-        monkeypatch.setattr(SafeStateRequests, "_send", hold)
+        go_on = held_back(monkeypatch)
         reading = asyncio.ensure_future(Hcp2Controller(remote, 8, timings=PATIENT).read(10))  # no such device
         await until(lambda: service.clients and service.clients[0].unfinished)
         entering = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))

@@ -1,4 +1,4 @@
-"""The service of a line: its options, what it reports of the line, to which clients, and what it leaves behind."""
+"""The service of a line: its options, its reports, the clients that get them, and the state after its end."""
 
 from __future__ import annotations
 
