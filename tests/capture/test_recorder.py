@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import time
 from pathlib import Path
 
@@ -22,6 +23,20 @@ REPLY = bytes.fromhex("02 30 31 35 03 37")
 
 def attempt() -> Attempt:
     return Attempt("hcp2", 2, READ, hcp2.PROFILE.timings, transaction=1)
+
+
+STATISTICS = 5
+"""The type of a block with statistics, which closes a file."""
+
+
+def block_types(data: bytes) -> list[int]:
+    """The types of the blocks of a pcapng file."""
+    types = []
+    while data:
+        kind, length = struct.unpack_from("<II", data)
+        types.append(kind)
+        data = data[length:]
+    return types
 
 
 def until_larger(path: Path, size: int) -> None:
@@ -166,6 +181,7 @@ def test_a_next_file_that_cannot_be_made_is_reported_once_and_made_as_soon_as_it
     frames = 0
     for path in folder.iterdir():
         assert b"COM" in path.read_bytes()
+        assert block_types(path.read_bytes()).count(STATISTICS) == 1, "each file is closed once"
         with path.open("rb") as file:
             frames += sum(packet.frame == REQUEST for packet in read_packets(file))
     assert frames == 4

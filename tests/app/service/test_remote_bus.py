@@ -424,8 +424,9 @@ def test_an_owner_that_ends_tells_what_became_of_each_request(tmp_path: Path) ->
                 await line.service.__aexit__(None, None, None)
                 assert line.service.clients == ()
                 assert len(line.records) == 2, "what became of them is known when the service has ended"
-                with pytest.raises(WriteUnconfirmed, match="the program that owns the line ends"):
+                with pytest.raises(WriteUnconfirmed, match="the program that owns the line ends") as unconfirmed:
                     await writing
+                assert unconfirmed.value.hint == WriteUnconfirmed.hint
                 with pytest.raises(BusClosed, match=r"that owns the line ends .*; start it, and connect again"):
                     await waiting
                 assert sorted(line.audit())[0][1] == "not started"
