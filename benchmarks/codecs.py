@@ -12,16 +12,15 @@ from functools import partial
 from typing import Any
 
 from benchmarks.harness import Options, Outcome, Table
-from busmaster.contract.exchange import Command, Expect
-from busmaster.contract.profile import Profile
-from busmaster.contract.timing import Timings
+from busmaster import Timings
+from busmaster.contract.exchange import Expect
+from busmaster.ext import Command, Profile, make_device
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
-from busmaster.registry import make_device
 from busmaster.testing import answers_of
 
 CASES: list[tuple[Profile, int, Callable[[], Command[Any]]]] = [

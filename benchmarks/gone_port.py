@@ -18,9 +18,9 @@ from statistics import median
 from typing import Any
 
 from benchmarks.harness import Claim, Options, Outcome, Table
-from busmaster.transport import identity
+from busmaster import SerialPort
+from busmaster.ext import identity
 from busmaster.transport.reconnect import Connection
-from busmaster.transport.serial_port import SerialPort
 
 TTYS, BOARD_UARTS, ADAPTERS = 68, 32, 7
 GONE = 6.0

@@ -12,11 +12,8 @@ from enum import Enum
 from types import TracebackType
 
 from benchmarks.apart import Apart
-from busmaster.contract.profile import LineSettings
-from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.identity import Identity
-from busmaster.transport.serial_port import SerialPort
-from busmaster.transport.tcp import TcpPort
+from busmaster import Endpoint, LineSettings, SerialPort, TcpPort
+from busmaster.ext import identity
 
 FREE_BAUDRATE = 57600
 """Said of a line that is not paced: windows follow it, the bytes do not."""
@@ -45,7 +42,7 @@ class SocketPort:
         return None
 
     async def open(
-        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
     ) -> asyncio.Transport:
         transport, _ = await asyncio.get_running_loop().create_connection(protocol_factory, sock=self.sock)
         return transport

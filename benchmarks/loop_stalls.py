@@ -19,13 +19,10 @@ from typing import Any
 
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.lines import Lines
+from benchmarks.questions import telegram
 from benchmarks.watch import Hold, Watch, watched
-from busmaster import Bus, BusError, Hcp2Controller, Point, PollGroup
-from busmaster.bus.node import Node
-from busmaster.contract.profile import LineSettings
+from busmaster import Bus, BusError, Hcp2Controller, LineSettings, Node, Point, PollGroup
 from busmaster.protocols.hcp2 import codec as hcp2
-from busmaster.wire.checks import xor
-from busmaster.wire.readers import ETX, STX
 
 NODES = range(1, 51)
 ELEMENTS = range(1, 11)
@@ -77,9 +74,8 @@ def replies() -> dict[bytes, tuple[bytes]]:
     table = {}
     for node in NODES:
         for element in ELEMENTS:
-            body = b"%02X%g" % (element, value_of(node, element)) + ETX
             request = hcp2.Read(element).open(node, hcp2.PROFILE.timings).request
-            table[request] = (STX + body + bytes((xor(body),)),)
+            table[request] = (telegram(b"%02X%g" % (element, value_of(node, element))),)
     return table
 
 

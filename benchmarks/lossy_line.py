@@ -23,15 +23,15 @@ from statistics import mean
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
 from benchmarks.served_line import ServedLine, value_of
+from busmaster import LEARNED
 from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.learned import TRUSTED_AFTER
 from busmaster.arbiter.schedule import set_members
-from busmaster.arbiter.transaction import Poll, Transaction
-from busmaster.contract.learning import LEARNED
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import ROUNDING, Line
 from busmaster.emulator.world import World
+from busmaster.ext import Poll, Transaction
 from busmaster.protocols._comms.mint import LAST_COMMS, EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 

@@ -17,10 +17,8 @@ from benchmarks.harness import Claim, Options, Outcome, Table, quantile
 from benchmarks.lines import Lines
 from benchmarks.masters import Question
 from benchmarks.questions import hcp2_questions, wire_time
-from busmaster.bus.bus import Bus
-from busmaster.contract.profile import LineSettings
+from busmaster import Bus, Endpoint, LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
-from busmaster.transport.endpoints import Endpoint
 
 SETTINGS = LineSettings(19200)
 DELAY = 0.002

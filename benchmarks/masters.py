@@ -19,13 +19,9 @@ import serial
 import serial_asyncio
 
 from benchmarks.lines import SocketPort
-from busmaster.bus.bus import Bus
-from busmaster.contract.exchange import Command
-from busmaster.contract.profile import Profile
+from busmaster import Bus, Endpoint, SerialPort, TcpPort
+from busmaster.ext import Command, Profile
 from busmaster.transport.alarm import KernelTimer, kernel_timer
-from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.serial_port import SerialPort
-from busmaster.transport.tcp import TcpPort
 
 REPLY_DEADLINE = 1.0
 """Seconds. Long: a machine that is busy with something else must not end a benchmark."""

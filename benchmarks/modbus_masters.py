@@ -17,12 +17,10 @@ from typing import Any, Protocol, TypeVar
 
 from benchmarks.harness import Options, installed
 from benchmarks.served_line import SETTINGS
-from busmaster import Bus, BusError, Node, Priority, ReplyTiming, Timings
-from busmaster.contract.learning import Learned
-from busmaster.planning import longest_hold
+from busmaster import Bus, BusError, Endpoint, Node, Priority, ReplyTiming, Timings, endpoint
+from busmaster.ext import Learned, longest_hold
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.modbus.codec import SILENCE, ReadRegisters, WriteRegisters
-from busmaster.transport.endpoints import Endpoint, endpoint
 
 T = TypeVar("T")
 

@@ -21,11 +21,9 @@ from typing import Any, cast
 
 from benchmarks.library_frames import LibraryIncomingConnection
 from benchmarks.watch import Watch, watched
-from busmaster import Bus, PollGroup, SerialPort, Service
+from busmaster import Bus, Node, Point, PollGroup, SerialPort, Service
 from busmaster.app.service import client_connection
-from busmaster.bus.node import Node, Request
-from busmaster.bus.points import Point
-from busmaster.bus.requester import Requester
+from busmaster.ext import Request, Requester
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters
 
 READ = ReadRegisters(7, 1)

@@ -16,8 +16,7 @@ from benchmarks.lines import Lines
 from benchmarks.masters import Bare, Question
 from benchmarks.modbus_masters import PROFILE, TIMINGS, Busmaster, Failed, Minimalmodbus, ModbusMaster, masters, notes
 from benchmarks.served_line import SETTINGS, value_of
-from busmaster import SerialPort, Timings
-from busmaster.contract.profile import LineSettings
+from busmaster import LineSettings, SerialPort, Timings
 from busmaster.protocols.modbus.codec import ReadRegisters, with_crc
 
 DELAY = 0.002

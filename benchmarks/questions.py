@@ -3,17 +3,24 @@ registers."""
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import xor
+
 from benchmarks.masters import Question
-from busmaster.contract.profile import LineSettings
+from busmaster import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.exchange import packet
-from busmaster.wire.checks import xor
-from busmaster.wire.readers import ACK, ETX, STX
 
+STX, ETX, ACK = b"\x02", b"\x03", b"\x06"
 NODES = (2, 3, 4, 5)
 ELEMENTS = (1, 2, 100)
+
+
+def telegram(content: bytes) -> bytes:
+    """Return a reply in HCP2 with its checksum, built apart from the code that is measured."""
+    return STX + content + ETX + bytes((reduce(xor, content + ETX),))
 
 
 def hcp2_questions() -> list[Question]:
@@ -22,10 +29,9 @@ def hcp2_questions() -> list[Question]:
     for address in NODES:
         for element in ELEMENTS:
             value = 1000.25 + 100 * address + element
-            body = b"%02X%.2f" % (element, value) + ETX
             command = hcp2.Read(element)
             request = command.open(address, hcp2.PROFILE.timings).request
-            questions.append(Question(command, address, request, (STX + body + bytes((xor(body),)),), value))
+            questions.append(Question(command, address, request, (telegram(b"%02X%.2f" % (element, value)),), value))
     return questions
 
 

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from benchmarks.apart import Apart
-from busmaster.contract.profile import LineSettings
+from busmaster import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer

@@ -14,11 +14,11 @@ from random import Random
 from benchmarks.harness import Claim, Options, Outcome, Table
 from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.schedule import set_members
-from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
+from busmaster.ext import Poll, Transaction
 from busmaster.protocols._comms.mint import LAST_COMMS, EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 

@@ -17,7 +17,8 @@ from benchmarks.harness import Claim, Options, Outcome, Table, alternate
 from benchmarks.lines import Lines
 from benchmarks.masters import Bare, Ours, Question
 from benchmarks.questions import hcp2_questions, modbus_questions, msc_questions, wire_time
-from busmaster.contract.profile import LineSettings, Profile
+from busmaster import LineSettings
+from busmaster.ext import Profile
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc

@@ -16,6 +16,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Quality, Sample, Snapshot
 from busmaster.contract.learning import LEARNED
 from busmaster.contract.profile import LineSettings
+from busmaster.contract.renames import ROOT
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import (
     BacklogFull,
@@ -35,7 +36,6 @@ from busmaster.errors import (
     VerifyFailed,
     WriteUnconfirmed,
 )
-from busmaster.renames import ROOT
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort

@@ -198,15 +198,6 @@ class BusClosed(BusError):
     hint = "use the bus inside `async with`"
 
 
-def cause_text(cause: Exception | None, otherwise: str) -> str:
-    """Return why a connection was lost, as text; `otherwise` if there was no error. Never empty."""
-    if cause is None:
-        return otherwise
-    if isinstance(cause, BusError):
-        return cause.what
-    return getattr(cause, "strerror", None) or str(cause) or type(cause).__name__
-
-
 __all__ = [
     "Addressed",
     "BacklogFull",

@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, Unpack
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE, Hold, LineClient
-from busmaster.arbiter.counters import LineStatistics, Mark, RecentUtilisation
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, Mark, NodeStatistics, Quantiles, RecentUtilisation
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.learned import LearnedTimes, window_of
 from busmaster.arbiter.on_wire import Echo
-from busmaster.arbiter.tap import Attempt, Tap, Verdict
-from busmaster.arbiter.transaction import BACKGROUND, COMMAND, POLL, URGENT, Poll, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, COMMAND, POLL, URGENT, Poll, Timeline, Transaction
 from busmaster.arbiter.unexpected import QUIET
 from busmaster.bus.bus import Bus
 from busmaster.bus.bus_like import find_group
@@ -63,23 +62,34 @@ from busmaster.contract.arguments import (
     seconds,
     whole_number,
 )
+from busmaster.contract.bounds import (
+    LONGEST_FILE,
+    LONGEST_HOLD,
+    LONGEST_PERIOD,
+    LONGEST_SUSPENSION,
+    MOST_MEMBERS,
+    MOST_RETRIES,
+    SHORTEST_PERIOD,
+)
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.items import Bit, Item
 from busmaster.contract.learning import Learned, documented
 from busmaster.contract.places import Changing, Placed, ReadsPlaces
 from busmaster.contract.profile import Profile
+from busmaster.contract.renames import TIMES, now_called
+from busmaster.contract.tap import Attempt, Tap, Verdict
 from busmaster.contract.timing import Timings
-from busmaster.files import FOLDER_MODE, MODE, check_regular, open_file, read_file
-from busmaster.planning import Bounds, GroupPlan, Losses, MergedReads, Plan, PlannedGroup, PlannedNode
+from busmaster.planning import Bounds, GroupPlan, Losses, MergedReads, Plan, PlannedGroup, PlannedNode, longest_hold
 from busmaster.planning.merging import Merge
-from busmaster.renames import TIMES, now_called
+from busmaster.registry import NodeKind, Option, Protocol, find, kinds, make_device, protocols
 from busmaster.transport import identity
 from busmaster.transport.clock import clock_of
 from busmaster.transport.endpoints import is_paced, is_served
+from busmaster.transport.files import FOLDER_MODE, MODE, check_regular, open_file, read_file
 from busmaster.transport.holders import PROC, holders, how_to_open, owning_group, serves
 from busmaster.transport.identity import USB, resolve
-from busmaster.transport.kernel import OpenPort, open_port
+from busmaster.transport.kernel import OpenPort, cause_text, open_port
 from busmaster.transport.pump import Waiter
 
 __all__ = [
@@ -87,9 +97,15 @@ __all__ = [
     "COMMAND",
     "FOLDER_MODE",
     "LEAST_SHARE",
+    "LONGEST_FILE",
+    "LONGEST_HOLD",
     "LONGEST_NUMBER",
+    "LONGEST_PERIOD",
+    "LONGEST_SUSPENSION",
     "MODE",
     "MOST_DIGITS",
+    "MOST_MEMBERS",
+    "MOST_RETRIES",
     "MOST_SHARE",
     "OF_QUANTITIES",
     "ORDINARY",
@@ -97,6 +113,7 @@ __all__ = [
     "POLL",
     "PROC",
     "QUIET",
+    "SHORTEST_PERIOD",
     "TIMES",
     "URGENT",
     "USB",
@@ -111,6 +128,7 @@ __all__ = [
     "CommandOptions",
     "Cycles",
     "Driver",
+    "DriverErrors",
     "Echo",
     "Entry",
     "Exchange",
@@ -126,15 +144,19 @@ __all__ = [
     "Left",
     "Limit",
     "LineClient",
+    "LineStatistics",
     "Losses",
     "Mark",
     "MeansNothing",
     "Merge",
     "MergedReads",
     "Named",
+    "NodeKind",
     "NodeRecord",
     "NodeSource",
+    "NodeStatistics",
     "OpenPort",
+    "Option",
     "Outcome",
     "Outdated",
     "Parameter",
@@ -147,6 +169,8 @@ __all__ = [
     "PlannedNode",
     "Poll",
     "Profile",
+    "Protocol",
+    "Quantiles",
     "ReadAfterWrite",
     "ReadsAfterWrites",
     "ReadsPlaces",
@@ -158,6 +182,7 @@ __all__ = [
     "Send",
     "SharedLine",
     "Tap",
+    "Timeline",
     "Transaction",
     "Value",
     "Verdict",
@@ -167,6 +192,7 @@ __all__ = [
     "actions",
     "add_tap",
     "begin_with",
+    "cause_text",
     "check_company",
     "check_regular",
     "check_settings",
@@ -177,6 +203,7 @@ __all__ = [
     "counted_items",
     "documented",
     "empty_set",
+    "find",
     "find_group",
     "give_back",
     "give_up",
@@ -191,12 +218,15 @@ __all__ = [
     "is_kept",
     "is_paced",
     "is_served",
+    "kinds",
     "last_value",
     "lend_node",
     "line_of",
     "line_statistics",
     "listed_parameters",
+    "longest_hold",
     "lost_seconds",
+    "make_device",
     "meant",
     "names_of_items",
     "now_called",
@@ -207,6 +237,7 @@ __all__ = [
     "plan_at_once",
     "plan_with_pauses",
     "prepare_write",
+    "protocols",
     "read_file",
     "read_item",
     "reads_after_writes",

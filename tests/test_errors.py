@@ -26,9 +26,9 @@ from busmaster import (
 from busmaster import errors as public
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Transaction, make_error
-from busmaster.errors import cause_text
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.transport.kernel import cause_text
 from tests.stories import on_a_bus
 
 KINDS = [

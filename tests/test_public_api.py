@@ -18,8 +18,8 @@ import pytest
 import busmaster
 from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, ModbusUnit, MscController, errors
 from busmaster.bus.handle import Handle
+from busmaster.contract.renames import ROOT as MOVED
 from busmaster.emulator.line import Line
-from busmaster.renames import ROOT as MOVED
 from tests.patience import PATIENCE
 
 OPTIONAL = ("click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib", "msgspec", "websockets")

@@ -65,13 +65,13 @@ from busmaster.arbiter.health import DOWN, NodeRecord
 from busmaster.arbiter.in_sync import InSync
 from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.on_wire import UNKNOWN_MAX_REPLY_DELAY, Echo, OnWire, Step
-from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import HELD, Poll, Transaction
 from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, damaged
 from busmaster.arbiter.unexpected import LOOK_SLACK, QUIET, UnexpectedBytes
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import Profile
+from busmaster.contract.tap import Attempt
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import BusClosed, BusError, LineDown, LineNoisy, Refused
 

@@ -27,7 +27,6 @@ from busmaster.arbiter.health import DOWN, UP, NodeRecord
 from busmaster.arbiter.probes import NodeWatch, Probes
 from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.shared_backlog import SharedBacklog
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.arbiter.transaction import (
     BACKGROUND,
     ENDED,
@@ -48,6 +47,7 @@ from busmaster.arbiter.transaction import (
 )
 from busmaster.arbiter.trust import SPOILING
 from busmaster.contract.exchange import Command, FrameError
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.errors import (
     BacklogFull,
     BusError,

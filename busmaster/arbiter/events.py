@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Poll, Transaction
+from busmaster.contract.tap import Attempt
 from busmaster.errors import BusError
 
 

@@ -15,7 +15,7 @@ from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.counters import Histogram
 from busmaster.arbiter.health import DOWN, UNKNOWN, NodeRecord
 from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER
-from busmaster.bounds import LONGEST_PERIOD, SHORTEST_PERIOD
+from busmaster.contract.bounds import LONGEST_PERIOD, SHORTEST_PERIOD
 from busmaster.contract.exchange import Command
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NoReply, NotStarted, WriteUnconfirmed

@@ -18,7 +18,6 @@ from busmaster.arbiter.counters import LineState, LineStatistics
 from busmaster.arbiter.events import CameUnexpected, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
-from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
 from busmaster.bus.bus_like import find_group
@@ -35,6 +34,7 @@ from busmaster.bus.taps import Taps
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
+from busmaster.contract.tap import Tap
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.planning import Plan, PlannedGroup

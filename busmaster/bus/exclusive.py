@@ -7,11 +7,11 @@ from collections.abc import Hashable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, TypeVar, Unpack
 
-from busmaster.bounds import LONGEST_HOLD
 from busmaster.bus.limits import Limit
 from busmaster.bus.requester import CommandOptions, Requester
 from busmaster.bus.samples import Sample
 from busmaster.contract.arguments import seconds
+from busmaster.contract.bounds import LONGEST_HOLD
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.errors import Addressed, HoldEnded, InvalidCommand

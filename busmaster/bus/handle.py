@@ -9,7 +9,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, overload
 
-from busmaster.bounds import MOST_MEMBERS
 from busmaster.bus.parameters import (
     Change,
     Difference,
@@ -28,6 +27,7 @@ from busmaster.bus.parameters import (
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, Priority, ReadOptions, Requester, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import guess, is_decimal, whole_number
+from busmaster.contract.bounds import MOST_MEMBERS
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile

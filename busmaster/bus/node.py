@@ -14,7 +14,6 @@ from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
-from busmaster.bounds import LONGEST_SUSPENSION
 from busmaster.bus.exclusive import HeldNode, checked_hold, hold_ended
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.limits import Limit
@@ -22,6 +21,7 @@ from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, Request
 from busmaster.bus.samples import Sample
 from busmaster.bus.shared_line import SharedLine, running_loop
 from busmaster.contract.arguments import seconds
+from busmaster.contract.bounds import LONGEST_SUSPENSION
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile

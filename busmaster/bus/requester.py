@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, TypeVar, Unpack, cast
 
 from busmaster.arbiter.transaction import COMMAND, Priority
-from busmaster.bounds import MOST_RETRIES
 from busmaster.bus.limits import Limit
 from busmaster.bus.samples import Sample
 from busmaster.contract.arguments import seconds, whole_number
+from busmaster.contract.bounds import MOST_RETRIES
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile

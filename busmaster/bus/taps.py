@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from busmaster.arbiter.tap import Attempt, Tap
+from busmaster.contract.tap import Attempt, Tap
 from busmaster.transport.pump import Pump
 
 

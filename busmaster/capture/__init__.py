@@ -32,7 +32,7 @@ __all__ = [
     "replay_packets",
 ]
 
-DISSECTOR = Path(__file__).parent.parent / "dissectors" / "busmaster.lua"
+DISSECTOR = Path(__file__).parent / "dissectors" / "busmaster.lua"
 """The Wireshark dissector for busmaster captures: `tshark -X lua_script:DISSECTOR -r FILE`."""
 
 _ON_DEMAND = {

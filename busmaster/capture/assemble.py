@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.decode import Decoder
 from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.contract.frames import UNACKED, UNEXPECTED, Direction, Frame, Kind
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.registry import NodeKind, find, protocols
 
 

@@ -6,7 +6,7 @@ import io
 import os
 from collections import deque
 
-from busmaster.files import open_file
+from busmaster.transport.files import open_file
 
 SIZE = 100_000_000
 """Bytes after which the next file is started. A busy line at 57600 baud writes about two gigabytes a day."""

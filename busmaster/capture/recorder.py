@@ -13,11 +13,11 @@ from collections import deque
 from collections.abc import Callable
 from types import TracebackType
 
-from busmaster.arbiter.tap import Attempt
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.files import COUNT, SIZE, CaptureFiles
 from busmaster.capture.pcapng import Packet, PcapngWriter
 from busmaster.contract.frames import Direction
+from busmaster.contract.tap import Attempt
 
 CAPACITY = 50_000
 """Events that can wait for the disk: minutes of a line at 57600 baud."""

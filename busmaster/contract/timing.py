@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from busmaster.contract.arguments import seconds
+from busmaster.contract.renames import refuse_old_arguments
 from busmaster.errors import InvalidCommand
-from busmaster.renames import refuse_old_arguments
 
 
 @dataclass(frozen=True, slots=True)

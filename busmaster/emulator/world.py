@@ -14,11 +14,11 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Event, LineChanged, NodeChanged, Overdue
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
+from busmaster.contract.tap import Attempt, Tap
 from busmaster.contract.timing import Timings
 from busmaster.emulator.line import Line
 

@@ -20,18 +20,13 @@ from itertools import count, cycle
 from statistics import median
 from typing import Any, TypeVar
 
-from busmaster import ext
-from busmaster.arbiter.tap import Attempt, Verdict
-from busmaster.arbiter.transaction import Priority
-from busmaster.bus.bus import Bus
-from busmaster.bus.handle import Handle
-from busmaster.bus.points import Point
+from busmaster import Bus, Point, Priority, SerialPort, ext
 from busmaster.contract.arguments import meant, seconds, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.emulator.device import Delay
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError, InvalidCommand, Refused
-from busmaster.registry import find
+from busmaster.ext import Attempt, Handle, Verdict, find
 from busmaster.testing.emulated_process import EmulatedLine, in_own_process
 from busmaster.testing.latency_plot import check_plot, plot
 from busmaster.testing.latency_report import (
@@ -46,7 +41,6 @@ from busmaster.testing.latency_report import (
     ratios,
 )
 from busmaster.testing.virtual_time import VirtualTimeLoop
-from busmaster.transport.serial_port import SerialPort
 
 T = TypeVar("T")
 MOST_CALLERS = 1000

@@ -27,7 +27,7 @@ from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command
 from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.errors import InvalidCommand
-from busmaster.registry import Protocol
+from busmaster.ext import Protocol
 from busmaster.testing.cases import Case, NotConformant
 from busmaster.testing.damage import bytewise
 

@@ -23,7 +23,7 @@ from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
 from busmaster.errors import LineDown
-from busmaster.registry import find, make_device
+from busmaster.ext import find, make_device
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import pytest
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
-from busmaster.registry import find, make_device
+from busmaster.ext import find, make_device
 from busmaster.testing.bench import BenchReport, bench
 from busmaster.testing.virtual_time import run_in_virtual_time
 

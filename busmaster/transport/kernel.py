@@ -1,8 +1,8 @@
 """State of an open port that the kernel knows and asyncio does not report.
 
-Unread bytes, unsent bytes, and the counters of a serial driver. No function here blocks. The hot path of a port that
-never held bytes back makes no query: unread and unsent bytes are queried when a deadline expires, counters when they
-are displayed.
+Unread bytes, unsent bytes, the counters of a serial driver, and why a connection was lost. No function here blocks.
+The hot path of a port that never held bytes back makes no query: unread and unsent bytes are queried when a deadline
+expires, counters when they are displayed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import termios
 from collections.abc import Callable
 
 from busmaster.arbiter.counters import DriverErrors
+from busmaster.errors import BusError
 
 DELAYED_ACK = 0.050
 """Seconds for which a healthy peer may delay an acknowledgement (Linux: 40 ms)."""
@@ -210,3 +211,12 @@ def _buffer_of(transport: asyncio.Transport) -> Callable[[], int] | None:
     except (AttributeError, NotImplementedError):
         return None
     return transport.get_write_buffer_size
+
+
+def cause_text(cause: Exception | None, otherwise: str) -> str:
+    """Return why a connection was lost, as text; `otherwise` if there was no error. Never empty."""
+    if cause is None:
+        return otherwise
+    if isinstance(cause, BusError):
+        return cause.what
+    return getattr(cause, "strerror", None) or str(cause) or type(cause).__name__

@@ -18,12 +18,12 @@ import anyio
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors, LineState, Mark
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
-from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Poll, Transaction
-from busmaster.errors import BusError, cause_text
+from busmaster.contract.tap import Attempt, Tap
+from busmaster.errors import BusError
 from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
-from busmaster.transport.kernel import OpenPort, open_port
+from busmaster.transport.kernel import OpenPort, cause_text, open_port
 
 STUCK_AFTER = 5.0
 """Seconds after which unsent output is discarded together with its connection. Flow control, a busy adapter or a lost

@@ -7,10 +7,11 @@ import random
 from collections.abc import Callable, Hashable
 from typing import cast
 
-from busmaster.errors import LineDown, cause_text
+from busmaster.errors import LineDown
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.folder_watch import FolderWatch, watch_folders
 from busmaster.transport.identity import Identity
+from busmaster.transport.kernel import cause_text
 from busmaster.transport.marks import taker_of_marked_bytes
 
 FIRST_DELAY = 0.1

@@ -8,9 +8,9 @@ import pytest
 
 from busmaster.arbiter.counters import Mark
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.contract.driver import EndlessExchange
 from busmaster.contract.exchange import Expect, Sizes
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError
 from busmaster.protocols.hcp2 import codec as hcp2

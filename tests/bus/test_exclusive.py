@@ -10,9 +10,9 @@ import pytest
 
 from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.transaction import Priority
-from busmaster.bounds import LONGEST_HOLD
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
+from busmaster.contract.bounds import LONGEST_HOLD
 from busmaster.errors import BusClosed, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2

@@ -13,10 +13,10 @@ from busmaster import ext
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
-from busmaster.arbiter.tap import Attempt
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node, Priority
 from busmaster.contract.profile import LineSettings
+from busmaster.contract.tap import Attempt
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NodeDown, NoReply

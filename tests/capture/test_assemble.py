@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.contract.exchange import Command
 from busmaster.contract.frames import Direction
 from busmaster.contract.profile import Profile
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from busmaster.app.cli import main
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.files import CaptureFiles
 from busmaster.capture.pcapng import CutOff, Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.outputs.cycles import until
 from tests.disks import small_disk

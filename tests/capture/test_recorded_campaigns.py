@@ -6,11 +6,11 @@ import io
 
 import pytest
 
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.pcapng import Outcome, PcapngWriter, read_packets
 from busmaster.capture.replay import replay_packets
 from busmaster.contract.frames import Direction
+from busmaster.contract.tap import Attempt, Verdict
 from tests.tiers import in_turn_by_default
 from tests.verification.campaigns.hunt import Hunt
 from tests.verification.campaigns.kinds import KINDS

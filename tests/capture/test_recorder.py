@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture import recorder
 from busmaster.capture.files import CaptureFiles
 from busmaster.capture.pcapng import Outcome, read_packets
 from busmaster.capture.recorder import Recorder
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.outputs.cycles import until
 

@@ -9,13 +9,13 @@ from typing import TypeAlias
 
 import pytest
 
-from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.replay import Replayed, replay_packets
 from busmaster.contract.exchange import Command
 from busmaster.contract.frames import Direction
 from busmaster.contract.profile import Profile
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2

@@ -23,7 +23,7 @@ from typing import Any, ForwardRef, NamedTuple
 import busmaster
 from tests.docs.pages import ROOT
 
-APART = {"busmaster.bounds": "[Bounds](bounds.md) lists them with their values."}
+APART = {"busmaster.app.bounds": "[Bounds](bounds.md) lists them with their values."}
 """Modules whose names have a page of their own."""
 LONGEST_SIGNATURE = 100
 LONGEST_VALUE = 60

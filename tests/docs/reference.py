@@ -9,10 +9,9 @@ import ast
 import json
 import tomllib
 from collections.abc import Iterator
+from importlib import import_module
 from itertools import pairwise
 
-import busmaster
-import busmaster.bounds
 from busmaster.app.config.keys import MILLION, Key
 from busmaster.app.config.schema import json_schema, tables
 from busmaster.app.service.schema import service_schema
@@ -92,9 +91,14 @@ def _bounds() -> Iterator[str]:
 
 The bounds of all input from files and clients. Input beyond a bound is rejected, and the error names the bound. They
 are not settings: a line and its views are tested with these values. Each bound is declared once, in
-`busmaster/bounds.py`, from which this page is generated. Times are in seconds.
+`busmaster/contract/bounds.py` or `busmaster/app/bounds.py`, from which this page is generated. Times are in seconds.
 """
-    text = (ROOT / "busmaster" / "bounds.py").read_text()
+    for module in ("busmaster.contract.bounds", "busmaster.app.bounds"):
+        yield from _bounds_of(module)
+
+
+def _bounds_of(module: str) -> Iterator[str]:
+    text = ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text()
     titles = {number: line[2:] for number, line in enumerate(text.splitlines(), 1) if line.startswith("# ")}
     body = ast.parse(text).body
     for node, about in pairwise(body):
@@ -105,7 +109,7 @@ are not settings: a line and its views are tested with these values. Each bound 
         [name] = (target.id for target in node.targets if isinstance(target, ast.Name))
         assert isinstance(about, ast.Expr), f"{name} has no text"
         assert isinstance(about.value, ast.Constant), f"{name} has no text"
-        value = getattr(busmaster.bounds, name)
+        value = getattr(import_module(module), name)
         shown = f"{int(value):_d}".replace("_", " ") if value == int(value) and value < 1e9 else f"{value:g}"
         yield f"| `{name}` | {shown} | {' '.join(str(about.value.value).split())} |"
 

@@ -8,8 +8,8 @@ from random import Random
 import pytest
 
 from busmaster.arbiter.events import CameUnexpected, Event, LineChange, LineChanged, Polled
-from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
+from busmaster.contract.tap import Attempt
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line

@@ -29,9 +29,9 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import LineChange, LineChanged, Overdue
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Transaction
 from busmaster.bus.node import Node
+from busmaster.contract.tap import Attempt
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryTransport

@@ -14,10 +14,10 @@ from typing import Any, TextIO
 
 import click
 
+from busmaster import BusError, InvalidCommand, NoReply
 from busmaster.app.cli.ending import Ending
 from busmaster.app.cli.output import Level, note
 from busmaster.app.cli.terminal import printable
-from busmaster.errors import BusError, InvalidCommand, NoReply
 from busmaster.ext import meant
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130

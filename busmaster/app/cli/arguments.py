@@ -15,8 +15,7 @@ from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.lines import is_line_file
 from busmaster.app.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
 from busmaster.app.cli.protocols import handle_options, protocol_option, take_options
-from busmaster.ext import Handle, Learned, NodeSource, Profile, documented
-from busmaster.registry import find
+from busmaster.ext import Handle, Learned, NodeSource, Profile, documented, find
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from busmaster import Bus
+from busmaster import Bus, InvalidCommand
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import Connection, nodes_option
 from busmaster.app.cli.emulate import nodes_to_emulate
@@ -19,7 +19,6 @@ from busmaster.app.cli.parsing import Whole, option_type, parse_items, parse_sec
 from busmaster.app.cli.protocols import NodeCommand, handle_options, protocol_option, take_options
 from busmaster.app.cli.reaching import check_no_owner
 from busmaster.emulator import NAMES, Delay
-from busmaster.errors import InvalidCommand
 from busmaster.ext import Learned, is_served, read_file
 from busmaster.testing.bench import (
     CYCLE,

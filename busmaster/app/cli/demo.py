@@ -11,12 +11,11 @@ from contextlib import ExitStack, contextmanager
 import anyio
 import click
 
-from busmaster import Bus, Hcp2Controller, MicroFlexDrive, Point, SerialPort
+from busmaster import Bus, BusError, Hcp2Controller, LineDown, MicroFlexDrive, Point, SerialPort
 from busmaster.app.cli.arguments import View, plain_option, seconds_option
 from busmaster.app.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.watching import Watch, follow
-from busmaster.errors import BusError, LineDown
 
 PERIOD = 0.2
 COMMAND_EVERY = 2.0

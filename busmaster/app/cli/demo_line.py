@@ -14,7 +14,7 @@ import sys
 
 from busmaster import LineSettings
 from busmaster.emulator import Delay, Line, LineServer, serve_pty
-from busmaster.registry import make_device
+from busmaster.ext import make_device
 
 CONTROLLERS = range(1, 4)
 DRIVES = range(4, 9)

@@ -11,8 +11,8 @@ from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
+from busmaster import InvalidCommand
 from busmaster.app.cli.parsing import parse_value
-from busmaster.errors import InvalidCommand
 
 T = TypeVar("T")
 STYLE = """

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from busmaster import LineSettings, Rfc2217Port, SerialPort, TcpPort, endpoint
+from busmaster import InvalidCommand, LineSettings, Rfc2217Port, SerialPort, TcpPort, endpoint
 from busmaster.app.cli.arguments import nodes_option
 from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.ending import until_ended
@@ -22,9 +22,7 @@ from busmaster.app.diagnostics.probing import opened
 from busmaster.app.diagnostics.search import Discovery, Search
 from busmaster.app.diagnostics.steps import LISTENING, Step, ranges, seconds, steps, untuned_steps, usual_kinds
 from busmaster.app.diagnostics.writing import lasting, line_text, summary
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Tap, is_served, open_file
-from busmaster.registry import NodeKind, find, kinds
+from busmaster.ext import NodeKind, Tap, find, is_served, kinds, open_file
 
 FAILED = 1
 USUAL = LineSettings(9600)

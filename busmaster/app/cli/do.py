@@ -12,7 +12,7 @@ from typing import Any, TypeVar, Unpack
 
 import click
 
-from busmaster import Point, ext
+from busmaster import InvalidCommand, Point, ext
 from busmaster.app.cli.arguments import Connection, connected, json_option
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.late import late_nodes
@@ -25,9 +25,7 @@ from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.authorisation import WriteRequest
 from busmaster.app.service.record import RAW_COMMAND, WriteRecord
 from busmaster.app.service.values import utc
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Action, Changing, Command, CommandOptions, Handle, HeldNode, Placed, Requester
-from busmaster.registry import kinds
+from busmaster.ext import Action, Changing, Command, CommandOptions, Handle, HeldNode, Placed, Requester, kinds
 
 T = TypeVar("T")
 MORE = "..."

@@ -11,7 +11,7 @@ from math import inf
 
 import click
 
-from busmaster import Rfc2217Port, SerialPort, TcpPort
+from busmaster import LineDown, Rfc2217Port, SerialPort, TcpPort
 from busmaster.app.cli.arguments import line_settings, nodes_option, seconds_option, single_nodes
 from busmaster.app.cli.lines import file_argument, load
 from busmaster.app.cli.output import Level, emit, note
@@ -20,9 +20,7 @@ from busmaster.app.cli.protocols import protocol_option
 from busmaster.app.config import LineFile, emulated_line
 from busmaster.app.line import ConfiguredLine
 from busmaster.emulator import NAMES, Delay, Faults, Line, LineServer, serve_pty, serve_tcp
-from busmaster.errors import LineDown
-from busmaster.ext import USB, Profile, host_and_port
-from busmaster.registry import find, make_device
+from busmaster.ext import USB, Profile, find, host_and_port, make_device
 
 LOOK_FOR_SIGNALS = 0.2
 """Seconds from one look to the next."""

@@ -7,11 +7,11 @@ from typing import Any, TypeVar
 
 import click
 
+from busmaster import InvalidCommand, LineDown
 from busmaster.app.cli.output import Level, note
 from busmaster.app.cli.reaching import token_for
 from busmaster.app.cli.top import address_of
 from busmaster.app.interfaces.following import Connected, Following
-from busmaster.errors import InvalidCommand, LineDown
 from busmaster.ext import host_and_port
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])

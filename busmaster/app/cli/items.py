@@ -11,8 +11,7 @@ from busmaster.app.cli.arguments import json_option
 from busmaster.app.cli.output import columns, emit, emit_all, json_line, note
 from busmaster.app.cli.parsing import option_type
 from busmaster.app.cli.protocols import parse_protocol
-from busmaster.ext import Bit, Item, meant
-from busmaster.registry import NodeKind, find
+from busmaster.ext import Bit, Item, NodeKind, find, meant
 
 HEAD = ("ITEM", "NUMBER", "UNIT", "ACCESS", "MEANING")
 

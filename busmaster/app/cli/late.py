@@ -9,10 +9,9 @@ from contextlib import asynccontextmanager
 
 import anyio
 
-from busmaster import Bus
+from busmaster import Bus, NoReply
 from busmaster.app.cli.output import Level, note
 from busmaster.app.service.remote import RemoteBus
-from busmaster.errors import NoReply
 from busmaster.events import MaxReplyDelayRaised, RepliesLate
 
 STEP = 0.05

@@ -13,6 +13,7 @@ from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.widgets import Static
 
+from busmaster import BusError, InvalidCommand
 from busmaster.app.cli.app import INTERRUPTED
 from busmaster.app.cli.cells import column_widths, fit, gauge_line, group_line, header_line, row_line, title_line
 from busmaster.app.cli.details import details_text
@@ -21,7 +22,6 @@ from busmaster.app.cli.dialog import AskValue, AskWords, AskYes, Show
 from busmaster.app.cli.parsing import parse_value
 from busmaster.app.cli.table import Table
 from busmaster.app.service.picture import Frame, Group, Node, Picture, Row, matching
-from busmaster.errors import BusError, InvalidCommand
 
 SUSPENDED_FOR = 60.0
 SILENT_AFTER = 2.0

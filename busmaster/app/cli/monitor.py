@@ -11,7 +11,7 @@ from typing import Any
 import anyio
 import click
 
-from busmaster import Endpoint, Snapshot, ext
+from busmaster import Endpoint, LineDown, Snapshot, ext
 from busmaster.app.cli.arguments import Connection
 from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.ending import until_ended
@@ -25,10 +25,8 @@ from busmaster.app.config import LineFile
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.values import cycle_fields, utc
 from busmaster.capture import DEFAULT_GAP, Decoder, Direction, Frame, Kind, Recorder
-from busmaster.errors import LineDown, cause_text
 from busmaster.events import AlarmChanged, BusEvent, Stream
-from busmaster.ext import check_settings
-from busmaster.registry import find
+from busmaster.ext import cause_text, check_settings, find
 
 BEAT = 0.05
 """Seconds between two readings of the clock. A longer gap means that the program was stopped."""

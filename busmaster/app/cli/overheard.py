@@ -19,15 +19,12 @@ from typing import Any
 
 import anyio
 
-from busmaster import Node, Point, Quality, Sample, Snapshot, ext
+from busmaster import BusError, InvalidCommand, Node, Point, Quality, Sample, Snapshot, ext
 from busmaster.app.config import LineFile
 from busmaster.app.line import ConfiguredLine
 from busmaster.capture import Direction, Frame, Kind
-from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import Stream
-from busmaster.ext import Changing, Command, Driver, Placed, ReadsPlaces
-from busmaster.registry import Protocol, find
-from busmaster.statistics import Timeline
+from busmaster.ext import Changing, Command, Driver, Placed, Protocol, ReadsPlaces, Timeline, find
 
 Question = tuple[int, Command[Any]]
 """The address of a node, and the command."""

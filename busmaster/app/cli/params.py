@@ -13,7 +13,7 @@ from functools import partial
 
 import click
 
-from busmaster import Priority, ext
+from busmaster import BusError, InvalidCommand, Priority, ext
 from busmaster.app.cli.app import FAILED, OK, bus_error_text
 from busmaster.app.cli.arguments import Connection, connected, json_option
 from busmaster.app.cli.ending import until_ended
@@ -35,11 +35,11 @@ from busmaster.app.line.parameter_sets import (
 )
 from busmaster.app.service.authorisation import WriteRequest
 from busmaster.app.service.record import WriteRecord, this_user
-from busmaster.errors import BusError, InvalidCommand
 from busmaster.ext import (
     Change,
     Found,
     Left,
+    NodeKind,
     Outcome,
     Parameter,
     ParameterLoad,
@@ -51,7 +51,6 @@ from busmaster.ext import (
     meant,
     walk,
 )
-from busmaster.registry import NodeKind
 
 DIFFERENT = 1
 items_option = click.option(

@@ -9,10 +9,8 @@ from typing import NamedTuple, TypeVar
 
 import click
 
-from busmaster import LEARNED
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Learned, is_decimal, read_file
-from busmaster.registry import kinds
+from busmaster import LEARNED, InvalidCommand
+from busmaster.ext import Learned, is_decimal, kinds, read_file
 
 S = TypeVar("S")
 T = TypeVar("T")

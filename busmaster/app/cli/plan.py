@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from busmaster import Endpoint, LineSettings, Priority, Rfc2217Port, SerialPort
+from busmaster.app.bounds import MOST_CLIENTS
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import json_option
 from busmaster.app.cli.lines import file_argument, load
@@ -16,7 +17,6 @@ from busmaster.app.cli.output import columns, emit, emit_all, json_line
 from busmaster.app.config import emulated_line
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.rights import line_parts
-from busmaster.bounds import MOST_CLIENTS
 from busmaster.ext import Bounds, GroupPlan, Losses, Plan
 
 SHOWN = (Priority.URGENT, Priority.COMMAND, Priority.POLL)

@@ -9,15 +9,14 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import click
 
+from busmaster import InvalidCommand
 from busmaster.app.cli.app import OK, WRONG_USAGE
 from busmaster.app.cli.lines import file_argument, load
 from busmaster.app.cli.output import Level, columns, emit, note
 from busmaster.app.config import LineFile
 from busmaster.app.line.points_table import COLUMNS, ITEM, LIMITED_BY, NODE, ORIGIN, POINT, entry_text, points_csv, rows
 from busmaster.app.line.points_taking import BadRows, taken, write_beside
-from busmaster.bounds import LONGEST_FILE
-from busmaster.errors import InvalidCommand
-from busmaster.ext import read_file
+from busmaster.ext import LONGEST_FILE, read_file
 
 
 @click.command()

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import click
 
 from busmaster.app.cli.parsing import Whole, option_type
-from busmaster.registry import NodeKind, Option, find, kinds
+from busmaster.ext import NodeKind, Option, find, kinds
 
 F = TypeVar("F", bound=Callable[..., Any])
 

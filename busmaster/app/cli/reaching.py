@@ -12,12 +12,11 @@ from urllib.parse import parse_qs
 
 import click
 
-from busmaster import Bus, Endpoint, TcpPort
+from busmaster import Bus, BusError, Endpoint, InvalidCommand, LineDown, TcpPort
 from busmaster.app.cli.arguments import Connection
 from busmaster.app.cli.output import note
 from busmaster.app.service.folder import Owner, addresses_of, owners
 from busmaster.app.service.remote import RemoteBus
-from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.ext import is_served, resolve
 
 TOKEN = "BUSMASTER_TOKEN"

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from busmaster import Bus, Node, ext
+from busmaster import Bus, Node, NoReply, ext
 from busmaster.app.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.ending import until_ended
@@ -21,7 +21,6 @@ from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import utc
-from busmaster.errors import NoReply
 from busmaster.ext import Handle
 
 

@@ -8,7 +8,7 @@ import sys
 import anyio
 import click
 
-from busmaster import ext
+from busmaster import InvalidCommand, ext
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import View, viewed
 from busmaster.app.cli.audit_log import AuditLog
@@ -26,7 +26,6 @@ from busmaster.app.cli.watching import Watch, follow
 from busmaster.app.config import LineFile
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import OutputStatistics
-from busmaster.errors import InvalidCommand
 
 SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""

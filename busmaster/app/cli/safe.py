@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 import anyio
 import click
 
-from busmaster import Endpoint
+from busmaster import BusError, Endpoint, InvalidCommand
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.capturing import capture_option, capturing
 from busmaster.app.cli.ending import until_ended
@@ -20,7 +20,6 @@ from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import event_text
 from busmaster.capture import Recorder
-from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import BusEvent, PortFailed, Stream
 
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Sequence
 import anyio
 import click
 
-from busmaster import Bus, Priority
+from busmaster import Bus, GarbledReply, NodeDown, NoReply, Priority, Refused
 from busmaster.app.cli.arguments import Connection, connected, json_option, nodes_option, nodes_to_ask
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.late import late_nodes
@@ -17,9 +17,7 @@ from busmaster.app.cli.protocols import NodeCommand
 from busmaster.app.cli.reaching import reach
 from busmaster.app.service.remote import RemoteBus
 from busmaster.app.service.values import utc
-from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
-from busmaster.ext import Profile, Requester
-from busmaster.registry import protocols
+from busmaster.ext import Profile, Requester, protocols
 
 SILENCE = 0.1
 """Seconds behind the last bytes after which the line knows whose they were, with time to spare."""

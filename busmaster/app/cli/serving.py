@@ -6,12 +6,11 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from busmaster import Service
+from busmaster import InvalidCommand, Service
 from busmaster.app.cli.output import Level, note
 from busmaster.app.config import LineFile
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.folder import line_name
-from busmaster.errors import InvalidCommand
 
 
 def secrets_of(file: LineFile) -> dict[str, bytes]:

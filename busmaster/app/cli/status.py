@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from busmaster import BusError
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import json_option
 from busmaster.app.cli.ending import until_ended
@@ -15,7 +16,6 @@ from busmaster.app.cli.output import Level, columns, emit, emit_all, json_line, 
 from busmaster.app.service.folder import Owner, owners
 from busmaster.app.service.remote import connect
 from busmaster.app.service.values import utc
-from busmaster.errors import BusError
 
 ANSWER_WITHIN = 2.0
 """Seconds within which the owner of a line must report its state."""

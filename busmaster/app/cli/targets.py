@@ -13,8 +13,7 @@ from busmaster.app.cli.lines import is_line_file, load
 from busmaster.app.cli.reaching import owner_to_use, reach
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.remote import RemoteBus, connect
-from busmaster.ext import Handle, is_decimal, meant
-from busmaster.registry import NodeKind, find
+from busmaster.ext import Handle, NodeKind, find, is_decimal, meant
 
 AT = "@"
 NODE_AT = "NODE@PORT|NODE@LINE.toml"

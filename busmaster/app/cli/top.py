@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from busmaster import LineSettings, endpoint
+from busmaster import LineDown, LineSettings, endpoint
 from busmaster.app.cli.app import FAILED
 from busmaster.app.cli.ending import until_ended
 from busmaster.app.cli.lines import is_line_file, load
@@ -18,7 +18,6 @@ from busmaster.app.cli.reaching import owner_of, token_for
 from busmaster.app.cli.terminal import made_printable
 from busmaster.app.interfaces.following import Following, Lost
 from busmaster.app.service.folder import find_owner, line_name, owners
-from busmaster.errors import LineDown
 from busmaster.ext import is_served
 
 if TYPE_CHECKING:

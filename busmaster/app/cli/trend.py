@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, NamedTuple
 import anyio
 import click
 
-from busmaster import Bus, Point, Priority
+from busmaster import Bus, BusClosed, BusError, InvalidCommand, Point, Priority, Refused
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import Connection, connected, json_option, plain_option, seconds_option
 from busmaster.app.cli.capturing import capturing
@@ -36,7 +36,6 @@ from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.cells import csv_lines, no_formula
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import utc
-from busmaster.errors import BusClosed, BusError, InvalidCommand, Refused
 from busmaster.ext import Requester, is_decimal, open_file
 
 COLUMNS = ("time", "seconds", "point", "value", "unit", "error")

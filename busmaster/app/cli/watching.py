@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import anyio
 from anyio.abc import TaskGroup
 
-from busmaster import Bus, Health, LineState, PollGroup, Service, Snapshot, ext
+from busmaster import Bus, BusError, Health, InvalidCommand, LineState, PollGroup, Service, Snapshot, ext
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import View
 from busmaster.app.cli.drawing import draw, served_here
@@ -22,9 +22,8 @@ from busmaster.app.cli.top import what_is_missing
 from busmaster.app.diagnostics import uart
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.values import cycle_fields, event_text, utc
-from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import AlarmChanged, BusEvent, LineChange, LineChanged, NodeChanged, PortFailed, RepliesLate
-from busmaster.statistics import LearnedTimes
+from busmaster.ext import LearnedTimes
 
 LINE = ""
 """Key of the line itself in the set of current faults."""

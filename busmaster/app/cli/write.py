@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from busmaster import Point, Priority, ext
+from busmaster import InvalidCommand, Point, Priority, ext
 from busmaster.app.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.ending import until_ended
@@ -25,9 +25,7 @@ from busmaster.app.service.authorisation import WriteRequest
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.values import utc
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Handle, Send, WriteOptions
-from busmaster.registry import find
+from busmaster.ext import Handle, Send, WriteOptions, find
 
 Pairs = Sequence[Assignment]
 """The writes in their order: items, or points of a file, and their values."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 
-from busmaster import LineSettings, Rfc2217Port, SerialPort, ext
+from busmaster import InvalidCommand, LineSettings, Rfc2217Port, SerialPort, ext
 from busmaster.app.config.names import expanded
 from busmaster.app.config.point_section import PointSection
 from busmaster.app.config.points import Scale
 from busmaster.app.config.sections import LineFile, NodeSection, decimals_of
 from busmaster.emulator import Device, Echo, Line
-from busmaster.errors import InvalidCommand
-from busmaster.ext import guess
-from busmaster.registry import make_device
+from busmaster.ext import guess, make_device
 
 
 def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None = None) -> Line:

@@ -11,8 +11,7 @@ from busmaster.app.config.names import expanded
 from busmaster.app.config.options import DELAY, check_keys, read_options
 from busmaster.app.config.table import Table
 from busmaster.emulator import NAMES, Delay, Faults
-from busmaster.ext import meant
-from busmaster.registry import NodeKind
+from busmaster.ext import NodeKind, meant
 
 VALUES = Form("table", {"type": "object", "additionalProperties": {"$ref": "#/$defs/values"}})
 

@@ -21,9 +21,9 @@ from functools import cache
 from types import UnionType
 from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from busmaster.app.bounds import LARGEST_WHOLE
 from busmaster.app.config.source import FileError
 from busmaster.app.config.table import Table, shown
-from busmaster.bounds import LARGEST_WHOLE
 from busmaster.ext import Between, Parsed, is_decimal
 
 T = TypeVar("T")

@@ -7,8 +7,8 @@ from collections.abc import Container, Iterator
 from itertools import product
 from math import prod
 
-from busmaster.bounds import MOST_NAMES
-from busmaster.errors import InvalidCommand
+from busmaster import InvalidCommand
+from busmaster.app.bounds import MOST_NAMES
 from busmaster.ext import LONGEST_NUMBER
 
 RANGE = re.compile(r"(\d+)-(\d+)")

@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
 
+from busmaster import InvalidCommand
 from busmaster.app.config.keys import Form, Key, form_of, names_of, read_keys
 from busmaster.app.config.names import expanded
 from busmaster.app.config.table import Table
 from busmaster.emulator import Delay
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Between, read_file
-from busmaster.registry import NodeKind, Option, kinds
+from busmaster.ext import Between, NodeKind, Option, kinds, read_file
 
 HIGHEST_ADDRESS = 0xFFFF_FFFF
 ADDRESS_SCHEMA = {"type": "integer", "minimum": 0, "maximum": HIGHEST_ADDRESS}

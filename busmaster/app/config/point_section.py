@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Annotated, Any
 
-from busmaster import Meaning, Point
+from busmaster import BusError, Meaning, Point
 from busmaster.app.config.keys import Internal, keys_of, names_of, read_keys
 from busmaster.app.config.names import POINT_NAME
 from busmaster.app.config.table import Table
-from busmaster.errors import BusError
-from busmaster.ext import OF_QUANTITIES, Between, MeansNothing, Placed
-from busmaster.registry import NodeKind
+from busmaster.ext import OF_QUANTITIES, Between, MeansNothing, NodeKind, Placed
 
 WIDEST = 64
 """Maximum number of bits of a number."""

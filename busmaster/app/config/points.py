@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Unpack, cast
 
-from busmaster import Meaning, Point
-from busmaster.errors import InvalidCommand
+from busmaster import InvalidCommand, Meaning, Point
 from busmaster.ext import PLAIN, Command, CommandOptions
 
 

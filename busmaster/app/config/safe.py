@@ -15,10 +15,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from busmaster import InvalidCommand
+from busmaster.app.bounds import LONGEST_SAFE_STATE
 from busmaster.app.config.keys import Form, Internal, read_section
 from busmaster.app.config.table import Table
-from busmaster.bounds import LONGEST_SAFE_STATE
-from busmaster.errors import InvalidCommand
 from busmaster.ext import Between, Parsed
 
 

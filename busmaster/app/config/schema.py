@@ -23,7 +23,7 @@ from busmaster.app.config.templates import Template
 from busmaster.app.config.timing import TimesSection, TimingSection
 from busmaster.app.outputs.kinds import kinds as output_kinds
 from busmaster.emulator import Faults
-from busmaster.registry import NodeKind, Option, kinds
+from busmaster.ext import NodeKind, Option, kinds
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, Literal, TypeVar
 
-from busmaster import Priority, SerialPort, TcpPort, Timings
+from busmaster import InvalidCommand, Priority, SerialPort, TcpPort, Timings
+from busmaster.app.bounds import LONGEST_TIMING, LONGEST_TITLE
 from busmaster.app.config.emulator import EmulatorSection, read_emulator
 from busmaster.app.config.keys import (
     Form,
@@ -33,10 +34,21 @@ from busmaster.app.config.table import Table
 from busmaster.app.config.templates import read_points
 from busmaster.app.config.timing import LEARNED_WORD, TIMING, read_timings, reads_learned
 from busmaster.app.outputs.base import check_folder
-from busmaster.bounds import LONGEST_PERIOD, LONGEST_TIMING, LONGEST_TITLE, MOST_RETRIES, SHORTEST_PERIOD
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Between, Learned, Parsed, Poll, Profile, check_company, is_decimal
-from busmaster.registry import NodeKind, find, kinds
+from busmaster.ext import (
+    LONGEST_PERIOD,
+    MOST_RETRIES,
+    SHORTEST_PERIOD,
+    Between,
+    Learned,
+    NodeKind,
+    Parsed,
+    Poll,
+    Profile,
+    check_company,
+    find,
+    is_decimal,
+    kinds,
+)
 
 T = TypeVar("T")
 

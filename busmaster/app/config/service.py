@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeVar
 
+from busmaster import InvalidCommand
+from busmaster.app.bounds import SHORTEST_TOKEN
 from busmaster.app.config.keys import Form, Internal, read_section, tables_of
 from busmaster.app.config.names import NODE_NAME
 from busmaster.app.config.table import Table
@@ -16,9 +18,7 @@ from busmaster.app.outputs.settings import FileMode
 from busmaster.app.service.permission import digest_of
 from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.app.service.tcp import check_listening
-from busmaster.bounds import LONGEST_FILE, SHORTEST_TOKEN
-from busmaster.errors import InvalidCommand
-from busmaster.ext import LEAST_SHARE, MOST_SHARE, Between, Parsed, check_regular, host_and_port
+from busmaster.ext import LEAST_SHARE, LONGEST_FILE, MOST_SHARE, Between, Parsed, check_regular, host_and_port
 
 K = TypeVar("K")
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from busmaster.bounds import LONGEST_TEXT, LONGEST_WORD, MOST_NESTED
-from busmaster.errors import InvalidCommand
+from busmaster import InvalidCommand
+from busmaster.app.bounds import LONGEST_TEXT, LONGEST_WORD, MOST_NESTED
 from busmaster.ext import read_file
 
 Key: TypeAlias = tuple[str | int, ...]

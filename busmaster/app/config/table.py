@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from busmaster import InvalidCommand
+from busmaster.app.bounds import LARGEST_WHOLE
 from busmaster.app.config.source import FileError, Key, Source
-from busmaster.bounds import LARGEST_WHOLE
-from busmaster.errors import InvalidCommand
 from busmaster.ext import meant, now_called
 
 T = TypeVar("T")

@@ -23,8 +23,7 @@ from busmaster.app.config.keys import Internal, read_section, tables_of
 from busmaster.app.config.point_section import PointSection, read_point
 from busmaster.app.config.source import FileError, Source
 from busmaster.app.config.table import Table
-from busmaster.ext import guess
-from busmaster.registry import NodeKind, kinds
+from busmaster.ext import NodeKind, guess, kinds
 
 FOLDERS = Path(__file__).parents[2] / "protocols"
 SUFFIX = ".toml"

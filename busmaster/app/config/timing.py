@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeAlias
 
 from busmaster import ReplyTiming, Timings
+from busmaster.app.bounds import LONGEST_TIMING
 from busmaster.app.config.keys import Form, keys_of, names_of, number, read_keys, read_section, table_of
 from busmaster.app.config.table import Table
-from busmaster.bounds import LONGEST_TIMING
 from busmaster.ext import Between
 
 LEARNED_WORD = "learned"

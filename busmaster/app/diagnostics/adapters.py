@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from busmaster.errors import LineDown
+from busmaster import LineDown
 from busmaster.ext import PROC, holders, how_to_open, identity, owning_group, serves
 
 SLOW_LATENCY_TIMER = 2

@@ -11,8 +11,7 @@ from busmaster import LineSettings, ReplyTiming
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.probing import Outcome, Probe
 from busmaster.capture import Decoder, Kind
-from busmaster.ext import Profile, window_of
-from busmaster.registry import find
+from busmaster.ext import Profile, find, window_of
 
 SHOWN = 12
 """Bytes of garbage that are printed."""

@@ -12,14 +12,12 @@ from typing import Protocol, TypeAlias
 
 import anyio.to_thread
 
-from busmaster import Endpoint, LineSettings, Rfc2217Port, SerialPort, TcpPort, Timings
+from busmaster import Endpoint, LineDown, LineSettings, Rfc2217Port, SerialPort, TcpPort, Timings
 from busmaster.app.diagnostics import adapters, diagnosis, uart
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.diagnosis import Record
 from busmaster.app.diagnostics.probing import Outcome, Prober, Wire, opened
-from busmaster.errors import LineDown
-from busmaster.ext import Mark, Profile, Tap
-from busmaster.registry import find
+from busmaster.ext import Mark, Profile, Tap, find
 
 OPENING = 0.05
 """Seconds in which opening a port may make noise."""

@@ -16,9 +16,8 @@ from typing import Any
 
 import anyio
 
-from busmaster import Endpoint, LineSettings, Timings
+from busmaster import Endpoint, LineDown, LineSettings, Refused, Timings
 from busmaster.app.service.values import value_text
-from busmaster.errors import LineDown, Refused, cause_text
 from busmaster.ext import (
     QUIET,
     Attempt,
@@ -32,6 +31,7 @@ from busmaster.ext import (
     Profile,
     Tap,
     Verdict,
+    cause_text,
     clock_of,
     is_paced,
     open_port,

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from busmaster import Endpoint, LineSettings
+from busmaster import Endpoint, LineDown, LineSettings
 from busmaster.app.diagnostics.diagnosis import garbage, known_frames, speed
 from busmaster.app.diagnostics.examination import OPENING, Course, unseen
 from busmaster.app.diagnostics.probing import Outcome, Probe, Prober, Wire
 from busmaster.app.diagnostics.steps import LISTENING, Step, ranges
-from busmaster.errors import LineDown
-from busmaster.ext import QUIET
-from busmaster.registry import NodeKind, Protocol
+from busmaster.ext import QUIET, NodeKind, Protocol
 
 RECOGNISING = 1.0
 """Seconds in which talk is listened to with each of the settings."""

@@ -6,10 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 
-from busmaster import LineSettings
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Profile
-from busmaster.registry import NodeKind, protocols
+from busmaster import InvalidCommand, LineSettings
+from busmaster.ext import NodeKind, Profile, protocols
 
 USUAL = range(1, 9)
 """The nodes that are tried unless others are named."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from busmaster.app.diagnostics.adapters import Finding
-from busmaster.statistics import DriverErrors
+from busmaster.ext import DriverErrors
 
 UART_ERRORS = {
     "framing": ("framing error", "wrong baud rate, or no termination; then missing biasing, swapped wires A and B"),

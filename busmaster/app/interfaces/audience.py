@@ -6,10 +6,10 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
+from busmaster import BusError
 from busmaster.app.interfaces.following import Following, Lost
 from busmaster.app.service.messages import encode_json
 from busmaster.app.service.remote_exchanges import RemoteExchanges
-from busmaster.errors import BusError
 
 MOST_EXCHANGES = 50
 """Messages of exchanges that one page has not taken; of more, the oldest are dropped."""

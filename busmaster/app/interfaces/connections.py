@@ -17,8 +17,8 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
+from busmaster.app.bounds import MOST_PAGE_CONNECTIONS, REQUEST_WITHIN, SEND_WITHIN
 from busmaster.app.service.refusals import LimitedReport
-from busmaster.bounds import MOST_PAGE_CONNECTIONS, REQUEST_WITHIN, SEND_WITHIN
 
 RESERVED = 128
 """Descriptors that connections leave: for those that are accepted before others are closed, for files and sockets."""

@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from busmaster import BusError, InvalidCommand, LineDown, NotStarted
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.picture import CURRENT, OLD_AFTER, Picture, Row
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.remote_overview import RemoteOverview
-from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
 
 FIRST_PAUSE = 0.25
 """Seconds before it is tried again to connect; each time twice as long, up to `LONGEST_PAUSE`."""

@@ -24,7 +24,18 @@ from math import inf
 from typing import Any, TypeAlias
 from weakref import WeakValueDictionary
 
-from busmaster import Priority, Quality
+from busmaster import (
+    BacklogFull,
+    BusError,
+    InvalidCommand,
+    LineDown,
+    NotStarted,
+    Priority,
+    Quality,
+    Refused,
+    Superseded,
+)
+from busmaster.app.bounds import REQUEST_WITHIN
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.reported_refusals import ReportedRefusals
 from busmaster.app.service.picture import Row
@@ -33,10 +44,7 @@ from busmaster.app.service.refusals import LimitedReport, peer_of
 from busmaster.app.service.remote import RemoteBus
 from busmaster.app.service.tcp import listening
 from busmaster.app.service.touches import Touches
-from busmaster.bounds import REQUEST_WITHIN
-from busmaster.errors import BacklogFull, BusError, InvalidCommand, LineDown, NotStarted, Refused, Superseded
-from busmaster.ext import meant, read_file
-from busmaster.registry import protocols
+from busmaster.ext import meant, protocols, read_file
 
 OWN_UNITS = (0, 255)
 """Unit ids of the server itself, by the Modbus TCP guide: with --pass-through only these have the points."""

@@ -19,7 +19,8 @@ from asyncua.crypto.permission_rules import User
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from busmaster import Snapshot
+from busmaster import BusError, InvalidCommand, LineDown, Snapshot
+from busmaster.app.bounds import MOST_SHOWN_POINTS
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua_access import Rules, guard
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
@@ -40,8 +41,6 @@ from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.remote import RemoteBus
 from busmaster.app.service.touches import Touches
-from busmaster.bounds import MOST_SHOWN_POINTS
-from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.ext import read_file
 
 LOOK_EVERY = 0.25

@@ -13,11 +13,11 @@ from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.server.address_space import AddressSpace, AttributeService
 
+from busmaster.app.bounds import MOST_CONNECTIONS, MOST_SUBSCRIPTIONS
 from busmaster.app.interfaces.opcua_sessions import use_sessions
 from busmaster.app.interfaces.opcua_terms import CODES
 from busmaster.app.service.permission import Access
 from busmaster.app.service.refusals import Logins
-from busmaster.bounds import MOST_CONNECTIONS, MOST_SUBSCRIPTIONS
 
 OPEN = [ua.SecurityPolicyType.NoSecurity]
 SIGNED = [

@@ -14,8 +14,7 @@ from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import header_from_binary, nodeid_from_binary, struct_from_binary
 
-from busmaster.app.interfaces.opcua_terms import CODES
-from busmaster.bounds import (
+from busmaster.app.bounds import (
     LONGEST_OPCUA_CHUNK,
     LONGEST_OPCUA_HELLO,
     LONGEST_OPCUA_REQUEST,
@@ -23,6 +22,7 @@ from busmaster.bounds import (
     MOST_WAITING_WRITES,
     SESSION_WITHIN,
 )
+from busmaster.app.interfaces.opcua_terms import CODES
 
 WRITE = ua.NodeId(ua.ObjectIds.WriteRequest_Encoding_DefaultBinary)
 CREATE_SESSION = ua.NodeId(ua.ObjectIds.CreateSessionRequest_Encoding_DefaultBinary)

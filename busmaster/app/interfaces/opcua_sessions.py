@@ -16,8 +16,7 @@ from asyncua.server.monitored_item_service import MonitoredItemService
 from asyncua.server.subscription_service import SubscriptionService
 from asyncua.ua.uaprotocol_auto import DataChangeFilter, EventFilter  # those of `ua` are subclasses
 
-from busmaster.app.interfaces.opcua_terms import CODES, NUMBERS
-from busmaster.bounds import (
+from busmaster.app.bounds import (
     LONGEST_ITEM_QUEUE,
     LONGEST_PUBLISHING,
     MOST_ITEMS,
@@ -27,6 +26,7 @@ from busmaster.bounds import (
     MOST_UNACKNOWLEDGED,
     SHORTEST_PUBLISHING,
 )
+from busmaster.app.interfaces.opcua_terms import CODES, NUMBERS
 
 WRITE_BIT = ua.AccessLevel.CurrentWrite.mask
 BINARY = (None, "", "Default Binary")

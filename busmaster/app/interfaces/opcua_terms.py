@@ -8,10 +8,9 @@ from typing import Any
 
 from asyncua import ua
 
-from busmaster import Quality, Sample
+from busmaster import GarbledReply, LineDown, LineNoisy, NodeDown, NoReply, NoSuchParameter, Quality, Refused, Sample
 from busmaster.app.service.authorisation import outcome_of
 from busmaster.app.service.record import Outcome
-from busmaster.errors import GarbledReply, LineDown, LineNoisy, NodeDown, NoReply, NoSuchParameter, Refused
 
 CODES = ua.StatusCodes
 GOOD: int = CODES.Good

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
 
+from busmaster import LineDown
+from busmaster.app.bounds import MOST_REPORTED
 from busmaster.app.interfaces.following import Following
 from busmaster.app.service.refusals import OTHERS, LimitedReport, failed_text
-from busmaster.bounds import MOST_REPORTED
-from busmaster.errors import LineDown
 
 REPORT_EVERY = 1.0
 """Seconds from one message to the line's owner to the next: a guesser fails a thousand times a second."""

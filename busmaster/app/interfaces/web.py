@@ -25,6 +25,15 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from busmaster import BacklogFull, BusClosed, BusError, InvalidCommand, LineDown, NoReply, NotStarted, Refused
+from busmaster.app.bounds import (
+    HISTORY_THREADS,
+    LONGEST_COMMAND,
+    LONGEST_PAGE_MESSAGE,
+    MOST_HISTORY,
+    MOST_PAGES,
+    MOST_SAMPLES,
+)
 from busmaster.app.interfaces.audience import Audience, Seat
 from busmaster.app.interfaces.connections import Crowd
 from busmaster.app.interfaces.following import Following, Lost
@@ -35,24 +44,6 @@ from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.refusals import Logins, wait_text
 from busmaster.app.service.tcp import HostPort, listening
-from busmaster.bounds import (
-    HISTORY_THREADS,
-    LONGEST_COMMAND,
-    LONGEST_PAGE_MESSAGE,
-    MOST_HISTORY,
-    MOST_PAGES,
-    MOST_SAMPLES,
-)
-from busmaster.errors import (
-    BacklogFull,
-    BusClosed,
-    BusError,
-    InvalidCommand,
-    LineDown,
-    NoReply,
-    NotStarted,
-    Refused,
-)
 
 PAGE = Path(__file__).parent / "page"
 NUMBER = re.compile(r"[-+]?[0-9]{1,20}(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,3})?")

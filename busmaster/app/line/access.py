@@ -6,10 +6,9 @@ from collections.abc import Hashable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Any, Protocol
 
-from busmaster import Point
+from busmaster import InvalidCommand, Point
 from busmaster.app.config.service import RoleSection, ServiceSection
 from busmaster.app.service.permission import Access, Permission
-from busmaster.errors import InvalidCommand
 from busmaster.ext import Handle, Placed
 
 ALL = "*"

@@ -17,13 +17,13 @@ from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
+from busmaster import InvalidCommand
 from busmaster.app.config.emulated import emulated_line
 from busmaster.app.config.names import expanded, listed
 from busmaster.app.config.sections import LineFile, read
 from busmaster.app.config.source import FileError, Key, Source
 from busmaster.app.config.table import Table
 from busmaster.app.line.configured_line import ConfiguredLine
-from busmaster.errors import InvalidCommand
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from operator import is_
 from types import TracebackType
 from typing import Any, Unpack
 
-from busmaster import Bus, Endpoint, Node, Point, PollGroup, ext
+from busmaster import Bus, Endpoint, InvalidCommand, Node, Point, PollGroup, ext
 from busmaster.app.config.names import SHOWN, expanded, listed
 from busmaster.app.config.point_section import PointSection, check_suits, sort_of
 from busmaster.app.config.points import NamedPoint, Scale
@@ -22,9 +22,8 @@ from busmaster.app.line.safe_state import SafeState, SafeWrite
 from busmaster.app.outputs.distributor import Distributor, Wanted
 from busmaster.app.outputs.kinds import find
 from busmaster.app.service.authorisation import Authorisation
-from busmaster.bounds import MOST_MEMBERS
-from busmaster.errors import InvalidCommand
 from busmaster.ext import (
+    MOST_MEMBERS,
     Handle,
     Limit,
     NodeSource,

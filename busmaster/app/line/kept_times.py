@@ -19,8 +19,7 @@ from typing import Any
 import anyio
 
 from busmaster import Bus, Node, ext
-from busmaster.ext import open_file, read_file
-from busmaster.statistics import LearnedTimes
+from busmaster.ext import LearnedTimes, open_file, read_file
 
 VERSION = 2
 """Of the file's form. Another one is started anew."""

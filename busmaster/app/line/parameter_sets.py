@@ -14,16 +14,25 @@ from datetime import datetime
 from types import TracebackType
 from typing import Any
 
-from busmaster import ext
+from busmaster import InvalidCommand, ext
 from busmaster.app.config.points import Scale
 from busmaster.app.config.rewriting import toml_text
 from busmaster.app.config.source import Source
 from busmaster.app.config.table import Table, shown
 from busmaster.app.line.configured_line import ConfiguredLine
-from busmaster.bounds import MOST_MEMBERS
-from busmaster.errors import InvalidCommand
-from busmaster.ext import Entry, Found, Handle, Parameter, ParameterSet, Value, open_file, read_file
-from busmaster.registry import NodeKind, find
+from busmaster.ext import (
+    MOST_MEMBERS,
+    Entry,
+    Found,
+    Handle,
+    NodeKind,
+    Parameter,
+    ParameterSet,
+    Value,
+    find,
+    open_file,
+    read_file,
+)
 
 FORMAT = 1
 PART = ".part"

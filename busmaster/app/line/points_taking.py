@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+from busmaster import InvalidCommand
 from busmaster.app.config.point_section import POINT_KEYS, PointSection, check_suits, read_point
 from busmaster.app.config.rewriting import Entries, rewritten, toml_text
 from busmaster.app.config.sections import LineFile, NodeSection, read
@@ -23,7 +24,6 @@ from busmaster.app.config.templates import read_template
 from busmaster.app.line.configured_line import ConfiguredLine
 from busmaster.app.line.points_table import COLUMNS, NODE, POINT, TEXTS, rows, sections
 from busmaster.app.outputs.cells import text_of
-from busmaster.errors import InvalidCommand
 from busmaster.ext import meant
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")

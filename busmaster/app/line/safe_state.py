@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import anyio
 
-from busmaster import Bus, Node, Priority, ext
+from busmaster import Bus, BusClosed, BusError, InvalidCommand, Node, NotStarted, Priority, ext
+from busmaster.app.bounds import LONGEST_SAFE_STATE
 from busmaster.app.config.points import NamedPoint
 from busmaster.app.service.authorisation import Authorisation, WriteRequest, outcome_of
 from busmaster.app.service.permission import Permission
 from busmaster.app.service.record import Outcome
-from busmaster.bounds import LONGEST_SAFE_STATE
-from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
 from busmaster.ext import Command, Handle, Send
 
 LOOK_AGAIN = 0.05

@@ -20,11 +20,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
-from busmaster import Bus, Point, Snapshot
+from busmaster import Bus, InvalidCommand, Point, Snapshot
 from busmaster.app.outputs.settings import Settings
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.record import WriteRecord
-from busmaster.errors import InvalidCommand
 
 TICK = 0.05
 PAUSE = 0.0002

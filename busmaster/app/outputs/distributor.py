@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import anyio
 
 from busmaster import Bus, Point, Snapshot, ext
+from busmaster.app.bounds import AUDIT_WITHIN
 from busmaster.app.outputs.base import Happening, Output, OutputLine, OutputStatistics
 from busmaster.app.outputs.exceptions import News
 from busmaster.app.outputs.kinds import find
@@ -18,7 +19,6 @@ from busmaster.app.outputs.settings import Settings
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import event_text, micros
-from busmaster.bounds import AUDIT_WITHIN
 from busmaster.events import (
     AlarmChanged,
     BusEvent,

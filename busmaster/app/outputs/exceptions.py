@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from busmaster import Point, Quality, Sample, Snapshot
-from busmaster.errors import BusError
+from busmaster import BusError, Point, Quality, Sample, Snapshot
 
 ROUNDING = 1e-6
 """Seconds by which two moments of a grid may seem nearer to each other than they are."""

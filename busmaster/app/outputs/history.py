@@ -16,8 +16,8 @@ from math import inf, nextafter
 from typing import NamedTuple
 from urllib.parse import quote
 
+from busmaster.app.bounds import HISTORY_WITHIN
 from busmaster.app.outputs.sqlite import VERSION
-from busmaster.bounds import HISTORY_WITHIN
 
 STEPS = 10_000
 """Instructions of SQLite between two looks at the clock: less than a millisecond."""

@@ -12,8 +12,8 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from busmaster import InvalidCommand
 from busmaster.app.outputs.base import OutputKind
-from busmaster.errors import InvalidCommand
 from busmaster.ext import meant
 
 if TYPE_CHECKING:

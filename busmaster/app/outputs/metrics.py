@@ -21,8 +21,7 @@ from busmaster.app.outputs.settings import MetricsSettings
 from busmaster.app.service.refusals import TOO_FAST, Refusals
 from busmaster.app.service.rights import Role
 from busmaster.app.service.values import micros
-from busmaster.ext import RecentUtilisation
-from busmaster.statistics import LineStatistics, NodeStatistics
+from busmaster.ext import LineStatistics, NodeStatistics, RecentUtilisation
 
 if TYPE_CHECKING:
     from prometheus_client.core import HistogramMetricFamily, Metric

@@ -41,6 +41,7 @@ import anyio
 from anyio.abc import TaskStatus
 
 from busmaster import Bus, LineState, Point, Sample, Snapshot, ext
+from busmaster.app.bounds import LONGEST_TOPIC
 from busmaster.app.outputs.base import PAUSE, TICK, Item, OutputKind, OutputLine, Unsuitable, check_extra, size_of
 from busmaster.app.outputs.home_assistant import HomeAssistant
 from busmaster.app.outputs.mqtt_commands import Answer, Commands, Inbox
@@ -52,7 +53,6 @@ from busmaster.app.outputs.spool import Record
 from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import cycle_fields, json_line, micros, sample_fields, write_fields
-from busmaster.bounds import LONGEST_TOPIC
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message

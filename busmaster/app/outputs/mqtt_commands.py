@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import anyio
 
-from busmaster import Point
+from busmaster import InvalidCommand, Point
+from busmaster.app.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.payload import NoCommand, read_payload
 from busmaster.app.service.record import WriteRecord
-from busmaster.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
-from busmaster.errors import InvalidCommand
 
 if TYPE_CHECKING:
     from aiomqtt import Message

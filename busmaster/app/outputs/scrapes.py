@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from busmaster.bounds import LONGEST_SCRAPE, MOST_ASKING, MOST_SILENT
+from busmaster.app.bounds import LONGEST_SCRAPE, MOST_ASKING, MOST_SILENT
 
 if TYPE_CHECKING:
     from prometheus_client.core import CollectorRegistry

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias
 
-from busmaster.bounds import MOST_BUFFERED, MOST_SPILLED
-from busmaster.errors import InvalidCommand
+from busmaster import InvalidCommand
+from busmaster.app.bounds import MOST_BUFFERED, MOST_SPILLED
 from busmaster.ext import MODE, Between, Parsed, read_file
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 
+from busmaster import InvalidCommand
 from busmaster.app.outputs.base import BATCH, Output, check_folder
 from busmaster.app.outputs.settings import SpillingSettings
 from busmaster.app.outputs.spool import Record, Spool
-from busmaster.errors import InvalidCommand
 
 SPILL_EVERY = 0.2
 """Seconds between two movings of what waits to disk, while the output is down."""

@@ -11,8 +11,8 @@ import sqlite3
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from busmaster import InvalidCommand
 from busmaster.app.outputs.damaged import is_damaged, move_aside
-from busmaster.errors import InvalidCommand
 from busmaster.ext import MODE, open_file
 
 PIECE = 1_000

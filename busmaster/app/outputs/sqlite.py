@@ -11,6 +11,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
+from busmaster import InvalidCommand
 from busmaster.app.outputs.base import Happening, Item, OutputKind, check_folder
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.damaged import is_damaged, move_aside
@@ -19,7 +20,6 @@ from busmaster.app.outputs.retention import Retention
 from busmaster.app.outputs.settings import SqliteSettings
 from busmaster.app.service.record import WriteRecord
 from busmaster.app.service.values import json_value, micros, write_fields
-from busmaster.errors import InvalidCommand
 from busmaster.ext import Named, open_file
 
 VERSION = 2

@@ -11,13 +11,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from typing import Any
 
-from busmaster.app.service.client import Client
-from busmaster.app.service.client_connection import ClientConnection
-from busmaster.app.service.messages import Malformed
-from busmaster.app.service.permission import Permission
-from busmaster.app.service.refusals import Refusals
-from busmaster.app.service.rights import RIGHTS, Role
-from busmaster.bounds import (
+from busmaster.app.bounds import (
     CONNECTIONS_A_SECOND,
     FREE_CONNECTIONS,
     MOST_CLIENTS,
@@ -26,6 +20,12 @@ from busmaster.bounds import (
     MOST_STRANGERS,
     RESERVED_FOR_SAFE,
 )
+from busmaster.app.service.client import Client
+from busmaster.app.service.client_connection import ClientConnection
+from busmaster.app.service.messages import Malformed
+from busmaster.app.service.permission import Permission
+from busmaster.app.service.refusals import Refusals
+from busmaster.app.service.rights import RIGHTS, Role
 
 
 class Admission:

@@ -11,21 +11,23 @@ from math import inf
 from types import TracebackType
 from typing import Any, Protocol, TypeAlias
 
-from busmaster import Bus, Point, ext
-from busmaster.app.service.permission import EVERYTHING, Access, Permission
-from busmaster.app.service.record import Outcome, WriteRecord, cut, this_user
-from busmaster.app.service.refusals import Refusals
-from busmaster.bounds import MOST_AT_ONCE
-from busmaster.errors import (
+from busmaster import (
+    Bus,
     BusError,
     InvalidCommand,
     NodeDown,
     NotStarted,
+    Point,
     Refused,
     Superseded,
     VerifyFailed,
     WriteUnconfirmed,
+    ext,
 )
+from busmaster.app.bounds import MOST_AT_ONCE
+from busmaster.app.service.permission import EVERYTHING, Access, Permission
+from busmaster.app.service.record import Outcome, WriteRecord, cut, this_user
+from busmaster.app.service.refusals import Refusals
 from busmaster.ext import Command
 
 FRESH = 1.0

@@ -9,7 +9,16 @@ from dataclasses import replace
 from itertools import islice
 from typing import Any, TypeAlias
 
-from busmaster import Node, Point, PollGroup, ext
+from busmaster import InvalidCommand, Node, Point, PollGroup, ext
+from busmaster.app.bounds import (
+    LONGEST_SENDER,
+    MOST_HOLDS,
+    MOST_NODES,
+    MOST_POLLED,
+    MOST_POLLED_POINTS,
+    MOST_REPORTED,
+    MOST_STREAMS,
+)
 from busmaster.app.service import client_messages as messages
 from busmaster.app.service.client_messages import ClientMessage, RequestParams
 from busmaster.app.service.client_requests import ClientRequest, Writing, client_request_of
@@ -56,16 +65,6 @@ from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Rights, Role
 from busmaster.app.service.streams import Broadcast
 from busmaster.app.service.typed import Raw
-from busmaster.bounds import (
-    LONGEST_SENDER,
-    MOST_HOLDS,
-    MOST_NODES,
-    MOST_POLLED,
-    MOST_POLLED_POINTS,
-    MOST_REPORTED,
-    MOST_STREAMS,
-)
-from busmaster.errors import InvalidCommand
 from busmaster.ext import (
     ORDINARY,
     Hold,

@@ -7,6 +7,7 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
+from busmaster.app.bounds import HELLO_WITHIN, LONGEST_REQUEST
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_messages import ClientMessage
 from busmaster.app.service.connection import GOING_AWAY, POLICY, IncomingConnection
@@ -19,7 +20,6 @@ from busmaster.app.service.messages import (
 )
 from busmaster.app.service.owner_messages import ErrorForm
 from busmaster.app.service.peers import Peer
-from busmaster.bounds import HELLO_WITHIN, LONGEST_REQUEST
 
 if TYPE_CHECKING:
     from websockets.http11 import Request

@@ -5,6 +5,13 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from busmaster import Priority
+from busmaster.app.bounds import (
+    MOST_CHECKED,
+    MOST_PLANNED_GROUPS,
+    MOST_PLANNED_READS,
+    MOST_POLLED_POINTS,
+    MOST_SYNC_READS,
+)
 from busmaster.app.service.fields import (
     Address,
     CommandForm,
@@ -21,18 +28,7 @@ from busmaster.app.service.fields import (
     Value,
 )
 from busmaster.app.service.typed import Meta, Raw, Struct, field
-from busmaster.bounds import (
-    LONGEST_HOLD,
-    LONGEST_PERIOD,
-    LONGEST_SUSPENSION,
-    MOST_CHECKED,
-    MOST_PLANNED_GROUPS,
-    MOST_PLANNED_READS,
-    MOST_POLLED_POINTS,
-    MOST_RETRIES,
-    MOST_SYNC_READS,
-    SHORTEST_PERIOD,
-)
+from busmaster.ext import LONGEST_HOLD, LONGEST_PERIOD, LONGEST_SUSPENSION, MOST_RETRIES, SHORTEST_PERIOD
 
 
 class ClientMessage(Struct, frozen=True):

@@ -7,7 +7,8 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
-from busmaster import Node, Point, ext
+from busmaster import InvalidCommand, Node, NotStarted, Point, WriteUnconfirmed, ext
+from busmaster.app.bounds import LONGEST_WAIT
 from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
 from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.encoding import protocol_of
@@ -19,8 +20,6 @@ from busmaster.app.service.permission import Permission
 from busmaster.app.service.record import RAW_COMMAND
 from busmaster.app.service.rights import Rights
 from busmaster.app.service.typed import asdict
-from busmaster.bounds import LONGEST_WAIT
-from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.ext import (
     ORDINARY,
     Changing,

@@ -11,11 +11,11 @@ from collections.abc import Callable
 from math import inf
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from busmaster import InvalidCommand
+from busmaster.app.bounds import MOST_FRAMES, SEND_WITHIN
 from busmaster.app.service.frames import NO_MASK, look_at, new_key, text_frame
 from busmaster.app.service.peers import CREDENTIALS
 from busmaster.app.service.refusals import peer_of
-from busmaster.bounds import MOST_FRAMES, SEND_WITHIN
-from busmaster.errors import InvalidCommand
 
 if TYPE_CHECKING:
     from websockets.client import ClientProtocol

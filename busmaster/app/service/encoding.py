@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple, Protocol, cast
 
-from busmaster import Bus, Point, Quality, Sample, Snapshot
+from busmaster import Bus, GarbledReply, InvalidCommand, Point, Quality, Sample, Snapshot
 from busmaster.app.service.failures import bus_error_of, error_data
 from busmaster.app.service.fields import GroupForm, PointForm
 from busmaster.app.service.messages import encode_number, encode_value, value_of
@@ -26,7 +26,6 @@ from busmaster.app.service.owner_messages import (
     StatisticsResult,
 )
 from busmaster.app.service.typed import Raw, convert, to_builtins
-from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.events import (
     AlarmChanged,
     BusEvent,
@@ -37,10 +36,8 @@ from busmaster.events import (
     PortFailed,
     RepliesLate,
 )
-from busmaster.ext import NodeRecord, Profile, Requester
-from busmaster.registry import Protocol as BusProtocol
-from busmaster.registry import protocols
-from busmaster.statistics import DriverErrors, LineStatistics, Quantiles
+from busmaster.ext import DriverErrors, LineStatistics, NodeRecord, Profile, Quantiles, Requester, protocols
+from busmaster.ext import Protocol as BusProtocol
 
 
 class FindNode(Protocol):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from busmaster import errors
+from collections.abc import Iterator
+
+from busmaster import BusError, InvalidCommand, Refused
 from busmaster.app.service.fields import BusErrorData, InvalidCommandData
 from busmaster.app.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS, InvalidParams, Malformed, encode
 from busmaster.app.service.owner_messages import ErrorForm
 from busmaster.app.service.typed import UNSET, Decoder, Raw, Struct, UnsetType
-from busmaster.errors import BusError, InvalidCommand, Refused
 
 FIELDS = ("what", "line", "label", "address", "command", "attempts", "hint")
 DEEPEST = 5
@@ -23,11 +24,17 @@ REFUSED = (
     RecursionError,  # a list in a list in a list
 )
 """Exceptions of a request: from the line, or from values whose type is the protocol's affair."""
-KNOWN: dict[str, type[BusError]] = {
-    name: thing
-    for name in errors.__all__
-    if isinstance(thing := getattr(errors, name), type) and issubclass(thing, BusError)
-}
+
+
+def _classes(kind: type[BusError]) -> Iterator[type[BusError]]:
+    """Yield a class and its subclasses."""
+    yield kind
+    for subclass in kind.__subclasses__():
+        yield from _classes(subclass)
+
+
+KNOWN = {kind.__name__: kind for kind in _classes(BusError) if kind.__module__ == BusError.__module__}
+"""The errors of the library, by name. Those of a program are unknown to its clients."""
 
 
 def encode_error(error: Exception) -> ErrorForm:

@@ -1,13 +1,13 @@
-"""The types of fields that several messages of the service have. Their limits are those of `busmaster.bounds`."""
+"""The types of fields that several messages of the service have. Their limits are in `busmaster.app.bounds`."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, TypeAlias
 
 from busmaster import Health, Priority, Quality
+from busmaster.app.bounds import LONGEST_REPLY, LONGEST_WAIT
 from busmaster.app.service.typed import UNSET, Meta, Raw, Struct, UnsetType
-from busmaster.bounds import LONGEST_REPLY, LONGEST_WAIT, MOST_RETRIES
-from busmaster.ext import CommandOptions
+from busmaster.ext import MOST_RETRIES, CommandOptions
 
 LARGEST_STREAM = 2**53
 """The largest whole number that every client has, JavaScript included."""

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
-from busmaster.bounds import LONGEST_LINE_RECORD
-from busmaster.errors import InvalidCommand, LineDown
+from busmaster import InvalidCommand, LineDown
+from busmaster.app.bounds import LONGEST_LINE_RECORD
 from busmaster.ext import host_and_port, read_file
 
 SYSTEM = Path("/run/busmaster")

@@ -7,7 +7,7 @@ from functools import partial
 from math import inf, nextafter
 from typing import Any
 
-from busmaster import Bus, Node, Point, PollGroup, ext
+from busmaster import Bus, InvalidCommand, Node, Point, PollGroup, ext
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.exchanges import ExchangesBroadcast
 from busmaster.app.service.overview import EventLog, Overview
@@ -15,7 +15,6 @@ from busmaster.app.service.plans import Planner
 from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.app.service.safe import SafeStateRequests
 from busmaster.app.service.streams import Broadcast, EventBroadcast, GroupBroadcast
-from busmaster.errors import InvalidCommand
 from busmaster.ext import NodeRecord, Placed
 
 MOST_NAMED = 50

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
+from busmaster import BusClosed, BusError, LineDown, NoReply, NotStarted, WriteUnconfirmed
+from busmaster.app.bounds import LONGEST_ANSWER
 from busmaster.app.service.client_messages import CancelParams, HelloParams
 from busmaster.app.service.connection import OutgoingConnection, check_installed
 from busmaster.app.service.failures import START_OWNER, error_of
@@ -23,17 +25,7 @@ from busmaster.app.service.messages import (
 )
 from busmaster.app.service.owner_messages import HelloResult, OwnerMessage
 from busmaster.app.service.typed import Struct, UnsetType
-from busmaster.bounds import LONGEST_ANSWER
-from busmaster.errors import (
-    Addressed,
-    BusClosed,
-    BusError,
-    LineDown,
-    NoReply,
-    NotStarted,
-    WriteUnconfirmed,
-)
-from busmaster.ext import Command, host_and_port
+from busmaster.ext import Command, Requester, host_and_port
 
 GRACE = 0.25
 """Seconds after `finish_within` in which the line's owner, which knows more, can send the result of a request."""
@@ -57,7 +49,7 @@ class PendingRequest:
         method: str,
         future: asyncio.Future[Any],
         writes: bool,
-        node: Addressed | None,
+        node: Requester | None,
         command: Command[Any] | None,
         handed: bool = False,
     ) -> None:
@@ -162,7 +154,7 @@ class Link:
         params: Struct,
         *,
         writes: bool = False,
-        node: Addressed | None = None,
+        node: Requester | None = None,
         command: Command[Any] | None = None,
     ) -> PendingRequest:
         """Send a request after all earlier messages. Its future gets the result. Raises LineDown or BusClosed."""
@@ -178,7 +170,7 @@ class Link:
             self._waiting.append((message, pending))
         return pending
 
-    def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
+    def check(self, node: Requester | None = None, command: Command[Any] | None = None) -> None:
         """Raise LineDown or BusClosed with the reason if the connection is over."""
         if self._over is not None:
             kind, what, hint = self._over

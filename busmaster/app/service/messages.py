@@ -13,12 +13,12 @@ from collections.abc import Set as AbstractSet
 from math import isfinite
 from typing import Any, NamedTuple, get_args
 
+from busmaster import InvalidCommand
+from busmaster.app.bounds import MOST_PARTS
 from busmaster.app.service import client_messages as client
 from busmaster.app.service import owner_messages as owner
 from busmaster.app.service.fields import BusErrorData, GroupForm, NonFinite, Number, Value
 from busmaster.app.service.typed import DecodeError, Decoder, Encoder, Raw, Struct, ValidationError, to_builtins
-from busmaster.bounds import MOST_PARTS
-from busmaster.errors import InvalidCommand
 
 VERSIONS = (3,)
 """Versions of the service protocol. A client names those that it knows first; the highest common one holds."""

@@ -6,7 +6,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable
 from typing import Protocol
 
-from busmaster.bounds import MOST_UNREAD, MOST_WAITING
+from busmaster.app.bounds import MOST_UNREAD, MOST_WAITING
 
 
 class MessageSink(Protocol):

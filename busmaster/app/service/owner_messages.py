@@ -28,7 +28,7 @@ from busmaster.app.service.fields import (
 )
 from busmaster.app.service.typed import UNSET, Meta, Raw, Struct, UnsetType
 from busmaster.events import LineChange
-from busmaster.statistics import Timeline
+from busmaster.ext import Timeline
 
 Body = TypeVar("Body")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any, NamedTuple, TypeGuard
 
-from busmaster.bounds import LARGEST_VALUE, LONGEST_COMMAND, LONGEST_ID
-from busmaster.errors import InvalidCommand
+from busmaster import InvalidCommand
+from busmaster.app.bounds import LARGEST_VALUE, LONGEST_COMMAND, LONGEST_ID
 
 LATEST = 1e11
 """Seconds since 1970. A later time, some thousand years from now, is in milliseconds."""

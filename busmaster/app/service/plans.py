@@ -7,16 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from busmaster import Bus, LineSettings, Priority, ext
+from busmaster import Bus, InvalidCommand, LineSettings, Priority, ext
+from busmaster.app.bounds import MOST_PLANNED_GROUPS, MOST_PLANNED_READS
 from busmaster.app.service.client_messages import PlannedGroupForm, PlannedRead
 from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.messages import encode_value, value_of
 from busmaster.app.service.owner_messages import PlanResult
 from busmaster.app.service.reply_times import encode_timings, timings_of
 from busmaster.app.service.typed import convert, to_builtins
-from busmaster.bounds import LONGEST_PERIOD, MOST_PLANNED_GROUPS, MOST_PLANNED_READS, SHORTEST_PERIOD
-from busmaster.errors import InvalidCommand
 from busmaster.ext import (
+    LONGEST_PERIOD,
+    SHORTEST_PERIOD,
     Command,
     GroupPlan,
     Learned,

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 
-from busmaster.bounds import (
+from busmaster.app.bounds import (
     FREE_LOGINS,
     LOGINS_FORGOTTEN,
     LONGEST_LOGIN_PAUSE,

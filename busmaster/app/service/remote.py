@@ -11,7 +11,8 @@ from math import inf
 from types import TracebackType
 from typing import Any, TypeAlias, TypeVar
 
-from busmaster import Point, Priority, Sample, Timings
+from busmaster import BusClosed, BusError, InvalidCommand, Point, Priority, Sample, Timings
+from busmaster.app.bounds import LONGEST_REQUEST, MOST_CHECKED
 from busmaster.app.service.client_messages import (
     GatherParams,
     NodeParams,
@@ -50,12 +51,19 @@ from busmaster.app.service.reply_times import encode_timings
 from busmaster.app.service.safe import outcomes_of
 from busmaster.app.service.sequences import RequestLimit
 from busmaster.app.service.typed import Struct, replace, to_builtins
-from busmaster.bounds import LONGEST_REQUEST, MOST_CHECKED
-from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.events import BusEvent, Stream
-from busmaster.ext import Command, Learned, Plan, PlannedGroup, Profile, checked_priority, find_group, seconds
-from busmaster.registry import protocols
-from busmaster.statistics import LineStatistics
+from busmaster.ext import (
+    Command,
+    Learned,
+    LineStatistics,
+    Plan,
+    PlannedGroup,
+    Profile,
+    checked_priority,
+    find_group,
+    protocols,
+    seconds,
+)
 
 T = TypeVar("T")
 RequestGroup: TypeAlias = Callable[[RemoteGroup, int], Awaitable[None]]

@@ -6,10 +6,9 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
-from busmaster import Point, Snapshot
+from busmaster import BusError, InvalidCommand, Point, Snapshot
 from busmaster.app.service.encoding import FindNode, owners_point_of, snapshot_of
 from busmaster.app.service.owner_messages import NoBody, PointsBody, SnapshotBody, StreamMessage
-from busmaster.errors import BusError, InvalidCommand
 from busmaster.events import Stream
 from busmaster.ext import Cycles
 

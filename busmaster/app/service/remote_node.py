@@ -7,14 +7,13 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, Unpack
 
-from busmaster import Point, Sample
+from busmaster import InvalidCommand, Point, Sample
 from busmaster.app.service.client_messages import CheckParams, RequestParams, StopParams
 from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.fields import OptionsForm, shortened
 from busmaster.app.service.link import Link
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.sequences import HoldsLine, RequestLimit, held_remotely
-from busmaster.errors import InvalidCommand
 from busmaster.ext import (
     ORDINARY,
     URGENT,

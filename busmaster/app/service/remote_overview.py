@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from busmaster import BusError
 from busmaster.app.service.client_messages import (
     DemandParams,
     DetailsParams,
@@ -18,7 +19,6 @@ from busmaster.app.service.link import Link
 from busmaster.app.service.messages import encode_value
 from busmaster.app.service.owner_messages import StreamMessage
 from busmaster.app.service.typed import Struct, to_builtins
-from busmaster.errors import BusError
 
 SOON = 1.0
 """Seconds within which a user's write must begin. Later it may not be wanted any more."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from busmaster import ReplyTiming, Timings
+from busmaster import InvalidCommand, ReplyTiming, Timings
+from busmaster.app.bounds import LONGEST_REPLY
 from busmaster.app.service.fields import ReplyTimesForm, TimingForm, TimingsForm
 from busmaster.app.service.typed import UNSET, UnsetType
-from busmaster.bounds import LONGEST_REPLY
-from busmaster.errors import InvalidCommand
 from busmaster.ext import Learned, Profile, documented
 
 STEPS = ("read", "write", "packet")

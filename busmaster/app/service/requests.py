@@ -8,15 +8,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from busmaster import Priority
+from busmaster import BacklogFull, BusClosed, BusError, InvalidCommand, Priority, WriteUnconfirmed
+from busmaster.app.bounds import MOST_REQUESTS, MOST_URGENT
 from busmaster.app.service.client_messages import RequestParams, SafeParams, WriteParams
 from busmaster.app.service.client_requests import BY_OWNER, ClientRequest, RequestSender, Writing, client_request_of
 from busmaster.app.service.failures import REFUSED, START_OWNER, refusal_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import Malformed, encode_value
 from busmaster.app.service.safe import SafeResult
-from busmaster.bounds import MOST_REQUESTS, MOST_URGENT
-from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
 
 
 class Requests:

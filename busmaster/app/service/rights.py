@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from busmaster import Priority
-from busmaster.bounds import RESERVED_FOR_ADMINS, RESERVED_FOR_WRITERS
+from busmaster.app.bounds import RESERVED_FOR_ADMINS, RESERVED_FOR_WRITERS
 from busmaster.ext import BACKGROUND, COMMAND, POLL, URGENT
 
 

@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Mapping
 from typing import TypeAlias
 
+from busmaster import BusError, InvalidCommand
 from busmaster.app.service.authorisation import Authorisation, SafeWrites
 from busmaster.app.service.failures import bus_error_of, error_data
 from busmaster.app.service.fields import BusErrorData
 from busmaster.app.service.peers import Peer
 from busmaster.app.service.values import number_text
-from busmaster.errors import BusError, InvalidCommand
 
 SafeResult: TypeAlias = dict[str, BusErrorData | None]
 """For each point why it is not confirmed, None if it is."""

@@ -8,10 +8,10 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar, Unpack
 
+from busmaster import NotStarted
+from busmaster.app.bounds import MOST_UNDER_WAY
 from busmaster.app.service.client_messages import HoldParams, SequenceParams
 from busmaster.app.service.link import Link
-from busmaster.bounds import MOST_UNDER_WAY
-from busmaster.errors import NotStarted
 from busmaster.ext import Command, CommandOptions, HeldNode, Requester, RequestOptions
 
 T = TypeVar("T")

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from busmaster import Bus, ext
+from busmaster import Bus, InvalidCommand, ext
 from busmaster.app.service.admission import Admission, ConnectionRate, connecting_peer, stranger_to_close
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client import Client
@@ -41,9 +41,7 @@ from busmaster.app.service.owner_messages import HelloResult, KnownNode, PollGro
 from busmaster.app.service.peers import Holder, Peer, find_name, process_of
 from busmaster.app.service.refusals import SERVICE, Logins, wait_text
 from busmaster.app.service.tcp import HostPort, check_listening, holder, is_our_name, listening
-from busmaster.errors import InvalidCommand
-from busmaster.ext import LEAST_SHARE, MOST_SHARE, NodeRecord
-from busmaster.registry import protocols
+from busmaster.ext import LEAST_SHARE, MOST_SHARE, NodeRecord, protocols
 
 if TYPE_CHECKING:
     from websockets.datastructures import Headers

@@ -8,9 +8,9 @@ import os
 import socket
 from collections.abc import Sequence
 
+from busmaster import InvalidCommand
 from busmaster.app.service.peers import Holder, holder_of
 from busmaster.app.service.permission import Access
-from busmaster.errors import InvalidCommand
 
 HostPort = tuple[str, int]
 BACKLOG = 64

@@ -13,11 +13,11 @@ from dataclasses import replace
 
 import pytest
 
+from busmaster.app.bounds import MOST_AT_ONCE
 from busmaster.app.service.authorisation import FRESH, Authorisation, WriteRequest, outcome_of
 from busmaster.app.service.permission import Access
 from busmaster.app.service.record import LONGEST_SHOWN, Outcome, WriteRecord, cut, this_user
 from busmaster.app.service.values import write_fields
-from busmaster.bounds import MOST_AT_ONCE
 from busmaster.bus.bus import Bus
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line

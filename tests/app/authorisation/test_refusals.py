@@ -7,7 +7,7 @@ from collections import Counter
 
 import pytest
 
-from busmaster import bounds
+from busmaster.app import bounds
 from busmaster.app.service.refusals import (
     Logins,
     Refusals,

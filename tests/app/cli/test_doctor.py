@@ -33,9 +33,9 @@ from busmaster.app.diagnostics import adapters, diagnosis, examination
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
 from busmaster.app.diagnostics.probing import Outcome, Prober, opened
-from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.capture.pcapng import read_packets
 from busmaster.contract.profile import LineSettings
+from busmaster.contract.tap import Attempt, Tap
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line

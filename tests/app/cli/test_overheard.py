@@ -19,9 +19,9 @@ from busmaster.app.config import emulated_line, load
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
-from busmaster.arbiter.tap import Attempt
 from busmaster.bus.polling import Snapshot
 from busmaster.capture.decode import Decoder
+from busmaster.contract.tap import Attempt
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive

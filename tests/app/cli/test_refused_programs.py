@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 from asyncua import Client, ua
 
-from busmaster import Hcp2Controller, bounds, connect
+from busmaster import Hcp2Controller, connect
+from busmaster.app import bounds
 from busmaster.app.interfaces import modbus_tcp
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import LineDown

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import bounds
+from busmaster.app import bounds
 from busmaster.app.config import LineFile
 from busmaster.app.config.names import expanded
 from busmaster.app.config.sections import read
@@ -16,7 +16,7 @@ from busmaster.app.config.source import FileError, Source
 from busmaster.app.config.table import Table
 from busmaster.app.line import ConfiguredLine
 from busmaster.errors import InvalidCommand
-from busmaster.files import read_file
+from busmaster.transport.files import read_file
 
 TEXT = """port = "socket://127.0.0.1:9"
 [nodes.d1-9]

@@ -18,7 +18,7 @@ from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.permission import Permission, digest_of
 from busmaster.app.service.rights import Role
-from busmaster.bounds import LONGEST_FILE
+from busmaster.contract.bounds import LONGEST_FILE
 from busmaster.errors import InvalidCommand
 
 USER, GROUP = pwd.getpwuid(0).pw_name, grp.getgrgid(0).gr_name

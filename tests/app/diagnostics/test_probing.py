@@ -7,8 +7,8 @@ import random
 import pytest
 
 from busmaster.app.diagnostics.probing import Outcome, Prober, opened
-from busmaster.arbiter.tap import Attempt, Tap, Verdict
 from busmaster.contract.profile import LineSettings
+from busmaster.contract.tap import Attempt, Tap, Verdict
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.registry import find, make_device

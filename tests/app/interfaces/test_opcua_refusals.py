@@ -13,7 +13,7 @@ import opcua
 import pytest
 from opcua import ua
 
-from busmaster import bounds
+from busmaster.app import bounds
 from busmaster.app.interfaces import opcua_connections, opcua_sessions
 from tests.app.interfaces.opcua_client import OtherClient
 from tests.app.interfaces.test_opcua import Opened, opened

@@ -16,7 +16,7 @@ from asyncua.server.address_space import AddressSpace, AttributeService, Attribu
 from asyncua.server.subscription_service import SubscriptionService
 from asyncua.ua.uaprotocol_auto import DataChangeFilter, EventFilter  # those of `ua` are subclasses
 
-from busmaster import bounds
+from busmaster.app import bounds
 from busmaster.app.interfaces import opcua_sessions
 from busmaster.app.interfaces.opcua_access import Rules, Writes, guard
 from busmaster.app.interfaces.opcua_sessions import Session, use_sessions

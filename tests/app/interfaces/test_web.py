@@ -20,6 +20,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Hcp2Controller, MicroFlexDrive
+from busmaster.app.bounds import HISTORY_THREADS, LONGEST_COMMAND, MOST_HISTORY
 from busmaster.app.interfaces import audience, following, web
 from busmaster.app.interfaces.audience import MOST_EXCHANGES, Seat
 from busmaster.app.interfaces.following import Lost
@@ -31,7 +32,6 @@ from busmaster.app.outputs.sqlite import SqliteOutput
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.picture import Row
 from busmaster.app.service.rights import Role
-from busmaster.bounds import HISTORY_THREADS, LONGEST_COMMAND, MOST_HISTORY
 from busmaster.bus.limits import Limit
 from busmaster.errors import (
     BacklogFull,

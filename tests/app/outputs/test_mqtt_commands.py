@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from busmaster.app.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.app.outputs import mqtt, mqtt_commands, mqtt_forbidden
 from busmaster.app.outputs.mqtt import MqttOutput
 from busmaster.app.outputs.mqtt_commands import LEAST, Answer, Commands
@@ -23,7 +24,6 @@ from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
 from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.record import Outcome, WriteRecord
-from busmaster.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from busmaster import Hcp2Controller, bounds, connect
+from busmaster import Hcp2Controller, connect
+from busmaster.app import bounds
 from busmaster.app.service.admission import Admission, ConnectionRate, connecting_peer, stranger_to_close
 from busmaster.app.service.client_connection import ClientConnection
 from busmaster.app.service.messages import Malformed

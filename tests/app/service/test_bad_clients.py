@@ -16,7 +16,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, bounds, connect, ext
+from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect, ext
+from busmaster.app import bounds
 from busmaster.app.service import admission
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.client import Client

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, bounds, connect
+from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, connect
+from busmaster.app import bounds
 from busmaster.app.service import plans
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_connection import READ_AT_ONCE, ClientConnection, MessageOrder

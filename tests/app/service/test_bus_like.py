@@ -24,6 +24,7 @@ from busmaster import (
     RemoteBus,
     connect,
 )
+from busmaster.app.bounds import LONGEST_REQUEST, MOST_PLANNED_READS
 from busmaster.app.service import service
 from busmaster.app.service.client_messages import PlannedGroupForm, PlannedRead, PlanParams
 from busmaster.app.service.messages import decode_request_params, decode_result, encode
@@ -31,8 +32,8 @@ from busmaster.app.service.plans import encode_groups, encode_plan, groups_of, p
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.app.service.reply_times import encode_timings
 from busmaster.app.service.typed import Raw
-from busmaster.bounds import LONGEST_PERIOD, LONGEST_REQUEST, MOST_PLANNED_READS, SHORTEST_PERIOD
 from busmaster.bus.bus_like import GroupLike
+from busmaster.contract.bounds import LONGEST_PERIOD, SHORTEST_PERIOD
 from busmaster.contract.learning import Learned
 from busmaster.planning import PlannedGroup, PlannedNode
 from busmaster.protocols.hcp2.codec import Write

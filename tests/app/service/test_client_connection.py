@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from busmaster.app.bounds import HELLO_WITHIN
 from busmaster.app.service.client_connection import ClientConnection, MessageOrder
 from busmaster.app.service.connection import GOING_AWAY, POLICY
 from busmaster.app.service.messages import INTERNAL, INVALID_PARAMS, INVALID_REQUEST, Malformed
 from busmaster.app.service.outbox import Outbox
-from busmaster.bounds import HELLO_WITHIN
 from tests.stories import in_virtual_time
 
 

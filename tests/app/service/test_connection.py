@@ -20,6 +20,7 @@ from websockets.protocol import OPEN
 from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 
+from busmaster.app.bounds import MOST_FRAMES, SEND_WITHIN
 from busmaster.app.service import connection
 from busmaster.app.service.connection import (
     Connection,
@@ -30,7 +31,6 @@ from busmaster.app.service.connection import (
     process_number,
 )
 from busmaster.app.service.frames import new_key, text_frame
-from busmaster.bounds import MOST_FRAMES, SEND_WITHIN
 from busmaster.errors import InvalidCommand
 from busmaster.testing import run_in_virtual_time
 from tests.stories import in_virtual_time

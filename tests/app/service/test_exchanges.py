@@ -19,7 +19,7 @@ from busmaster.app.service.exchanges import (
     encode_exchange,
 )
 from busmaster.app.service.messages import encode
-from busmaster.arbiter.tap import Attempt, Verdict
+from busmaster.contract.tap import Attempt, Verdict
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, until

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from busmaster import Hcp2Controller, Priority, RemoteBus, Service, connect, ext
+from busmaster.app.bounds import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.shared_backlog import PASSED_BY_EACH
 from busmaster.arbiter.transaction import Transaction
-from busmaster.bounds import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until

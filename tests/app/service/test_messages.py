@@ -11,7 +11,8 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from busmaster import Hcp2Controller, Priority, RemoteBus, bounds
+from busmaster import Hcp2Controller, Priority, RemoteBus, ext
+from busmaster.app import bounds
 from busmaster.app.service.client_messages import CancelParams, NodeParams, NoParams, RequestParams, WriteParams
 from busmaster.app.service.client_requests import Reading, client_request_of
 from busmaster.app.service.connection import Connection
@@ -181,7 +182,7 @@ def test_a_missing_field_is_refused_with_its_name(method: str, name: str) -> Non
     [
         ("request", {"options": {"safe": True}}, "options: object contains unknown field `safe`"),
         ("request", {"options": {"priority": 4}}, "options.priority: invalid enum value 4"),
-        ("request", {"options": {"retries": bounds.MOST_RETRIES + 1}}, "options.retries: expected `int` <= 100"),
+        ("request", {"options": {"retries": ext.MOST_RETRIES + 1}}, "options.retries: expected `int` <= 100"),
         ("request", {"address": 5.0}, "address: expected `int`, got `float`"),
         ("request", {"address": -1}, "address: expected `int` >= 0"),
         ("request", {"address": 2**31 + 1}, "address: expected `int` <= 2147483648"),
@@ -195,8 +196,8 @@ def test_a_missing_field_is_refused_with_its_name(method: str, name: str) -> Non
         ("events", {"stream": 2**53 + 1}, "stream: expected `int` <= 9007199254740992"),
         ("suspend", {"for": -1}, "for: expected `float` >= 0"),
         ("poll", {"phase": -0.1}, "phase: expected `float` >= 0"),
-        ("plan", {"groups": [{**PLANNED, "period": bounds.SHORTEST_PERIOD / 2}]}, "groups[0].period: expected"),
-        ("plan", {"groups": [{**PLANNED, "period": bounds.LONGEST_PERIOD + 1}]}, "groups[0].period: expected"),
+        ("plan", {"groups": [{**PLANNED, "period": ext.SHORTEST_PERIOD / 2}]}, "groups[0].period: expected"),
+        ("plan", {"groups": [{**PLANNED, "period": ext.LONGEST_PERIOD + 1}]}, "groups[0].period: expected"),
     ],
 )
 def test_a_value_beyond_its_limit_is_refused_with_the_limit(method: str, more: dict[str, Any], reason: str) -> None:

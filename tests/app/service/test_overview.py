@@ -27,11 +27,11 @@ from busmaster.app.service.picture import Picture
 from busmaster.app.service.remote_overview import RemoteOverview
 from busmaster.app.service.rights import Role
 from busmaster.arbiter.health import Health
-from busmaster.bounds import LONGEST_SUSPENSION
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
+from busmaster.contract.bounds import LONGEST_SUSPENSION
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryTransport
 from busmaster.errors import BusError, InvalidCommand, LineDown, NodeDown, NoReply, WriteUnconfirmed

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from busmaster.app.bounds import LARGEST_VALUE, LONGEST_COMMAND, LONGEST_ID
 from busmaster.app.service.payload import LATEST, NoCommand, Payload, read_payload
-from busmaster.bounds import LARGEST_VALUE, LONGEST_COMMAND, LONGEST_ID
 
 
 @pytest.mark.parametrize(

@@ -25,12 +25,12 @@ from busmaster import (
     errors,
     ext,
 )
+from busmaster.app.bounds import MOST_CHECKED
 from busmaster.app.service import link
 from busmaster.app.service.failures import encode_error, error_of
 from busmaster.app.service.fields import OptionsForm
 from busmaster.app.service.link import Link
 from busmaster.app.service.owner_messages import ErrorForm
-from busmaster.bounds import MOST_CHECKED
 from busmaster.errors import (
     BusClosed,
     BusError,

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, bounds, ext
+from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, ext
+from busmaster.app import bounds
 from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.client import MOST_FAILED
 from busmaster.app.service.client_messages import RequestParams, WriteParams
@@ -527,7 +528,7 @@ def test_a_sequence_that_has_begun_is_not_begun_again_under_its_number(tmp_path:
     async def story(line: Served) -> None:
         async with raw(line) as client:
             for address in (5, 6):
-                hold = {"sequence": 1, "protocol": "hcp2", "address": address, "max_hold": bounds.LONGEST_HOLD}
+                hold = {"sequence": 1, "protocol": "hcp2", "address": address, "max_hold": ext.LONGEST_HOLD}
                 await client.say(method="hold", params=hold)
             assert (await client.ask("request", **READ, sequence=1))["result"] == 0
             reply = await client.ask("request", **{**READ, "address": 6}, sequence=1)

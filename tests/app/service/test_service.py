@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import connect as connect_websocket
 
-from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, bounds, connect, ext
+from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect, ext
+from busmaster.app import bounds
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.picture import Picture

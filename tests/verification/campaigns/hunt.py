@@ -18,10 +18,10 @@ from busmaster.arbiter.counters import LineState
 from busmaster.arbiter.events import Event, MaxReplyDelayRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import line_time, set_members
-from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import LEARNED
+from busmaster.contract.tap import Tap
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo

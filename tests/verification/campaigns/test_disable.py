@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 import pytest
 
 from busmaster import Bus, BusError, MicroFlexDrive, Priority, WriteUnconfirmed
-from busmaster.arbiter.tap import Attempt
 from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
+from busmaster.contract.tap import Attempt
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort

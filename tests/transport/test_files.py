@@ -15,9 +15,9 @@ import pytest
 from busmaster.app.outputs.growing_file import GrowingFile
 from busmaster.app.outputs.spool import Spool
 from busmaster.capture.files import CaptureFiles
-from busmaster.files import FOLDER_MODE, check_regular, open_file, read_file
+from busmaster.transport.files import FOLDER_MODE, check_regular, open_file, read_file
 
-PACKAGE = Path(__file__).parent.parent / "busmaster"
+PACKAGE = Path(__file__).parents[2] / "busmaster"
 FOR_ALL_TO_READ = {"app/service/folder.py"}
 """Say who owns a line, to whoever wants to know."""
 

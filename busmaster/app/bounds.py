@@ -1,16 +1,14 @@
 """The bounds of all content of a file and all requests of a client. Input beyond a bound is rejected with its name.
 
-Each bound is declared here and nowhere else. The page docs/reference/bounds.md is made of this module: a line
-`# Title` begins a section of that page, and the text below a name is its row. Times are in seconds.
+Each bound is declared here, or in `busmaster/contract/bounds.py` if the library needs it too, and nowhere else. The
+page docs/reference/bounds.md is made of both: a line `# Title` begins a section of that page, and the text below a name
+is its row. Times are in seconds.
 """
 
 from __future__ import annotations
 
 # Files
 
-LONGEST_FILE = 4 << 20
-"""Bytes of a file that is read whole. Such files are: LINE.toml, template, list of symbols, table of points, tokens,
-learned reply times, certificate. A LINE.toml with 20 000 named points has about half of it."""
 LONGEST_LINE_RECORD = 1 << 14
 """Bytes of a `NAME.line` file in the folder of the sockets."""
 MOST_NESTED = 16
@@ -28,18 +26,10 @@ LARGEST_WHOLE = 1_000_000
 """The largest whole number, where the key has no other range."""
 MOST_NAMES = 1000
 """Names that one name with ranges may stand for, all its ranges together: `a1-10b1-10` stands for 100."""
-MOST_MEMBERS = 20_000
-"""Points of all poll groups of a line, each as often as it is named; and those of any other list of points."""
-SHORTEST_PERIOD = 0.001
-"""Seconds from one cycle of a poll group to the next, at least."""
-LONGEST_PERIOD = 86_400.0
-"""Seconds from one cycle of a poll group to the next, at most: a day."""
 LONGEST_TIMING = 10.0
 """Seconds of each reply time that a file may set: a larger number is meant in milliseconds."""
 LONGEST_SAFE_STATE = 60.0
 """Seconds in which the writes of `[safe]` must be sent and confirmed."""
-MOST_RETRIES = 100
-"""Times that a request is sent again after a failure."""
 MOST_BUFFERED = 1_000_000
 """Values that wait for an output in memory."""
 MOST_SPILLED = 100_000_000
@@ -91,8 +81,6 @@ MOST_UNDER_WAY = MOST_REQUESTS // 2
 client. As many again may have been given up by it, and still be known to the owner."""
 MOST_HOLDS = 32
 """Exclusive sequences of one client that are not over."""
-LONGEST_HOLD = 5.0
-"""Seconds for which a line may be held for one sequence: no other request is sent meanwhile."""
 MOST_UNREAD = 256
 """Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
 MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
@@ -117,8 +105,6 @@ LONGEST_REPLY = 5.0
 """Seconds for which a client may have the line wait for a reply: nothing else is sent meanwhile."""
 LONGEST_WAIT = 86_400.0
 """Seconds of `start_within` and `finish_within` of a client's request: a day."""
-LONGEST_SUSPENSION = 86_400.0
-"""Seconds for which a node can be suspended: a day. A suspension does not end with the program that requested it."""
 
 # Logins by token or password, at whatever interface
 

@@ -6,7 +6,7 @@ import errno
 import os
 import stat
 
-from busmaster.bounds import LONGEST_FILE
+from busmaster.contract.bounds import LONGEST_FILE
 
 MODE = 0o640
 """Mode of a new file: its owner may write, its group may read. The process's umask restricts it as usual."""

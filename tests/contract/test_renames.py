@@ -11,10 +11,10 @@ import pytest
 import busmaster
 from busmaster import InvalidCommand, ReplyTiming
 from busmaster.app.config import load
-from busmaster.renames import ROOT, STATISTICS, TIMES, now_called, refuse_old_arguments
+from busmaster.contract.renames import ROOT, STATISTICS, TIMES, now_called, refuse_old_arguments
 from busmaster.statistics import LineStatistics
 
-PAGE = Path(__file__).parents[1] / "docs" / "upgrading.md"
+PAGE = Path(__file__).parents[2] / "docs" / "upgrading.md"
 GOOD = {"late_after": 0.05, "window": 0.1, "max_reply_delay": 0.2, "inter_byte_timeout": 0.02}
 
 
