@@ -1,7 +1,7 @@
 """Connections of the service that leave every WebSocket frame to the library, to compare them with those that do not.
 
-`busmaster.app.service.frames` reads and writes whole text frames itself. Each of these connections must talk to another
-of its kind or to one of the service.
+`busmaster.app.service.connection` reads and writes whole text frames itself. Each of these connections must talk to
+another of its kind or to one of the service.
 """
 
 from __future__ import annotations

@@ -16,8 +16,7 @@ from busmaster.contract.exchange import Done, FrameError
 from busmaster.emulator.line import Line
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus
-from busmaster.protocols.modbus.handle import is_whole
-from busmaster.protocols.modbus.numbers import Number
+from busmaster.protocols.modbus.handle import Number, is_whole
 from busmaster.testing import Case, Foreign, RoundTrip, answers_of, check_protocol
 from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.protocols.modbus_frames import UNIT, frame

@@ -4,24 +4,38 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from functools import partial
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from rich.text import Text
+from textual import events
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
-from textual.widgets import Static
+from textual.containers import Vertical, VerticalScroll
+from textual.geometry import Region, Size
+from textual.screen import ModalScreen
+from textual.scroll_view import ScrollView
+from textual.strip import Strip
+from textual.widgets import Input, Static
 
 from busmaster import BusError, InvalidCommand
 from busmaster.app.cli.app import INTERRUPTED
-from busmaster.app.cli.cells import column_widths, fit, gauge_line, group_line, header_line, row_line, title_line
-from busmaster.app.cli.details import details_text
-from busmaster.app.cli.dialog import STYLE as STYLE_OF_DIALOGS
-from busmaster.app.cli.dialog import AskValue, AskWords, AskYes, Show
+from busmaster.app.cli.cells import (
+    age_text,
+    column_widths,
+    fit,
+    gauge_line,
+    group_line,
+    header_line,
+    row_line,
+    sparkline,
+    title_line,
+)
+from busmaster.app.cli.output import number_text, value_text
 from busmaster.app.cli.parsing import parse_value
-from busmaster.app.cli.table import Table
-from busmaster.app.service.picture import Frame, Group, Node, Picture, Row, matching
+from busmaster.app.cli.terminal import made_printable
+from busmaster.app.service.picture import Frame, Group, Identity, Node, Picture, Row, matching
 
 SUSPENDED_FOR = 60.0
 SILENT_AFTER = 2.0
@@ -61,6 +75,307 @@ Ctrl-C  the same, with exit status 130
 
 !  could not be read: its last good value, growing old
 ↑ ↓  beyond its limit     ~  came late     ?  older than a write to it"""
+
+Draw = Callable[[Row, bool], Text]
+"""Returns the line of a row, which is the selected one or not."""
+
+RECENT = 6
+"""Values that are shown as numbers."""
+QUALITIES = {"late": "came late", "stale": "older than a write to it"}
+
+T = TypeVar("T")
+STYLE_OF_DIALOGS = """
+Dialog { align: center bottom; background: transparent; }
+Dialog .box { width: 100%; height: auto; max-height: 100%; border: round ansi_default; background: ansi_default;
+    color: ansi_default; padding: 0 1; scrollbar-size: 0 0; }
+Dialog Static { color: ansi_default; background: ansi_default; width: 1fr; }
+Dialog Input { border: none; height: 1; padding: 0; background: ansi_default; color: ansi_default; }
+"""
+"""Style sheet of the dialogs, which follows that of the screen."""
+
+
+class Dialog(ModalScreen[T]):
+    """Something at the foot of the picture, which stays in sight above it. Escape leaves it."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "leave", show=False)]
+
+    def action_leave(self) -> None:
+        """Close the dialog without a result."""
+        self.dismiss(None)
+
+
+class AskYes(Dialog[bool]):
+    """Request a confirmation. The result is True for yes, else None."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("y", "agree", show=False),
+        Binding("n", "leave", show=False),
+    ]
+
+    def __init__(self, question: str) -> None:
+        super().__init__()
+        self.question = question
+
+    def compose(self) -> ComposeResult:
+        with Vertical(classes="box"):
+            yield Static(Text(f"{self.question}  y or n"))
+
+    def action_agree(self) -> None:
+        """End it with yes."""
+        self.dismiss(True)
+
+
+class AskValue(Dialog[str]):
+    """Request a value for `name`, then a confirmation. The result is the value, or None for no."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("n", "leave", show=False),
+        Binding("y", "agree", show=False),
+    ]
+
+    def __init__(self, name: str, unit: str) -> None:
+        super().__init__()
+        self.asked = name
+        self.unit = unit
+        self.value: str | None = None
+
+    def compose(self) -> ComposeResult:
+        with Vertical(classes="box"):
+            unit = f" in {self.unit}" if self.unit else ""
+            yield Static(Text(f"write {self.asked}{unit}  (Enter; Esc cancels)"), id="question")
+            yield Input(placeholder="value")
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Accept the value and request a confirmation, or show why it is not a number."""
+        event.stop()
+        if not event.value.strip():
+            return
+        question = self.query_one("#question", Static)
+        try:
+            parse_value(event.value)
+        except InvalidCommand as error:
+            question.update(Text(f"write {self.asked}: {error}  (Enter; Esc cancels)"))
+            return
+        self.value = event.value.strip()
+        event.input.remove()
+        question.update(Text(f"write {self.asked} = {f'{self.value} {self.unit}'.rstrip()}?  y or n"))
+
+    def action_agree(self) -> None:
+        """End the question with the value, once there is one."""
+        if self.value is not None:
+            self.dismiss(self.value)
+
+
+class AskWords(Dialog[str]):
+    """Request the words of the row filter. The result is the words; None for no change."""
+
+    def __init__(self, words: str) -> None:
+        super().__init__()
+        self.words = words
+
+    def compose(self) -> ComposeResult:
+        with Vertical(classes="box"):
+            yield Static(Text("show rows with (node, item, group, unit, health, error; Enter; empty for all)"))
+            yield Input(self.words, placeholder="all")
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Take the words."""
+        event.stop()
+        self.dismiss(event.value.strip())
+
+
+class Show(Dialog[None]):
+    """Show a text, which may change, until one of its keys is pressed."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("enter,space,q,question_mark", "leave", show=False),
+        Binding("up", "scroll(-1)", show=False),
+        Binding("down", "scroll(1)", show=False),
+    ]
+
+    def __init__(self, text: Text) -> None:
+        super().__init__()
+        self.text = text
+
+    def compose(self) -> ComposeResult:
+        with VerticalScroll(classes="box"):
+            yield Static(self.text, id="text")
+
+    def update(self, text: Text) -> None:
+        """Show this text in its place."""
+        if self.is_mounted:
+            self.query_one("#text", Static).update(text)
+
+    def action_scroll(self, lines: int) -> None:
+        """Go up or down in a text that is longer than the terminal."""
+        self.query_one(VerticalScroll).scroll_relative(y=lines, animate=False)
+
+
+def details_text(
+    row: Row, node: Node | None, group: Group | None, details: Mapping[str, Any], frame: Frame | None, width: int
+) -> Text:
+    """Return the details of a point, for `width` columns. `details` is the description from the line's owner."""
+    lines = [Text(f"{row.name}  ({row.key})", "bold")]
+    facts = _facts(row, node, group, made_printable(dict(details)), frame)
+    lines += [Text.assemble((f"{name:<9}", "bold"), text) for name, text in facts]
+    numbers = [number for _, number in row.past if number is not None]
+    if numbers:
+        trend = [number for _, number in row.past][-width:]
+        lines.append(Text(sparkline(trend)))
+        recent = [value_text(number, row.precision) for number in reversed(trend[-RECENT:])]
+        lines.append(Text(f"of late {'  '.join(recent)}"))
+        span = row.past[-1][0] - row.past[0][0]
+        lowest, highest = (value_text(one, row.precision) for one in (min(numbers), max(numbers)))
+        lines.append(Text(f"{len(row.past)} values in {span:.1f} s, {lowest} to {highest}"))
+    return Text("\n").join(lines)
+
+
+def _facts(
+    row: Row, node: Node | None, group: Group | None, details: Mapping[str, Any], frame: Frame | None
+) -> Iterator[tuple[str, str]]:
+    value = f"{value_text(row.value, row.precision)} {row.unit}".rstrip()
+    age = f", requested {age_text(frame.now - row.asked)} ago" if frame and row.asked is not None else ""
+    yield "value", value + (f", {QUALITIES[row.quality]}" if row.quality in QUALITIES else "") + age
+    if row.alarm:
+        yield (
+            "alarm",
+            f"the bit is {row.alarm}" if row.alarm in ("set", "clear") else f"value beyond its {row.alarm} limit",
+        )
+    if row.error:
+        yield "error", f"{row.error}; {details['hint']}" if details.get("hint") else row.error
+    if node is not None:
+        state = "offline" if frame and frame.state == "offline" else node.health
+        times = f"p50 {node.p50 * 1000:.1f}, p99 {node.p99 * 1000:.1f} ms"
+        counts = f"{node.requests} requests, {node.failed} failed, {node.late} late, {times}"
+        yield "node", f"{node.kind or node.protocol} {node.address}, {state}: {counts}"
+    if group is not None:
+        yield "group", f"{group.name}, every {group.period * 1000:g} ms{', paused' if group.paused else ''}"
+    if details.get("gone"):
+        yield "", str(details["gone"])
+    elif details:
+        yield "limits", _limits_text(row, details)
+        yield "asks", str(details["command"])
+        if details.get("timeline"):
+            yield "exchange", _exchange_text(details["timeline"])
+
+
+def _limits_text(row: Row, details: Mapping[str, Any]) -> str:
+    texts = []
+    for limit in details["limits"]:
+        bounds = [
+            f"{word} {number_text(limit[name])}"
+            for name, word in (("minimum", "from"), ("maximum", "to"), ("max_step", "in steps of at most"))
+            if limit[name] is not None
+        ]
+        texts.append(" ".join(bounds))
+    if not all(limit["writable"] for limit in details["limits"]):
+        written = "may not be written"
+    else:
+        written = "written " * row.writable
+        written += "; ".join(text for text in texts if text) or ("any value" if row.writable else "it is read-only")
+    alarms = [f"{name} {number_text(details[name])}" for name in ("low", "high") if details.get(name) is not None]
+    return written + (f"; alarm {', '.join(alarms)}" if alarms else "")
+
+
+def _exchange_text(times: Mapping[str, Any]) -> str:
+    """Return why the last exchange took as long as it did, in milliseconds."""
+    queued, started = times["queued"], times["started"]
+    attempts = times["attempts"]
+    if started is None:
+        return f"{attempts} attempts, no reply" if attempts else "not sent"
+    parts = [f"waited {_ms(started - queued)}"]
+    if times["exchanges_ahead"]:
+        parts[0] += f" behind {times['exchanges_ahead']}"
+    if times["quiet_time_ahead"]:
+        parts[0] += f", {_ms(times['quiet_time_ahead'])} of it while the line resynchronised"
+    if times["first_byte"] is not None:
+        parts.append(f"reply after {_ms(times['first_byte'] - started)}")
+    if times["last_byte"] is not None:
+        parts.append(f"whole after {_ms(times['last_byte'] - started)}")
+    else:
+        parts.append("no reply")
+    if attempts != 1:
+        parts.append(f"{attempts} attempts")
+    return ", ".join(parts)
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1000:.1f} ms"
+
+
+class Table(ScrollView, can_focus=True):
+    """Rows, one of which is selected."""
+
+    DEFAULT_CSS = """
+    Table { height: 1fr; background: ansi_default; color: ansi_default; scrollbar-size: 0 0; overflow-x: hidden; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("up", "move(-1)", show=False),
+        Binding("down", "move(1)", show=False),
+        Binding("pageup", "page(-1)", show=False),
+        Binding("pagedown", "page(1)", show=False),
+        Binding("home", "move(-1000000)", show=False),
+        Binding("end", "move(1000000)", show=False),
+    ]
+
+    def __init__(self, draw: Draw) -> None:
+        super().__init__(id="points")
+        self.rows: list[Row] = []
+        self._draw = draw
+        self._selected: Identity | None = None
+        self._index = 0
+
+    @property
+    def selected(self) -> Row | None:
+        """The selected row, None where there is none."""
+        return self.rows[self._index] if self._index < len(self.rows) else None
+
+    def show(self, rows: list[Row]) -> None:
+        """Show these rows. The selected one stays so; where it is gone, it is the one in its place."""
+        before = self._index, len(self.rows)
+        self.rows = rows
+        places = (index for index, row in enumerate(rows) if row.identity == self._selected)
+        self._select(next(places, min(self._index, max(0, len(rows) - 1))))
+        if (self._index, len(rows)) != before:
+            self.virtual_size = Size(self.size.width, len(rows))
+            self._keep_in_sight()
+        self.refresh()
+
+    def _select(self, index: int) -> None:
+        self._index = index
+        self._selected = self.rows[index].identity if index < len(self.rows) else self._selected
+
+    def _keep_in_sight(self) -> None:
+        self.scroll_to_region(Region(0, self._index, 1, 1), animate=False, force=True)
+
+    def action_move(self, rows: int) -> None:
+        """Select another row, so many further down."""
+        if self.rows:
+            self._select(max(0, min(len(self.rows) - 1, self._index + rows)))
+            self._keep_in_sight()
+            self.refresh()
+
+    def action_page(self, pages: int) -> None:
+        """Select a row of the next page, or of the one before."""
+        self.action_move(pages * max(1, self.size.height - 1))
+
+    def on_click(self, event: events.Click) -> None:
+        """Select the row that was clicked on."""
+        self.action_move(event.y + self.scroll_offset.y - self._index)
+
+    def on_resize(self) -> None:
+        """Keep the selected row in sight."""
+        self.virtual_size = Size(self.size.width, len(self.rows))
+        self.call_after_refresh(self._keep_in_sight)
+
+    def render_line(self, y: int) -> Strip:
+        """Draw one visible line."""
+        index = y + self.scroll_offset.y
+        if index >= len(self.rows):
+            return Strip.blank(self.size.width, self.rich_style)
+        text = self._draw(self.rows[index], index == self._index)
+        strip = Strip(text.render(self.app.console), text.cell_len)
+        return strip.adjust_cell_length(self.size.width)
 
 
 class Line(Protocol):

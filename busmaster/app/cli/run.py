@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import anyio
 import click
 
-from busmaster import InvalidCommand, ext
+from busmaster import InvalidCommand, Service, ext
 from busmaster.app.cli.app import FAILED, OK
 from busmaster.app.cli.arguments import View, viewed
 from busmaster.app.cli.audit_log import AuditLog
@@ -20,12 +23,12 @@ from busmaster.app.cli.output import Level, note, number_text
 from busmaster.app.cli.plan import losses_text
 from busmaster.app.cli.reaching import check_no_owner
 from busmaster.app.cli.safe import print_unsafe
-from busmaster.app.cli.serving import secrets_of, served, service_of
 from busmaster.app.cli.systemd import ServiceManager
 from busmaster.app.cli.watching import Watch, follow
 from busmaster.app.config import LineFile
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import OutputStatistics
+from busmaster.app.service.folder import line_name
 
 SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
@@ -33,6 +36,53 @@ WORTH_PRINTING = 0.005
 """Share of the line that learned reply times must save to be suggested."""
 CLOSE_WITHIN = 2.0
 """Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
+
+
+def secrets_of(file: LineFile) -> dict[str, bytes]:
+    """Return the digests of the tokens with which programs may come to a line. Raises FileError, as their file does."""
+    return file.service.secrets() if file.service.enabled else {}
+
+
+def service_of(line: ConfiguredLine) -> Service | None:
+    """Return the service of the line for other programs; None if its file disables that."""
+    section = line.file.service
+    if not section.enabled:
+        return None
+    name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
+    return Service(
+        line.bus,
+        authorisation=line.authorisation,
+        name=name,
+        mode=section.mode,
+        group=section.group,
+        share=section.share,
+        listen=section.listen,
+        title=line.file.title,
+    )
+
+
+@asynccontextmanager
+async def served(service: Service | None, *, announce: bool) -> AsyncIterator[Service | None]:
+    """Serve a line, and yield its service; None if that is not possible. The line runs in any case.
+
+    With `announce`, the addresses are printed.
+    """
+    if service is None:
+        yield None
+        return
+    try:
+        await service.__aenter__()
+    except InvalidCommand as error:
+        note(f"no other program can use this line: {error}", Level.WARNING)
+        yield None
+        return
+    try:
+        if announce:
+            by_tcp = "" if service.tcp_address is None else f" and {service.tcp_address}"
+            note(f"{service.line.title} is served at {service.address}{by_tcp}", Level.NOTICE)
+        yield service
+    finally:
+        await service.__aexit__(None, None, None)
 
 
 @click.command()

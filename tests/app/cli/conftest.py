@@ -25,7 +25,7 @@ import pytest
 
 from busmaster import Service
 from busmaster.app.cli import main
-from busmaster.app.cli.serving import secrets_of, served, service_of
+from busmaster.app.cli.run import secrets_of, served, service_of
 from busmaster.app.config import load
 from busmaster.app.line import ConfiguredLine
 from busmaster.emulator.line import Line

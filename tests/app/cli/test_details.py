@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.app.cli.details import details_text
+from busmaster.app.cli.live import details_text
 from busmaster.app.service.picture import Frame, Group, Node, Row
 
 LIMIT: dict[str, Any] = {"name": "force", "minimum": None, "maximum": None, "max_step": None, "writable": True}

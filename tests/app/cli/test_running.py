@@ -164,7 +164,7 @@ class Reports(list[tuple[str, Level]]):
 @pytest.fixture
 def reported(monkeypatch: pytest.MonkeyPatch) -> Reports:
     found = Reports()
-    for module in ("run", "serving", "safe"):
+    for module in ("run", "safe"):
         monkeypatch.setattr(f"busmaster.app.cli.{module}.note", found.note)
     return found
 

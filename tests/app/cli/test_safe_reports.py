@@ -12,7 +12,7 @@ import anyio
 import click
 import pytest
 
-from busmaster.app.cli import safe, serving
+from busmaster.app.cli import run, safe
 from busmaster.app.cli.output import Level
 from busmaster.app.config import load
 from busmaster.app.line import ConfiguredLine
@@ -29,7 +29,7 @@ def reported(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Level]]:
         found.append((text, level))
 
     monkeypatch.setattr(safe, "note", note)
-    monkeypatch.setattr(serving, "note", note)
+    monkeypatch.setattr(run, "note", note)
     return found
 
 
@@ -113,9 +113,9 @@ def test_each_key_of_the_section_reaches_the_service(
     path = file.with_name("the slitter.toml")
     path.write_text(text + section)
     made: dict[str, Any] = {}
-    monkeypatch.setattr(serving, "Service", lambda bus, **options: made.update(bus=bus, **options))
+    monkeypatch.setattr(run, "Service", lambda bus, **options: made.update(bus=bus, **options))
     line = ConfiguredLine(load(path), outputs=False)
-    serving.service_of(line)
+    run.service_of(line)
     assert made == {
         "bus": line.bus,
         "authorisation": line.authorisation,
@@ -129,14 +129,14 @@ def test_each_key_of_the_section_reaches_the_service(
     assert made["mode"] == 0o660
     assert made["listen"] is not None
     assert made["group"] is not None
-    assert set(serving.secrets_of(line.file)) == {"hmi"}
+    assert set(run.secrets_of(line.file)) == {"hmi"}
     path.write_text(text + section.replace("[service]\n", "[service]\nenabled = false\n"))
     made.clear()
     disabled = ConfiguredLine(load(path), outputs=False)
-    assert serving.service_of(disabled) is None
+    assert run.service_of(disabled) is None
     assert made == {}
     tokens.unlink()
-    assert serving.secrets_of(disabled.file) == {}  # no program can use them
+    assert run.secrets_of(disabled.file) == {}  # no program can use them
 
 
 class FakeService:
@@ -159,13 +159,13 @@ class FakeService:
 
 
 def served(service: Any, *, announce: bool, error: Exception | None = None) -> Any:
-    async def run() -> Any:
-        async with serving.served(service, announce=announce) as found:
+    async def ran() -> Any:
+        async with run.served(service, announce=announce) as found:
             if error is not None:
                 raise error
             return found
 
-    return anyio.run(run)
+    return anyio.run(ran)
 
 
 def test_where_a_line_is_served_is_announced_and_it_ends_with_the_run(reported: list[tuple[str, Level]]) -> None:

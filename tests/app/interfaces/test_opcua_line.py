@@ -14,9 +14,8 @@ from asyncua.crypto.permission_rules import User
 
 from busmaster.app.interfaces import opcua
 from busmaster.app.interfaces.following import Connected, Lost
-from busmaster.app.interfaces.opcua import LineServer
+from busmaster.app.interfaces.opcua import Health, LineServer
 from busmaster.app.interfaces.opcua_access import Rules
-from busmaster.app.interfaces.opcua_health import Health
 from busmaster.app.interfaces.opcua_space import Space, Variable
 from busmaster.app.interfaces.opcua_terms import CODES
 from busmaster.app.service.permission import digest_of

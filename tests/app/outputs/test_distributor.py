@@ -23,8 +23,7 @@ from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs import distributor
 from busmaster.app.outputs.base import Happening, Item, Kept, Output, OutputKind, OutputLine
-from busmaster.app.outputs.distributor import Distributor, Wanted, label_of
-from busmaster.app.outputs.exceptions import News
+from busmaster.app.outputs.distributor import Distributor, News, Wanted, label_of
 from busmaster.app.outputs.settings import FileSettings, MqttSettings, Settings
 from busmaster.app.service.record import Outcome, WriteRecord
 from busmaster.bus.meaning import Meaning

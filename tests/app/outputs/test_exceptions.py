@@ -18,7 +18,7 @@ from busmaster.app.config import LineFile, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.outputs.exceptions import News, differs
+from busmaster.app.outputs.distributor import News, differs
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.polling import Quality, Snapshot
 from busmaster.errors import GarbledReply, NoReply

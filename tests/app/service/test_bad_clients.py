@@ -298,7 +298,7 @@ def test_pages_cannot_use_it(tmp_path: Path) -> None:
 def test_one_program_has_so_many_requests_and_a_few_urgent_ones_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 3)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_REQUESTS", 3)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)

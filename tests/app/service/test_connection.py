@@ -27,10 +27,11 @@ from busmaster.app.service.connection import (
     IncomingConnection,
     OutgoingConnection,
     check_installed,
+    new_key,
     origin_of,
     process_number,
+    text_frame,
 )
-from busmaster.app.service.frames import new_key, text_frame
 from busmaster.errors import InvalidCommand
 from busmaster.testing import run_in_virtual_time
 from tests.stories import in_virtual_time

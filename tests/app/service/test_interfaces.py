@@ -20,7 +20,7 @@ from websockets.exceptions import InvalidStatus
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, MicroFlexDrive, Service, connect
 from busmaster.app.service import peers
-from busmaster.app.service.frames import NO_MASK, text_frame
+from busmaster.app.service.connection import NO_MASK, text_frame
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.rights import Role
 from busmaster.app.service.tcp import check_listening, is_loopback, is_our_name, listening, listening_error

@@ -16,7 +16,7 @@ import pytest
 from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, ext
 from busmaster.app import bounds
 from busmaster.app.service.authorisation import FRESH
-from busmaster.app.service.client import MOST_FAILED
+from busmaster.app.service.client import MOST_FAILED, Requests
 from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.client_requests import Reading, Writing, client_request_of
 from busmaster.app.service.encoding import protocol_of
@@ -24,7 +24,6 @@ from busmaster.app.service.fields import OptionsForm, shortened
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, encode_value
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.record import Outcome
-from busmaster.app.service.requests import Requests
 from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
@@ -157,8 +156,8 @@ def test_a_group_of_the_owner_has_all_its_points_there_too(tmp_path: Path) -> No
 
 
 def test_of_urgent_requests_too_only_so_many_may_be_unanswered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 3)
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_URGENT", 2)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_REQUESTS", 3)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_URGENT", 2)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         async with busy(line):
@@ -173,7 +172,7 @@ def test_of_urgent_requests_too_only_so_many_may_be_unanswered(tmp_path: Path, m
 def test_a_request_with_options_has_no_place_of_the_urgent_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 3)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_REQUESTS", 3)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         async with busy(line):

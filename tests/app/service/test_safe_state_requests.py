@@ -136,7 +136,7 @@ def held_back(monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
 def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_REQUESTS", 1)
 
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         meant = held_back(monkeypatch)
@@ -226,8 +226,8 @@ def test_a_part_of_it_is_another_safe_state(tmp_path: Path) -> None:
 def test_ordinary_requests_that_wait_do_not_keep_it_from_the_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_REQUESTS", 1)
-    monkeypatch.setattr("busmaster.app.service.requests.MOST_URGENT", 1)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_REQUESTS", 1)
+    monkeypatch.setattr("busmaster.app.service.client.MOST_URGENT", 1)
 
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         go_on = held_back(monkeypatch)
