@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from busmaster.errors import InvalidCommand
+from busmaster.protocols.msc.blocks import Count, Part, place, reads, reads_back, writes
 from busmaster.protocols.msc.codec import BLOCK, PROFILE, BlockRead, BlockWrite, DataRead, DataWrite, Merging
-from busmaster.protocols.msc.handle import Count, Part, place, reads, reads_back, writes
 
 
 def test_a_place_lies_its_steps_behind_the_first() -> None:

@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[2] / "busmaster"
 NAMES = {name.replace("-", "_") for name in (*kinds(), *(protocol.name for protocol in protocols()))} | {"mint"}
 """Those of the protocols, and of products that speak them."""
 EXCEPTED = {
-    *("__init__.py", "renames.py"),
+    *("__init__.py", "contract/renames.py"),
     *("app/cli/demo.py", "app/cli/demo_line.py", "app/cli/modbus_tcp.py", "app/interfaces/modbus_tcp.py"),
 }
 """The public names; the demo, which shows certain drives; the interface that speaks Modbus to its clients."""
