@@ -49,7 +49,10 @@ MOST_CAPACITY = 1_000_000
 
 
 class Outlook:
-    """The predictions for one bus. `nodes` and `groups` are the bus's own and always current."""
+    """The predictions for one bus: whether its polls fit the line, and how long a request can wait.
+
+    `nodes` and `groups` are the bus's own and always current.
+    """
 
     def __init__(
         self,

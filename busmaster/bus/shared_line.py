@@ -40,7 +40,10 @@ running_loop = asyncio._get_running_loop
 
 
 class Taps:
-    """The taps of one line. An untapped line has no extra cost."""
+    """The taps of one line: a recorder, or viewers of the traffic. They can be added and removed while it runs.
+
+    An untapped line has no extra cost.
+    """
 
     def __init__(self, pump: Pump, first: Tap | None = None) -> None:
         self._pump = pump

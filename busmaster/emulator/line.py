@@ -43,7 +43,13 @@ TakeBack = Callable[[Device, float], None]
 
 
 class AttachedDevices:
-    """The devices of a line. `send` is called with their replies, `take_back` after a restart."""
+    """The devices of a line. `send` is called with their replies, `take_back` after a restart.
+
+    Every device receives every byte. An undisturbed frame of the host is passed in one piece to the device with a
+    matching route; the other devices receive it only if they are attentive. Incomplete, corrupted or joined frames are
+    passed to all devices byte by byte. If they contain no byte with which a route begins, they cannot change the state
+    of an idle device, and are passed to attentive devices only.
+    """
 
     def __init__(self, send: Send, take_back: TakeBack, chance: Chance, tau: float) -> None:
         self.devices: list[Device] = []

@@ -45,6 +45,11 @@ NO_MASK = bytes(4)
 """The key of a mask that changes nothing."""
 
 
+# Frames that are whole texts, as nearly all are, are read and written here; the library handles all others. With the
+# library alone, a remote read on an idle line takes 3 to 4 % longer: `python -m benchmarks service` measures this with
+# the table "A remote read on an idle line".
+
+
 def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
     """Return the size of the frame at the start, or the number of bytes needed to know it, and the text of the frame.
     The text is None unless it is complete, a whole text, and masked as required.
