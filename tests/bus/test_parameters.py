@@ -6,11 +6,12 @@ import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from math import inf
 
 import pytest
 
-from busmaster import Bus, Dc104Drive, InvalidCommand, MemoryPort, MentorDrive, ModbusUnit, NoReply, NotStarted
+from busmaster import Bus, Dc104Drive, InvalidCommand, MemoryPort, MentorDrive, ModbusUnit, NoReply, NotStarted, Point
 from busmaster.bus.handle import Handle, Send
 from busmaster.bus.node import Node, Priority
 from busmaster.bus.parameters import FIRST, LAST, Change, Entry, Found, Parameter, ParameterLoad, ParameterSet, Result
@@ -21,7 +22,7 @@ from busmaster.protocols.dc104.device import READ, EmulatedDc104
 from busmaster.protocols.ei_bisynch.handle import BisynchInstrument
 from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.modbus.device import EmulatedModbus
-from busmaster.registry import make_device
+from busmaster.registry import find, make_device
 from busmaster.wire.checks import sum8
 from tests.stories import in_virtual_time
 
@@ -193,6 +194,14 @@ async def test_a_set_names_the_node_its_line_and_what_identifies_it() -> None:
         assert (saved.protocol, saved.address, saved.label) == ("ei-bisynch", 1, "oven")
         assert saved.line == bus.endpoint.name
         assert saved.identity == {item: await instrument.read(item) for item in ("II", "V0")}
+
+
+@pytest.mark.parametrize("kind", ["hcp2", "microflex"])
+@in_virtual_time
+async def test_the_firmware_identifies_a_controller_or_a_drive_with_hcp2(kind: str) -> None:
+    handle = find(kind).handle
+    async with bus_of(handle, make_device(kind, 7, firmware=5300)) as bus:
+        assert (await handle(bus, 7).save_parameters([])).identity == {"firmware": 5300}
 
 
 @in_virtual_time
@@ -391,6 +400,126 @@ async def test_a_value_that_cannot_be_read_back_is_unconfirmed() -> None:
     results, reasons = await outcomes(Hiding(), 4, 5, retries=0)
     assert results == [Result.UNCONFIRMED, Result.NOT_WRITTEN]
     assert reasons[0].startswith("it cannot be read back: no reply within")
+
+
+class LosesRuns(EmulatedModbus):
+    """A unit that replies to reads of one register only."""
+
+    def _read(self, function: int, first: int, count: int, now: float) -> bytes:
+        self.silent = count > 1
+        return super()._read(function, first, count, now)
+
+    def _reply(self, answer: bytes, now: float) -> None:
+        if not self.silent:
+            super()._reply(answer, now)
+
+
+@in_virtual_time
+async def test_parameters_are_read_one_by_one_if_a_merged_read_has_no_reply_and_the_node_replies_to_its_probe() -> None:
+    async with bus_of(ModbusUnit, LosesRuns(17, range(100, 110))) as bus:
+        unit = ModbusUnit(bus, 17, retries=0)
+        saved = await unit.save_parameters(unit.parameters(["holding:2:3"]))
+        assert [(item, entry.value) for item, entry in saved.entries.items()] == [
+            ("holding:2", 102),
+            ("holding:3", 103),
+            ("holding:4", 104),
+        ]
+
+
+@in_virtual_time
+async def test_each_of_hundreds_of_merged_parameters_has_its_own_value() -> None:
+    found: list[Found] = []
+    async with bus_of(ModbusUnit, EmulatedModbus(17, range(1000, 1300))) as bus:
+        unit = ModbusUnit(bus, 17)
+        saved = await unit.save_parameters(unit.parameters(["holding:0:300"]), progress=found.append)
+        assert Node.of(unit).statistics().attempts <= 8
+    assert {item: entry.value for item, entry in saved.entries.items()} == {
+        f"holding:{place}": 1000 + place for place in range(300)
+    }
+    assert sorted(one.parameter.item for one in found) == sorted(saved.entries)
+
+
+@in_virtual_time
+async def test_a_value_that_cannot_be_decoded_is_not_a_parameter_that_the_node_lacks() -> None:
+    class Coded(Dc104Drive):
+        def point(self, item: str) -> Point[int]:
+            def decode(raw: int) -> int:
+                raise ValueError("not a code")
+
+            return replace(super().point(item), decode=decode)
+
+    found: list[Found] = []
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        saved = await Coded(bus).save_parameters([Parameter(item="4")], progress=found.append)
+    assert (dict(saved.entries), [(one.value, one.gap) for one in found]) == ({}, [(None, False)])
+    assert found[0].why == "0 is not a value of 4: not a code"
+
+
+@in_virtual_time
+async def test_a_garbled_reply_to_one_parameter_is_reported_and_the_others_are_saved() -> None:
+    class Garbling(OddDrive):
+        def _handle(self, frame: bytes, now: float) -> None:
+            self.faults.flip = float(frame[2] == 4)
+            super()._handle(frame, now)
+
+    found: list[Found] = []
+    async with bus_of(Dc104Drive, Garbling()) as bus:
+        saved = await Dc104Drive(bus, retries=0).save_parameters(
+            [Parameter(item=item) for item in ("3", "4", "5")], progress=found.append
+        )
+    assert list(saved.entries) == ["3", "5"]
+    assert "though the node replies to other reads" in found[1].why
+
+
+@in_virtual_time
+async def test_a_set_has_the_time_in_utc_and_only_the_identity_that_the_node_has() -> None:
+    class Anonymous(Dc104Drive):
+        _identity = ("3", "7")
+
+    before = datetime.now(UTC).replace(microsecond=0)
+    async with bus_of(Dc104Drive, EmulatedDc104(maximum=6)) as bus:
+        saved = await Anonymous(bus).save_parameters([])
+    assert saved.identity == {"3": 0}
+    assert before <= saved.saved <= datetime.now(UTC)
+    assert (saved.saved.utcoffset(), saved.saved.microsecond) == (timedelta(0), 0)
+
+
+@in_virtual_time
+async def test_parameters_that_the_document_does_not_list_are_written_after_those_that_it_lists() -> None:
+    class Short(Dc104Drive):
+        def _listed(self) -> list[Parameter]:
+            return [Parameter(item=item) for item in ("5", "3")]
+
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Short(bus)
+        saved = await drive.save_parameters([Parameter(item=item) for item in ("4", "3", "2", "5")])
+        load = await drive.prepare_load(changed(saved, p2=1, p3=1, p4=1, p5=1))
+        assert [change.parameter.item for change in load.changes] == ["5", "3", "4", "2"]
+
+
+@in_virtual_time
+async def test_a_limit_that_is_set_after_a_load_was_prepared_refuses_its_write_and_the_others_are_written() -> None:
+    async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
+        drive = Dc104Drive(bus)
+        saved = await drive.save_parameters(drive.parameters(["3:3"]))
+        load = await drive.prepare_load(changed(saved, p3=7, p4=51, p5=7))
+        drive.point("4").limit(maximum=50)
+        found = [outcome async for outcome in load.write()]
+    assert [one.result for one in found] == [Result.WRITTEN, Result.REFUSED, Result.WRITTEN]
+    assert found[1].why.endswith("4 = 51 is above its maximum of 50")
+
+
+@in_virtual_time
+async def test_an_acknowledged_write_that_could_not_be_read_back_is_unconfirmed() -> None:
+    class Vanishing(OddDrive):
+        def _handle(self, frame: bytes, now: float) -> None:
+            if frame[1] == READ and self.registers[4]:
+                self.faults.dead = 1.0
+            super()._handle(frame, now)
+
+    results, reasons = await outcomes(Vanishing(), 3, 4, 5, retries=0)
+    assert results == [Result.WRITTEN, Result.UNCONFIRMED, Result.NOT_WRITTEN]
+    assert reasons[1].startswith("acknowledged, but not read back: ")
 
 
 def test_parameters_are_counted_each_once_and_known_by_any_form_of_their_item() -> None:
