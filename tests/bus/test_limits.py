@@ -6,14 +6,16 @@ import asyncio
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import pytest
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
 from busmaster.bus.node import Health, Node, Priority
+from busmaster.bus.requester import WriteOptions
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
@@ -454,3 +456,49 @@ async def test_a_limit_of_a_held_handle_applies_to_its_node() -> None:
         drive.node.check(hcp2.Write(10, (11.0,)), stop=True)
         held.node.check(hcp2.Write(10, (11.0,)), stop=True)
         assert len(Node.of(drive).limits) == 1
+
+
+@in_virtual_time
+async def test_the_value_from_which_a_write_steps_is_read_with_the_priority_of_the_write() -> None:
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5)) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20, priority=Priority.BACKGROUND)
+        waits = (await bus.statistics()).waits
+        assert (waits[Priority.BACKGROUND].count, waits[Priority.COMMAND].count) == (2, 0)
+
+
+@in_virtual_time
+async def test_a_step_counts_from_what_is_read_after_a_write_to_all_because_no_node_confirms_it() -> None:
+    device = make_device("mentor", 14)
+    async with bus_of(MentorDrive, device) as bus:
+        drive = MentorDrive(bus, 14)
+        drive.point("1.17").limit(max_step=60)
+        await MentorDrive(bus, 0).write("1.17", 50)
+        device.preset("1.17", 100)
+        await drive.write("1.17", 150)
+        assert await drive.read("1.17") == 150
+
+
+@pytest.mark.parametrize("option", ["start_within", "finish_within"])
+@in_virtual_time
+async def test_a_write_is_not_sent_if_the_value_from_which_it_steps_is_not_read_within_its_time(option: str) -> None:
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(0.09))) as bus:
+        in_use(bus)
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        began, options = bus.now(), cast("WriteOptions", {option: 0.05})
+        with pytest.raises(NotStarted, match="the current value was not read in time"):
+            await drive.write(10, 20, **options)
+        assert bus.now() - began == pytest.approx(0.05, abs=0.001)
+        assert await drive.read(10) == 0
+
+
+@in_virtual_time
+async def test_a_message_about_a_limit_has_the_unit_of_the_point() -> None:
+    async with controller() as drive:
+        replace(drive.element(10), unit="m/min").limit(maximum=500, max_step=50)
+        with pytest.raises(InvalidCommand, match=r"10 = 501 m/min is above its maximum of 500 m/min$"):
+            await drive.write(10, 501)
+        with pytest.raises(InvalidCommand, match=r"10 = 51 m/min is too far from 0 m/min: its max_step is 50 m/min$"):
+            await drive.write(10, 51)
