@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from busmaster import ext
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -17,18 +18,21 @@ from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, NoReply, Refused
+from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, NodeDown, NoReply, Refused
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.mentor.handle import MentorDrive as MentorHandle
+from busmaster.protocols.modbus.device import EmulatedModbus, Illegal
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import make_device
 from tests.stories import cycles, on_a_bus
+
+SERVER_DEVICE_BUSY = 6
 
 # consumers
 
@@ -678,5 +682,118 @@ def test_an_application_may_leave_the_loop_over_a_group_and_its_consumer_ends() 
         assert len(group._consumers) == 1
         await iteration.aclose()  # type: ignore[attr-defined]  # it is a generator
         assert group._consumers == []
+
+    on_a_bus(story)
+
+
+def test_the_last_value_is_that_of_the_last_reply_and_not_of_a_later_read_that_failed() -> None:
+    device = EmulatedMint(1)
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        await axis.write(7, 5.0)
+        first = bus.poll_group("first", period=1000.0, points=[axis.point("7")])
+        await cycles(first, 1)
+        device.faults.dead = 1.0
+        [failed] = await cycles(bus.poll_group("second", period=1000.0, points=[axis.point("7")]), 1)
+        assert isinstance(failed[axis.point("7")].error, NoReply)
+        assert ext.last_value(axis.point("7")) == 5.0
+
+    on_a_bus(story, device)
+
+
+def test_a_sample_that_becomes_stale_within_its_cycle_is_counted_once() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        points = [axis.point(str(element)) for element in range(1, 25)]
+        group = bus.poll_group("g", period=10.0, points=points)
+        await cycles(group, 1)
+        group.demand()
+        await asyncio.sleep(0.030)
+        await points[0].write(5.0)
+        await cycles(group, 1)
+        counts = group.statistics()
+        assert (counts.cycles, counts.good, counts.late, counts.stale, counts.bad) == (2, 47, 0, 1, 0)
+
+    on_a_bus(story)
+
+
+def test_a_read_that_one_node_refuses_is_still_merged_for_the_others() -> None:
+    devices = [make_device("modbus", 17), make_device("modbus", 18, size=3)]
+
+    async def story(bus: Bus) -> None:
+        units = [ModbusUnit(bus, address) for address in (17, 18)]
+        points = [unit.point(f"holding:{place}") for unit in units for place in range(5)]
+        group = bus.poll_group("g", period=5.0, points=points)
+        [snapshot] = await cycles(group, 1)
+        assert [point.key for point, sample in snapshot.items() if sample.error is not None] == [
+            "18/holding:3",
+            "18/holding:4",
+        ]
+        merged = (await bus.plan()).groups[0].merged
+        assert [(reads.node, reads.serves) for reads in merged if reads.node == "node 17"] == [("node 17", 5)]
+        sent = Node.of(units[0]).statistics().attempts
+        await cycles(group, 3)
+        assert Node.of(units[0]).statistics().attempts == sent + 3
+
+    on_a_bus(story, *devices, settings=ModbusUnit.profile.line)
+
+
+def test_reads_are_merged_again_when_a_node_that_was_busy_is_not() -> None:
+    class Busy(EmulatedModbus):
+        busy = False
+
+        def _read(self, function: int, first: int, count: int, now: float) -> bytes:
+            if self.busy:
+                raise Illegal(SERVER_DEVICE_BUSY)
+            return super()._read(function, first, count, now)
+
+    device = Busy(17)
+
+    async def story(bus: Bus) -> None:
+        unit = ModbusUnit(bus, 17)
+        points = [unit.point(f"holding:{place}") for place in range(5)]
+        group = bus.poll_group("g", period=5.0, points=points)
+        await cycles(group, 1)
+        device.busy = True
+        [snapshot] = await cycles(group, 1)
+        assert all(isinstance(sample.error, Refused) for sample in snapshot.values())
+        device.busy = False
+        assert [merged.serves for merged in (await bus.plan()).groups[0].merged] == [5]
+        sent = Node.of(unit).statistics().attempts
+        [snapshot] = await cycles(group, 1)
+        assert [sample.value for sample in snapshot.values()] == [0] * 5
+        assert Node.of(unit).statistics().attempts == sent + 1
+
+    on_a_bus(story, device, settings=ModbusUnit.profile.line)
+
+
+def test_periods_are_measured_by_the_times_at_which_cycles_were_due_if_nothing_can_be_sent() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        Node.of(point).suspend(100.0)
+        [*_, snapshot] = await cycles(group, 4)
+        assert (snapshot.started, isinstance(snapshot[point].error, NodeDown)) == (None, True)
+        assert group.recent_periods == pytest.approx((0.1,) * 3)
+        assert group.statistics().achieved == pytest.approx(0.1)
+
+    on_a_bus(story)
+
+
+def test_the_time_of_a_cycle_counts_from_when_it_was_due() -> None:
+    async def story(bus: Bus) -> None:
+        dead = bus.node(hcp2.PROFILE, 9)
+        group = bus.poll_group("g", period=0.5, points=[Hcp2Controller(bus, 1).point("7")])
+        due = (await cycles(group, 2))[-1].due + 0.5
+        group.reset_statistics()
+        await asyncio.sleep(due - bus.now() - 0.010)
+        with pytest.raises(NoReply):
+            await dead.request(hcp2.Read(1), retries=0)
+        await cycles(group, 2)
+        counts = group.statistics()
+        assert (counts.cycles, counts.cycle_time.count) == (2, 2)
+        assert counts.cycle_time.highest > 0.140
+        assert counts.exchanges_ahead == pytest.approx(0.5)  # one exchange before one of the two cycles
 
     on_a_bus(story)

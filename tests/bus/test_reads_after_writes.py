@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, ModbusUnit
+from busmaster import Bus, Hcp2Controller, MemoryPort, ModbusUnit, ext
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node, Priority
 from busmaster.bus.points import Point
@@ -30,7 +31,8 @@ Story = Callable[[Bus, Device], Awaitable[None]]
 def on_a_line(story: Story) -> None:
     async def run() -> None:
         device = make_device("hcp2", 5)
-        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, [device])), seed=1) as bus:
+        line = Line(Hcp2Controller.profile.line, [device], chance=random.Random(1))
+        async with Bus(MemoryPort(line), seed=1) as bus:
             await story(bus, device)
 
     run_in_virtual_time(run())
@@ -256,5 +258,76 @@ def test_all_points_that_a_write_makes_stale_are_read_in_each_group() -> None:
         assert bus._reads_after_writes.read == 3
         assert [held(first, point)[1] for point in points[:2]] == [Quality.GOOD] * 2
         assert held(second, points[2])[1] is Quality.GOOD
+
+    on_a_line(story)
+
+
+def test_the_last_values_of_other_points_are_still_known_after_the_read() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        device.preset("11", 4.0)
+        point, other = point_of(bus, "10", read_after_write=True), point_of(bus, "11")
+        await polled(bus, point, other)
+        await point.write(7.0)
+        await settle()
+        assert [ext.last_value(one) for one in (point, other)] == [7.0, 4.0]
+
+    on_a_line(story)
+
+
+def test_what_became_stale_has_the_time_of_the_write() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        point = point_of(bus, "10")
+        group = await polled(bus, point)
+        changes = group.subscribe(changes=True)
+        await asyncio.sleep(100.0)
+        await point.write(7.0)
+        outdated = await anext(changes)
+        assert outdated.finished == pytest.approx(bus.now(), abs=0.1)
+        assert outdated.wall == outdated[point].wall == pytest.approx(outdated.finished + bus.wall_time() - bus.now())
+        assert group.latest is not None
+        assert outdated.wall - group.latest[point].wall > 99.0
+
+    on_a_line(story)
+
+
+def test_a_read_that_is_not_sent_within_the_period_of_its_group_is_dropped() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        point = point_of(bus, "10", read_after_write=True)
+        await polled(bus, point, period=0.3)
+        async with Hcp2Controller(bus, 5).exclusive(max_hold=5.0) as held:
+            await held.point("10").write(7.0)
+            await asyncio.sleep(0.5)
+        await settle()
+        assert (bus._reads_after_writes.read, bus._reads_after_writes.failed) == (0, 1)
+
+    on_a_line(story)
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["", "and it is written again without a confirmation"])
+def test_a_value_read_after_a_write_in_a_running_cycle_is_counted_once_with_its_quality(again: bool) -> None:
+    """The cycle has read the point before the write, so the value that was read after the write is in its snapshot."""
+
+    async def story(bus: Bus, device: Device) -> None:
+        point = point_of(bus, "10", read_after_write=True)
+        others = [point_of(bus, str(number)) for number in range(11, 99)]
+        group = await polled(bus, point, *others)
+        await settle()
+        bus.reset_statistics()
+        group.demand()
+        await asyncio.sleep(0.1)  # its first read is over, its last is not
+        await point.write(7.0)
+        while not bus._reads_after_writes.read:  # noqa: ASYNC110  time is virtual
+            await asyncio.sleep(0.001)
+        if again:
+            device.faults.lost = 1.0
+            with pytest.raises(WriteUnconfirmed):
+                await point.write(8.0, retries=0)
+            device.faults.lost = 0.0
+        while not group.statistics().cycles:  # noqa: ASYNC110  time is virtual
+            await asyncio.sleep(0.001)
+        counts = group.statistics()
+        assert held(group, point) == (7.0, Quality.STALE if again else Quality.GOOD)
+        assert counts.stale == int(again)
+        assert counts.good + counts.late + counts.stale + counts.bad == 89
 
     on_a_line(story)
