@@ -194,6 +194,7 @@ def test_each_of_several_overheard_values_may_begin_an_alarm() -> None:
         [sample] = samples(30.0).values()
         bus._overheard(dict.fromkeys((*speeds, drive.point("13")), sample))
         assert {point for point, alarm in bus.alarms.items() if alarm is not None} == set(speeds)
+        assert set(bus.alarms) == set(speeds), "a point without limits has no alarm"
 
     on_a_bus(story)
 

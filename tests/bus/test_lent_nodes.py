@@ -6,7 +6,8 @@ import asyncio
 
 import pytest
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, Node
+from busmaster import Bus, BusError, Hcp2Controller, MemoryPort, Node
+from busmaster.arbiter.events import NodeChanged
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.hcp2.codec import Write
@@ -103,5 +104,25 @@ def test_no_queue_is_kept_of_nodes_that_were_given_back() -> None:
                 await own.read(1)
             bus._give_back(bus._lend_node(PROFILE, 11))
             assert not Node.of(own)._shared.arbiter.dispatcher.writes.queues
+
+    run_in_virtual_time(run())
+
+
+def test_what_happens_to_a_node_that_was_given_back_is_not_reported() -> None:
+    async def run() -> None:
+        async with bus_with(5) as bus:
+            await Hcp2Controller(bus, 5).read(1)
+            events = bus.events()
+            lent = bus._lend_node(PROFILE, ABSENT)
+            failing = asyncio.ensure_future(lent.request(PROFILE.probe, retries=0))
+            await asyncio.sleep(0.01)
+            bus._give_back(lent)
+            again = bus._lend_node(PROFILE, ABSENT)
+            assert again is not lent
+            with pytest.raises(BusError):
+                await failing
+            await asyncio.sleep(1)
+            events.close()
+            assert [event async for event in events if isinstance(event, NodeChanged)] == []
 
     run_in_virtual_time(run())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import cast
 
 import pytest
 
@@ -18,8 +19,9 @@ from busmaster.arbiter.events import (
     RepliesLate,
 )
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.bus.alarms import BusEvent
+from busmaster.bus.alarms import AlarmChanged, BusEvent, Side
 from busmaster.bus.logbook import PAUSE, Logbook
+from tests.app.outputs.cycles import point
 from tests.arbiter.bench import Bench
 
 
@@ -63,6 +65,7 @@ def test_r14_a_raised_max_reply_delay_names_node_and_times(lines: pytest.LogCapt
 
 def test_r14_a_max_reply_delay_that_comes_down_again_names_node_and_time(lines: pytest.LogCaptureFixture) -> None:
     Logbook("line").note(MaxReplyDelayLowered(Bench().node(3), 0.15), PAUSE)
+    assert [record.levelname for record in lines.records] == ["INFO"]
     assert lines.messages == ["line: node 3 has replied in time for an hour; maximum reply delay lowered to 150 ms"]
 
 
@@ -121,3 +124,22 @@ def test_r14_exchanges_that_cannot_be_chosen_are_logged_with_group_and_error(lin
         "line: the exchanges of poll group 'fast' could not be chosen",
     )
     assert record.exc_info is not None
+
+
+def test_r14_each_limit_of_a_point_and_each_end_of_its_alarm_is_logged_by_itself(
+    lines: pytest.LogCaptureFixture,
+) -> None:
+    logbook, speed = Logbook("line"), point("1")
+    for limit, bound, value, active in (
+        ("high", 20.0, 25.0, True),
+        ("high", 20.0, 5.0, False),
+        ("low", 10.0, 5.0, True),
+        ("low", 10.0, 15.0, False),
+    ):
+        logbook.note(AlarmChanged(speed, cast("Side", limit), bound, value, active), 0.0)
+    assert [(record.levelname, record.message) for record in lines.records] == [
+        ("WARNING", "line: 5/1 = 25 is above its high of 20"),
+        ("INFO", "line: 5/1 is back at 5, was above its high of 20"),
+        ("WARNING", "line: 5/1 = 5 is below its low of 10"),
+        ("INFO", "line: 5/1 is back at 15, was below its low of 10"),
+    ]

@@ -79,6 +79,9 @@ def test_what_is_no_word_has_no_bits(value: Any) -> None:
         ({"bits": {"READY": 0}, "precision": 1}, "precision"),
         ({"bits": {"READY": 0}, "deadband": 1}, "deadband"),
         ({"labels": {0: "off"}, "high": 1}, "high"),
+        ({"labels": {0: "off"}, "deadband": 1}, "deadband"),
+        ({"labels": {True: "on"}}, "labels"),
+        ({"bits": {"READY": True}}, "bits"),
         ({"labels": {0: "two\nlines"}}, "labels"),
         ({"labels": {0: ""}}, "labels"),
         ({"labels": {0.5: "half"}}, "labels"),
@@ -168,3 +171,10 @@ def test_values_are_reported_by_exception_if_a_deadband_or_a_heartbeat_is_set(
     assert Meaning(**said).by_exception is by_exception
     word = Meaning(bits={"READY": 0}, **said)
     assert (word.of_bit("READY").deadband, word.of_bit("READY").heartbeat) == (word.deadband, word.heartbeat)
+
+
+@pytest.mark.parametrize("field", ["precision", "low", "high", "hysteresis"])
+@pytest.mark.parametrize(("names", "called"), [({"bits": {"READY": 0}}, "bits"), ({"labels": {0: "off"}}, "labels")])
+def test_what_is_for_quantities_is_refused_for_a_number_with_names(names: Any, called: str, field: str) -> None:
+    with pytest.raises(MeansNothing, match=f"^{field}: is for quantities, and this number has {called}"):
+        Meaning(**{**names, field: 1})

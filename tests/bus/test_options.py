@@ -143,8 +143,11 @@ def test_a_write_that_could_not_be_read_back_in_time_was_not_left_undone() -> No
     async def story(bus: Bus) -> None:
         axis = Hcp2Controller(bus, 1)
         await axis.read(1)
-        with pytest.raises(WriteUnconfirmed, match="acknowledged, but not read back, then: sent, but not answered"):
+        with pytest.raises(
+            WriteUnconfirmed, match="acknowledged, but not read back, then: sent, but not answered"
+        ) as caught:
             await axis.write(1, 5.0, verify=True, finish_within=1.5 * SLOW)
+        assert (caught.value.label, caught.value.command, caught.value.attempts) == ("node 1", "read element 1", 1)
         assert device.comms[1] == 5.0
         await axis.write(1, 6.0, verify=True, finish_within=1.0)
         device.comms[1] = 6.0
@@ -237,3 +240,19 @@ def test_a_timed_request_takes_the_same_options() -> None:
             await node.timed_request(hcp2.Read(1), finish_within=0.03)
 
     on_a_bus(story, slow())
+
+
+def test_equal_writes_of_the_safe_state_that_wait_for_the_line_are_sent_once() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        sent = Node.of(axis).statistics().attempts
+        reading = asyncio.ensure_future(axis.read(1))
+        await asyncio.sleep(0.01)
+        await asyncio.gather(*(axis.write(2, 5.0, safe=True, priority=Priority.URGENT) for _ in range(3)))
+        await reading
+        assert Node.of(axis).statistics().attempts == sent + 2
+        assert device.comms[2] == 5.0
+
+    device = slow()
+    on_a_bus(story, device)

@@ -117,3 +117,5 @@ async def test_a_probe_that_the_protocol_does_not_have_is_an_error() -> None:
             Hcp2Controller(bus, 7).use_sync_reads(probe="axis9.position")
         with pytest.raises(InvalidCommand, match="must read, and write element"):
             Hcp2Controller(bus, 7).node.use_sync_reads(hcp2.Write(1, (1.0,)), ())
+        with pytest.raises(InvalidCommand, match="must read, and write element"):
+            Hcp2Controller(bus, 7).node.use_sync_reads(hcp2.Read(1), (hcp2.Read(2), hcp2.Write(1, (1.0,))))
