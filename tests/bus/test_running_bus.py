@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 from collections.abc import AsyncIterator
 from dataclasses import replace
 
@@ -19,11 +20,17 @@ from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NodeDown, NoReply
 from busmaster.planning import PlannedGroup
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.device import EmulatedMentor
+from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -404,3 +411,117 @@ def test_a_greatest_age_is_a_time_and_only_a_good_sample_serves() -> None:
         assert Node.of(point).statistics().attempts > sent + 1
 
     on_a_bus(story, device)
+
+
+def test_the_reply_time_in_plans_is_that_of_the_last_replies() -> None:
+    """A drive replies more slowly when its program has grown: 400 quick replies and 500 slow ones."""
+    device = EmulatedMint(1, delay=Delay(0.002))
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("g", period=5.0, points=[axis.point(str(element)) for element in range(1, 51)])
+        await cycles(group, 8)
+        assert (Node.of(axis).planned().reply_time or 1.0) < 0.003
+        device.delay = Delay(0.020)
+        await cycles(group, 10)
+        assert (Node.of(axis).planned().reply_time or 0.0) > 0.014
+
+    on_a_bus(story, device)
+
+
+def test_a_plan_behind_a_port_of_unknown_rate_is_for_the_line_of_the_first_protocol() -> None:
+    bus = Bus(TcpPort("127.0.0.1", 1))
+    assert asyncio.run(bus.plan()).line == LineSettings(9600)
+    bus.node(hcp2.PROFILE, 1)
+    assert hcp2.PROFILE.line != LineSettings(9600)
+    assert asyncio.run(bus.plan()).line == hcp2.PROFILE.line
+
+
+def test_r9_polls_in_the_background_are_not_among_those_before_a_poll() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        points = [axis.point(str(element)) for element in range(1, 15)]
+        await axis.read(1)
+        hold = bus.worst_case_wait(Priority.COMMAND) / (1 + 4 + 3)  # with three exchanges before each (R15)
+        group = bus.poll_group("fast", period=0.5, points=points[:4])
+        low = bus.poll_group("slow", period=0.5, points=points[4:], priority=Priority.BACKGROUND)
+        await asyncio.gather(cycles(group, 1), cycles(low, 1))
+        # Twice as many turns as without a group in the background, and no more rivals.
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 4 * 16 * 5 * hold)
+        assert bus.worst_case_wait(Priority.BACKGROUND) == pytest.approx(0.5 + 4 * 16 * 10 * hold)
+
+    on_a_bus(story)
+
+
+def test_hooks_that_still_run_are_cancelled_when_the_bus_is_closed() -> None:
+    devices, begun, cancelled = [EmulatedMint(1), EmulatedMint(2)], list[int](), list[int]()
+
+    async def restore(node: Node) -> None:
+        begun.append(node.address)
+        try:
+            await asyncio.sleep(1e6)
+        except asyncio.CancelledError:
+            cancelled.append(node.address)
+            raise
+
+    async def story(bus: Bus) -> None:
+        axes = [Hcp2Controller(bus, address) for address in (1, 2)]
+        for axis in axes:
+            Node.of(axis).on_return = restore
+        group = bus.poll_group("g", period=0.5, points=[axis.point("7") for axis in axes])
+        for dead, health in ((0.0, Health.UP), (1.0, Health.DOWN), (0.0, Health.UP)):
+            for device in devices:
+                device.faults.dead = dead
+            while any(Node.of(axis).health is not health for axis in axes):
+                await cycles(group, 1)
+        await cycles(group, 1)
+
+    on_a_bus(story, *devices)
+    assert sorted(begun) == sorted(cancelled) == [1, 2]
+
+
+def test_the_time_before_a_bus_is_entered_is_not_time_of_its_line() -> None:
+    async def story() -> None:
+        bus = Bus(MemoryPort(Line(LineSettings(57600), [EmulatedMint(1)], chance=random.Random(1))))
+        await asyncio.sleep(100.0)
+        async with bus:
+            await Hcp2Controller(bus, 1).read(1)
+            assert (await bus.statistics()).elapsed < 5.0
+
+    run_in_virtual_time(story())
+
+
+def test_a_plan_at_once_evaluates_merges_that_no_group_has_enabled() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MentorDrive(bus, 11)
+        bus.poll_group("g", period=1.0, points=[drive.point(f"1.{number}") for number in range(17, 25)])
+        assert ext.plan_at_once(bus).groups[0].could_save == 0.0
+        saved = ext.plan_at_once(bus, could_merge=[mentor.merge_runs]).groups[0].could_save
+        assert saved == (await bus.plan(could_merge=[mentor.merge_runs])).groups[0].could_save > 0.0
+
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
+
+
+def test_a_plan_with_pauses_is_the_plan_and_pauses() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        for number in range(10):
+            points = [axis.point(str(element)) for element in range(1, 50)]
+            bus.poll_group(str(number), period=1000.0, points=points)
+        began = bus.now()
+        planned = await ext.plan_with_pauses(bus, pause=2.0)
+        assert bus.now() - began > 4.0
+        assert [group.exchanges for group in planned.groups] == [49] * 10
+
+    on_a_bus(story)
+
+
+def test_a_hold_of_a_client_is_charged_to_it() -> None:
+    async def story(bus: Bus) -> None:
+        node, client = Node.of(Hcp2Controller(bus, 1)), ext.line_of(bus).add_client(1.0)
+        hold = ext.hold(node, 0.5, client)
+        assert hold.client is client
+        assert ext.hold(node, 0.5).client is not client
+        ext.line_of(bus).release(hold)
+
+    on_a_bus(story)

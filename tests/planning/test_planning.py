@@ -453,3 +453,40 @@ def test_any_plan_adds_up(wanted: list[tuple[tuple[PlannedNode, Command[Any]], f
         assert one.line_time <= one.cycle <= one.longest_cycle or one.cycle == pytest.approx(one.line_time)
         assert one.achieved >= one.period
         assert one.worst_wait > one.line_time
+
+
+def test_a_line_that_is_nearly_full_gets_the_advice_of_one_that_is_too_full() -> None:
+    """Between 90 and 100 % of the line, no cycle is missed, but nothing is left for commands and retries."""
+    groups = [group("a", 32 * EXCHANGE / 0.95, 32)]
+    prediction = planned(*groups)
+    assert prediction.utilisation == pytest.approx(0.95)
+    assert prediction.fitting_baudrate == 115200
+    assert prediction.groups[0].fitting_period is not None
+    assert prediction.advice[-2:] == ("it would fit with all periods 1.06 times as long", "it would fit at 115200 baud")
+
+
+def test_a_period_that_is_offered_has_two_digits() -> None:
+    node = PlannedNode(hcp2.PROFILE, 1, reply_time=0.063 - 20 * TAU)
+    prediction = planned(group("a", 0.1, 2, node=node))
+    assert prediction.groups[0].line_time == pytest.approx(0.126)
+    assert prediction.groups[0].fitting_period == 0.14  # 0.126 s of work are 90 % of it
+
+
+def test_r9_the_probe_of_each_node_counts_with_its_own_timings() -> None:
+    slow = PlannedNode(hcp2.PROFILE, 9, Timings.uniform(ReplyTiming(0.1, 0.5, 0.7, 0.02)))
+    quick_write = hcp2.Write(1, (1.0,))
+    for nodes in ((NODE, slow), (slow, NODE)):
+        bound = bounds([(node, quick_write) for node in nodes], TAU)
+        assert bound.hold == longest_hold(slow.open(slow.profile.probe), TAU)
+
+
+def test_a_node_that_does_not_reply_keeps_the_line_until_its_driver_would_have_released_it() -> None:
+    times = replace(hcp2.PROFILE.timings.read, driver_release_time=0.4)
+    node = PlannedNode(hcp2.PROFILE, 1, Timings.uniform(times))
+    assert planned(group("a", 1.0, 1, node=node)).dead_wait == pytest.approx(8 * TAU + 0.4)
+
+
+def test_the_values_of_a_group_are_its_points_however_they_are_read() -> None:
+    twice = PlannedGroup("g", 1.0, [(NODE, hcp2.Read(1)), (NODE, hcp2.Read(1)), (NODE, hcp2.Read(2))])
+    [one] = planned(twice).groups
+    assert (one.values, one.exchanges) == (3, 2)
