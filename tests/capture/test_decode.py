@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from busmaster.capture.decode import LONGEST_FRAME, Decoder
 from busmaster.contract.frames import Direction, Frame, Kind
 from busmaster.errors import InvalidCommand
+from busmaster.protocols.mentor import codec as mentor
 from busmaster.registry import find, kinds
 from busmaster.testing.damage import garbage_chunks
 from tests.capture.hearing import HOST, NODE, hear, said, sender_of, vectors
@@ -106,6 +107,44 @@ def test_a_lone_eot_says_no_such_parameter_and_one_before_digits_is_a_new_reques
 def test_nobody_answers_a_mentor_broadcast() -> None:
     frames = hear("mentor", "04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F", "06")
     assert said(frames) == ["host 0 write 01.17 = +0000", "node ACK [unexpected]"]
+
+
+def test_a_mentor_read_of_a_missing_parameter_can_be_continued_by_short_commands() -> None:
+    frames = hear("mentor", "04 31 31 32 32 31 37 32 33 05", "04", "06")
+    assert said(frames) == ["host 12 read 17.23", "node 12 EOT", "host 12 next 17.24"]
+
+
+def test_a_mentor_forgets_its_last_read_with_any_other_request() -> None:
+    frames = hear(
+        "mentor",
+        "04 31 31 32 32 30 31 31 37 05",
+        "02 30 31 31 37 2D 30 30 34 37 36 03 3C",
+        "04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F",  # to all drives: none replies
+        "06",
+    )
+    assert said(frames)[-2:] == ["host 0 write 01.17 = +0000", "node ACK [unexpected]"]
+
+
+def test_short_commands_with_different_steps_are_not_a_run() -> None:
+    frames = hear(
+        "mentor",
+        "04 31 31 32 32 30 31 31 37 05",
+        "02 30 31 31 37 2D 30 30 34 37 36 03 3C",
+        "06",
+        "02 30 31 31 38 2B 30 30 30 30 30 03 30",
+        "08",
+        "02 30 31 31 37 2D 30 30 34 37 36 03 3C",
+    )
+    read, following, previous = frames[::2]
+    command = find("mentor").protocol.dialect().command
+    assert command(read, [following]) == mentor.ReadRun(1, 17, 2)
+    assert command(read, [following, previous]) == command(read, []) == mentor.Read(1, 17)
+
+
+def test_a_capture_of_a_parameter_0_is_a_read_and_a_write_of_it() -> None:
+    frames = hear("dc104", "02 AA 00 AA", "02 55 00 04 D2 2B")
+    command = find("dc104").protocol.dialect().command
+    assert [str(command(frame, ())) for frame in frames] == ["read parameter 0", "write parameter 0 = 1234"]
 
 
 def test_parity_in_bit_7_is_not_looked_at() -> None:
@@ -215,6 +254,8 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
         ("hcp2", "07 30 32 02 30 61 05 54", "host 2 read '0a'"),
         ("hcp2", "07 30 31 02 30 31 35 03 34 02 30 31 35 03 37", "node 1 1 = 5 [a value is not a reply to a write]"),
         ("hcp2", "07 30 31 02 30 31 35 03 34 15 15", "node NAK [unexpected]"),
+        ("hcp2", "07 30 32 02 30 31 05 04 02 30 32 35 03 35", "node 2 2 = 5 [bad checksum 35, not 34]"),
+        ("hcp", "04 31 31 02 39 39 31 2C 32 03 2D", "host 1 write 99 = 1,2 [bad checksum 2D, not 2C]"),
         ("mentor", "04 31 32 33 34 30 31 31 37 05", "host read 01.17 [no drive address: '1234']"),
         ("mentor", "04 31 31 32 32 30 31 41 37 05", "host 12 read '01A7'"),
         ("mentor", "04 31 31 32 32 30 31 31 37 05 06", "node 12 ACK [an ACK is not a reply to a read]"),

@@ -45,8 +45,10 @@ async def test_a_written_parameter_is_read_back(line: Parameters) -> None:
 
 @pytest.mark.asyncio
 async def test_a_value_that_the_drive_limits_fails_its_verification(line: Parameters) -> None:
-    with pytest.raises(VerifyFailed, match="parameter 12 reads 1000 after 1500 was written"):
-        await Dc104Drive(line).write(12, 1500, verify=True)
+    for values in ((1500,), (1500, 7), (7, 1500)):
+        limited = 12 + values.index(1500)
+        with pytest.raises(VerifyFailed, match=f"parameter {limited} reads 1000 after 1500 was written"):
+            await Dc104Drive(line).write(12, *values, verify=True)
 
 
 @pytest.mark.asyncio
@@ -63,8 +65,9 @@ async def test_what_the_drive_does_not_have_is_never_sent(line: Parameters) -> N
     drive = Dc104Drive(line, maximum=120)
     with pytest.raises(InvalidCommand):
         await drive.read(121)
-    with pytest.raises(InvalidCommand):
-        await drive.write(0, 1)
+    for wrong in (0, 121):
+        with pytest.raises(InvalidCommand):
+            await drive.write(wrong, 1)
     with pytest.raises(InvalidCommand):
         await drive.write(1, 65536)
     for item in ("121", "0", "x", "-1", ""):

@@ -11,7 +11,7 @@ import pytest
 from busmaster import Bus, Hcp2Controller, InvalidCommand, MicroFlexDrive, NoReply, NotStarted, VerifyFailed
 from busmaster.contract.exchange import Command
 from busmaster.emulator.faults import Faults
-from busmaster.errors import WriteUnconfirmed
+from busmaster.errors import BusClosed, WriteUnconfirmed
 from busmaster.protocols._comms.codec import ReadElement, WriteElements
 from busmaster.protocols._comms.mint import EmulatedMint, command_handshake
 from tests.handles.fake_bus import FakeBus
@@ -179,9 +179,9 @@ async def test_a_command_that_was_not_acknowledged_is_awaited_if_it_arrived() ->
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize("after", [0.0, NoReply("no reply")])
+@pytest.mark.parametrize("after", [0.0, 8.0, NoReply("no reply")])
 async def test_a_command_that_was_not_acknowledged_and_is_not_there_is_unconfirmed(after: float | Exception) -> None:
-    bus = Program(0, after, write=lambda: WriteUnconfirmed("no acknowledgement"))
+    bus = Program(0, after, 0, write=lambda: WriteUnconfirmed("no acknowledgement"))
     with pytest.raises(WriteUnconfirmed, match="no acknowledgement"):
         await Hcp2Controller(bus, 1).execute(7, finish_within=1)
     assert bus.asked.count("write element 1 = 7") == 1
@@ -216,6 +216,49 @@ async def test_a_read_that_fails_meanwhile_is_made_again() -> None:
     bus = Program(0, 7, NoReply("no reply"), 7, NoReply("no reply"), 0)
     await Hcp2Controller(bus, 1).execute(7, finish_within=1)
     assert bus.reads == []
+
+
+@pytest.mark.asyncio
+async def test_nothing_is_awaited_on_a_bus_that_was_closed() -> None:
+    bus = Program(0, 7, BusClosed("the bus was closed"), 0)
+    with pytest.raises(BusClosed):
+        await Hcp2Controller(bus, 1).execute(7, finish_within=1)
+    assert bus.reads == [0]
+
+
+def test_the_time_that_a_command_takes_counts_from_when_it_was_sent_also_without_an_acknowledgement() -> None:
+    """The acknowledgement is lost: that the command has arrived is known only some 0.15 s later."""
+    mint = EmulatedMint(1, program=careful)
+    write, read = mint.write_element, mint.read_element
+
+    def write_element(element: int, value: float, now: float) -> bool:
+        mint.faults.lost = float(element == 1)
+        return write(element, value, now)
+
+    def read_element(element: int, now: float) -> float | None:
+        mint.faults.lost = 0.0
+        return read(element, now)
+
+    mint.write_element, mint.read_element = write_element, read_element  # type: ignore[method-assign]
+
+    async def story(bus: Bus) -> None:
+        await Hcp2Controller(bus, 1).execute(MOVE_ABSOLUTE, SPEED, TARGET, finish_within=5, takes=0.9 * TARGET / SPEED)
+        assert mint.axes[1].position(bus.now()) == TARGET
+
+    on_a_bus(story, mint)
+
+
+def test_no_data_are_written_for_a_command_beyond_a_limit() -> None:
+    mint = EmulatedMint(1, program=careful)
+
+    async def story(bus: Bus) -> None:
+        controller = Hcp2Controller(bus, 1)
+        controller.element(1).limit(maximum=5)
+        with pytest.raises(InvalidCommand, match="1 = 7 is above its maximum of 5"):
+            await controller.execute(7, SPEED, TARGET, finish_within=5)
+        assert mint.comms[2:4] == [0.0, 0.0]
+
+    on_a_bus(story, mint)
 
 
 @pytest.mark.asyncio

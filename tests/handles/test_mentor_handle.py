@@ -49,6 +49,14 @@ async def test_a_value_is_in_the_parameters_own_unit(drive: MentorDrive, line: P
 
 
 @pytest.mark.asyncio
+async def test_a_value_of_a_parameter_without_decimals_is_rounded_if_that_is_declared(
+    drive: MentorDrive, line: Parameters
+) -> None:
+    await drive.write("1.18", 2.5)
+    assert line.asked == ["write 01.18 = +0003"]
+
+
+@pytest.mark.asyncio
 async def test_high_resolution_adds_a_decimal(drive: MentorDrive, line: Parameters) -> None:
     await drive.write("1.17", 47.65, high_resolution=True)
     assert line.asked == ["write 01.17 = +04765"]
@@ -90,6 +98,9 @@ async def test_a_verified_write_is_read_back(drive: MentorDrive, line: Parameter
         await drive.write("1.17", 47.6, verify=True)
     with pytest.raises(VerifyFailed, match=r"reads 475 after \+04765"):
         await drive.write("1.17", 47.65, high_resolution=True, verify=True)
+    with pytest.raises(VerifyFailed, match=r"reads 475 after \+04760"):  # an ordinary step, and not its tenths
+        await drive.write("1.17", 47.60, high_resolution=True, verify=True)
+    await drive.write("1.17", 47.59, high_resolution=True, verify=True)
 
 
 @pytest.mark.asyncio
@@ -199,7 +210,9 @@ async def test_a_high_resolution_point_reads_in_the_unit_in_which_it_is_written(
 ) -> None:
     point = drive.point("2.10:hires")
     await point.write(4765)
-    assert line.asked == ["write 02.10 = +04765"]
+    [send] = drive._prepare_write("2.10:hires", [4766])
+    await send()
+    assert line.asked == ["write 02.10 = +04765", "write 02.10 = +04766"]
     assert await point.read() == 4760
 
 

@@ -182,6 +182,12 @@ def test_a_cancel_bit_that_cannot_be_cleared_is_told(line: Drive) -> None:
         run_in_virtual_time(MicroFlexDrive(line, 7).cancel_errors())
 
 
+def test_the_failure_to_set_the_cancel_bit_is_reported_and_not_that_to_clear_it(line: Drive) -> None:
+    line.failures = chain([NoReply("first")], (WriteUnconfirmed("second") for _ in count()))
+    with pytest.raises(NoReply, match="first"):
+        run_in_virtual_time(MicroFlexDrive(line, 7).cancel_errors())
+
+
 def test_a_clear_that_never_gets_its_turn_is_told(line: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = MicroFlexDrive(line, 7)
     monkeypatch.setattr(drive.node, "request", hang_at_third(drive.node.request))

@@ -167,6 +167,7 @@ async def test_a_refusal_that_no_single_read_would_fix_is_the_callers(line: Cont
     known, unknown = MscController(line, 3, address_step=4), MscController(line, 4)
     with pytest.raises(Refused):
         await known.read(1000, 32)
+    assert line.asked == ["read 32 values from data 1000"]
     with pytest.raises(Refused):
         await known.read(1000, 1)
     with pytest.raises(Refused):
@@ -198,6 +199,16 @@ async def test_a_cam_table_is_written_verified_and_shows_its_progress(press: Msc
     assert progress == sorted(progress)
     assert {priority for _, _, priority in line.log} == {Priority.BACKGROUND}
     assert len(line.asked) == 31 + 8 + 1 + 32
+    writes = [options for command, options in zip(line.asked, line.options, strict=True) if "write" in command]
+    assert {options.get("idempotent") for options in writes} == {True}
+
+
+@pytest.mark.asyncio
+async def test_a_cam_table_is_loaded_with_another_priority_if_one_is_given(
+    press: MscController, line: Controller
+) -> None:
+    await press.load_cam("cam", range(33), priority=Priority.URGENT)
+    assert {priority for _, _, priority in line.log} == {Priority.URGENT}
 
 
 @pytest.mark.asyncio
@@ -229,6 +240,24 @@ async def test_the_address_step_is_found_on_values_that_differ(step: int) -> Non
 async def test_values_that_do_not_tell_the_step_leave_it_unknown(step: int, values: list[int]) -> None:
     line = Controller(step=step)
     line.data = values
+    press = MscController(line, 3)
+    with pytest.raises(InvalidCommand, match="do not show the address step"):
+        await press.find_address_step(2000)
+    assert press.address_step is None
+
+
+@pytest.mark.asyncio
+async def test_values_that_change_while_the_step_is_searched_leave_it_unknown() -> None:
+    line = Controller(step=1)
+    line.data = [3 * i * i for i in range(1200)]
+    known = line.answer
+
+    def answer(command: Command[Any]) -> Any:
+        found = known(command)
+        line.data[4] = 7
+        return found
+
+    line.answer = answer
     press = MscController(line, 3)
     with pytest.raises(InvalidCommand, match="do not show the address step"):
         await press.find_address_step(2000)

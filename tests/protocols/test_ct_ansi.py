@@ -183,6 +183,41 @@ def test_values_are_read_and_written_in_their_own_unit() -> None:
     told(story, decimals={"1.21": 1})
 
 
+@pytest.mark.parametrize(
+    ("value", "text"), [(47.65, "+47.7"), (-47.65, "-47.7"), (0.25, "+0.3"), (3, "+3"), (True, "1"), (False, "0")]
+)
+def test_a_value_is_rounded_half_away_from_zero_to_its_declared_decimals(value: float, text: str) -> None:
+    async def story(drive: CtAnsiDrive) -> None:
+        sent: list[str] = []
+
+        async def request(command: Write, **options: Any) -> None:
+            sent.append(command.text)
+
+        drive.node.request = request  # type: ignore[method-assign, assignment]  # to see what is sent
+        await drive.write("1.21", value)
+        await drive.point("1.21").write(value)
+        assert sent == [text] * 2
+
+    told(story, decimals={"1.21": 1})
+
+
+def test_a_value_with_more_decimals_than_fit_is_verified_as_it_was_sent() -> None:
+    async def story(drive: CtAnsiDrive) -> None:
+        sent: list[float] = []
+
+        async def request(command: Any, **options: Any) -> Any:
+            if not command.writes:
+                return sent[-1]
+            sent.append(float(command.text))
+            return None
+
+        drive.node.request = request  # type: ignore[method-assign]  # a drive that stores what it takes
+        await drive.write("1.22", 1 / 3, verify=True)
+        assert sent != [1 / 3]
+
+    told(story)
+
+
 def test_a_value_that_differs_after_writing_is_told() -> None:
     async def story(drive: CtAnsiDrive) -> None:
         answers = iter((Done(None), Done(5.0)))
@@ -241,3 +276,10 @@ def test_a_listener_hears_decimal_points_and_makes_commands_of_this_protocol() -
     dialect = find("ct-ansi").protocol.dialect()
     commands = [dialect.command(frame, ()) for frame in frames if frame.kind in (Kind.READ, Kind.WRITE)]
     assert commands == [Write(1, 25, -34.5), Read(1, 21)]
+
+
+@pytest.mark.parametrize("value", [True, False, 1.0, -34.5, 12])
+def test_a_listener_makes_a_command_that_sends_the_same_bytes_of_a_write(value: float) -> None:
+    request = Write(1, 25, value).open(12, PROFILE.timings).request
+    [frame] = hear("ct-ansi", request.hex())
+    assert find("ct-ansi").protocol.dialect().command(frame, ()).open(12, PROFILE.timings).request == request

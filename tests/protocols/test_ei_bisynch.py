@@ -129,6 +129,11 @@ def test_a_short_command_after_a_write_refers_to_no_read() -> None:
     assert [frame.item for frame in frames[:4]] == ["PV"] * 4
 
 
+def test_a_short_command_after_an_unexpected_value_refers_to_no_read() -> None:
+    frames = heard(selection("SL", "5."), reply("SL", "5."), NAK)
+    assert [frame.fault for frame in frames] == ["", "a value is not a reply to a write", UNEXPECTED]
+
+
 def test_a_listener_accepts_both_rules_of_the_checksum_and_no_other() -> None:
     low = reply("SL", "1.")
     assert low[-1] < 0x20
@@ -137,6 +142,23 @@ def test_a_listener_accepts_both_rules_of_the_checksum_and_no_other() -> None:
     assert [bool(fault) for fault in faults] == [False, False, True]
     [write] = heard(b"\x040033" + low[:-1] + bytes((low[-1] + 0x20,)))
     assert BisynchDialect().command(write, ()) == Write("SL", 1, printable_check=True)
+
+
+def test_a_listener_makes_a_command_that_sends_the_same_bytes_of_a_write() -> None:
+    for text in ("1.", "0001.5", ">0001", ">01", ">00"):
+        request = b"\x040033" + reply("SW", text)
+        [write] = heard(request)
+        assert BisynchDialect().command(write, ()).open(3, TIMINGS).request == request
+
+
+def test_a_listener_does_not_know_what_the_next_parameter_is_until_it_is_sent() -> None:
+    frames = heard(enquiry("PV"), reply("PV", "1."), ACK, reply("SL", "2."), NAK, reply("SL", "3."))
+    assert [frame.item for frame in frames] == ["PV", "PV", "SL", "SL", "SL", "SL"]
+    assert [frame.fault for frame in frames] == [""] * 6
+    dialect = BisynchDialect()
+    assert dialect.command(frames[0], [frames[2], frames[4]]) == ReadRun(("PV", "SL", "SL"))
+    [read, _, following] = heard(enquiry("PV"), reply("PV", "1."), ACK)
+    assert dialect.command(read, [following]) == Read("PV")
 
 
 @pytest.mark.parametrize(
@@ -417,8 +439,9 @@ def counted(furnace: BisynchInstrument) -> int:
 def test_a_refused_write_names_the_instruments_own_reason() -> None:
     async def story(furnace: BisynchInstrument) -> None:
         for item, value, reason in (("PV", 3, "05C8: the parameter is read-only"), ("SL", 5000, "out of range")):
-            with pytest.raises(Refused, match=reason):
+            with pytest.raises(Refused, match=reason) as refusal:
                 await furnace.write(item, value)
+            assert refusal.value.attempts == 2  # a refusal is confirmed by a second one
         with pytest.raises(Refused, match="01C7"):
             await furnace._prepare_one("QQ", 1)()
         assert "01C7" in await furnace.last_error()
@@ -439,6 +462,29 @@ def test_a_refusal_stays_one_where_the_last_error_cannot_be_read() -> None:
     instrument = made(3)
     del instrument.parameters[b"EE"]
     on_a_bus(story, instrument)
+
+
+def test_a_refusal_stays_one_where_the_last_error_is_not_answered() -> None:
+    class Reticent(EmulatedBisynch):
+        def _answer_read(self, name: bytes, now: float) -> None:
+            if name[-2:] != b"EE":
+                super()._answer_read(name, now)
+
+    async def story(furnace: BisynchInstrument) -> None:
+        with pytest.raises(Refused) as refusal:
+            await furnace.write("PV", 3)
+        assert refusal.value.what == "refused"
+
+    on_a_bus(story, Reticent(3))
+
+
+@pytest.mark.parametrize("name", ["SL", "1SL", "target_setpoint"])
+def test_decimals_are_of_a_parameter_by_its_mnemonic_or_its_name(name: str) -> None:
+    async def story(furnace: BisynchInstrument) -> None:
+        await furnace.write(name, 450.06, verify=True)
+        assert await furnace.read("SL") == 450.1
+
+    on_a_bus(story, made(3), decimals={name: 1})
 
 
 def test_values_are_rounded_to_the_decimals_of_the_parameter() -> None:
@@ -468,6 +514,9 @@ def test_an_instrument_with_another_format_is_read_and_written(options: dict[str
         await furnace.write("tag247:hex", 0xA000, verify=True)
         assert await furnace.read("SL") == 123.5
         assert await furnace.read("tag247") == 0xA000
+        assert await furnace.point("SL,SL").read() == (123.5, 123.5)
+        await furnace.write("SL", 1)
+        assert await furnace.point("SL,SL").read() == (1, 1)
 
     instrument = made(3, **options)
     instrument.preset("tag247", 1)

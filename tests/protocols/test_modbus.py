@@ -6,7 +6,7 @@ The frames are those of the Modbus application protocol, V1.1b3, sections 6.1 to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ from busmaster.contract.exchange import Done, FrameError
 from busmaster.emulator.line import Line
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus
-from busmaster.protocols.modbus.handle import Number, is_whole
+from busmaster.protocols.modbus.handle import Number, Place, is_whole
 from busmaster.testing import Case, Foreign, RoundTrip, answers_of, check_protocol
 from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.protocols.modbus_frames import UNIT, frame
@@ -255,6 +255,33 @@ def test_a_value_that_differs_after_writing_is_told() -> None:
     told(story)
 
 
+def test_values_of_each_exchange_of_a_long_write_are_verified() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        store = device._store
+
+        def stuck(first: int, values: Sequence[int]) -> None:
+            store(first, values)
+            device.registers[125] = 5
+
+        device._store = stuck  # type: ignore[method-assign]
+        with pytest.raises(VerifyFailed, match="holding 125 reads 5 after 1 was written"):
+            await unit.write("holding:0", *(1,) * 130, verify=True)
+
+    told(story)
+
+
+def test_a_number_is_never_divided_between_two_writes() -> None:
+    writes = Place.parse("holding:10:float64").write([1.5] * 60)
+    assert [(write.first, len(write.values)) for write in writes] == [(10, 120), (130, 120)]
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@pytest.mark.parametrize("value", [True, float("nan"), 1e400, 10**400, "1.5", None])
+def test_what_is_not_a_finite_number_cannot_be_sent_as_a_float(kind: str, value: Any) -> None:
+    with pytest.raises(InvalidCommand, match=f"cannot be sent as {kind}"):
+        Number(kind).encode(value)
+
+
 def test_a_write_to_all_reaches_every_unit() -> None:
     async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
         everyone = ModbusUnit(unit.bus, 0)
@@ -273,7 +300,7 @@ def test_a_write_to_all_reaches_every_unit() -> None:
     "item",
     [
         *("100", "holding", "holding:", "holding:x", "holding:1.5", "registers:1"),
-        *("holding:1:int8", "coil:1:int16", "holding:1:swapped", "holding:1:float32:wrong"),
+        *("holding:1:int8", "coil:1:int16", "holding:1:swapped", "holding:1:float32:wrong", "coil:1:int16:swapped"),
         *("holding:65536", "input:65535:2", "holding:1:126", "holding:1:0"),
     ],
 )

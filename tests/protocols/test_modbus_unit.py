@@ -7,9 +7,12 @@ from itertools import combinations
 
 import pytest
 
+from busmaster.capture.decode import Decoder
+from busmaster.contract.frames import Kind
 from busmaster.protocols.modbus.codec import PROFILE, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus
-from tests.capture.hearing import hear, said
+from busmaster.registry import find
+from tests.capture.hearing import HOST, NODE, hear, said
 from tests.protocols.modbus_frames import UNIT, frame
 
 REQUEST = frame("11 03 0007 0001")
@@ -104,6 +107,8 @@ def test_a_listener_tells_requests_from_replies() -> None:
         frame("11 04 0005 0001").hex(),
         frame("11 04 0005 0001").hex(),  # asked again
         frame("11 04 02 0007").hex(),
+        frame("00 06 0001 0003").hex(),
+        frame("11 06 0001 0003").hex(),
     )
     bits = ",".join("101" + "0" * 20 + "1")
     assert said(frames) == [
@@ -119,6 +124,8 @@ def test_a_listener_tells_requests_from_replies() -> None:
         "host 17 read input:5",
         "host 17 read input:5",
         "node 17 input:5 = 7",
+        "host 0 write holding:1 = 3",
+        "host 17 write holding:1 = 3",  # not a reply: a write to all has none
     ]
 
 
@@ -129,3 +136,17 @@ def test_a_listener_says_what_is_wrong_with_a_frame() -> None:
     another = said(hear("modbus", frame("11 06 0001 0003").hex(), frame("11 06 0001 0004").hex()))
     assert "it repeats another write" in another[1]
     assert "4 bytes of data, not 2" in said(hear("modbus", frame(request).hex(), frame("11 03 04 0001 0002").hex()))[1]
+
+
+@pytest.mark.parametrize(("code", "name"), [("02", "illegal data address"), ("2b", "exception 43")])
+def test_a_listener_names_the_exception_of_a_refusal(code: str, name: str) -> None:
+    frames = hear("modbus", frame("11 03 0064 0001").hex(), frame(f"11 83 {code}").hex())
+    assert (frames[1].kind, frames[1].command) == (Kind.NAK, name)
+
+
+@pytest.mark.parametrize("reply", ["12 03 02 0001", "11 04 02 0001", "12 83 02"])
+def test_a_reply_of_another_unit_or_function_is_wrong(reply: str) -> None:
+    decoder = Decoder(find("modbus").protocol.dialect())
+    decoder.feed(frame("11 03 0064 0001"), 0.0, HOST)
+    [found] = decoder.feed(frame(reply), 0.01, NODE)
+    assert found.fault == "wrong reply: function 3 of unit 17 was requested"

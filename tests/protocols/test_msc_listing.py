@@ -85,6 +85,10 @@ def test_a_line_that_cannot_be_read_is_named_and_nothing_is_guessed(line: str, f
     assert f"1 line of its data table cannot be read: line 3, {line!r}: {fault}" in str(caught.value)
 
 
+def test_the_highest_address_is_65535() -> None:
+    assert table("a 0", "b 65535", "c 0FFFFh") == {"a": 0, "b": 65535, "c": 65535}
+
+
 def test_many_bad_lines_are_counted_and_the_first_are_named() -> None:
     with pytest.raises(
         InvalidCommand, match=r"5 lines of its .*line 3, 'b': .*line 4, 'c': .*line 5, 'd': .*; and 2 more; write"
