@@ -217,10 +217,17 @@ def test_a_package_whose_protocol_cannot_be_used_is_told_and_the_others_are_ther
     with pytest.warns(UserWarning, match="of busmaster-broken cannot be used") as told:
         found = protocols()
     causes = [str(warning.message) for warning in told]
-    assert len(causes) == 4
+    assert len(causes) == 6
     for cause, text in zip(
         causes,
-        ("busmaster_missing", "is not a Protocol", "name hcp is taken", "option address_step is a whole"),
+        (
+            "busmaster_missing",
+            "is not a Protocol",
+            "capture id 1 is taken",
+            "name hcp is taken",
+            "option address_step is a whole",
+            "option chain is a flag",
+        ),
         strict=True,
     ):
         assert text in cause
