@@ -155,6 +155,8 @@ def test_an_alarm_goes_on_while_other_points_of_its_group_come_and_go() -> None:
         assert began is not None
         group.add(other)
         assert bus.alarms[speed] is began
+        await cycles(group, 1)
+        assert set(bus.alarms) == {speed}, "a point without limits has no alarm"
         await cycles(group, 2)
         group.remove(other)
         await cycles(group, 2)

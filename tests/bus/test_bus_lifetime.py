@@ -21,11 +21,12 @@ from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import BusClosed, BusError, InvalidCommand
+from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, LineDown
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport.serial_port import SerialPort
 
 
 def slow_bus() -> Bus:
@@ -263,3 +264,47 @@ def test_anyios_cancel_scopes_and_task_groups_work_around_a_bus() -> None:
         read.append(await axis.read(1))
 
     assert anyio.run(story) == [0.0]
+
+
+def test_a_bus_whose_port_could_not_be_opened_can_be_entered_again() -> None:
+    bus = Bus(SerialPort("/dev/no-such-port", baudrate=57600))
+
+    async def story() -> None:
+        for _ in range(2):
+            with pytest.raises(LineDown) as failed:
+                await bus.__aenter__()
+            assert failed.value.line == "/dev/no-such-port"
+            assert not bus.running
+
+    asyncio.run(story())
+
+
+def test_a_bus_queues_as_many_requests_of_a_class_as_its_capacity() -> None:
+    async def story() -> None:
+        line = Line(LineSettings(57600), [EmulatedMint(1)], chance=random.Random(1))
+        async with Bus(MemoryPort(line), capacity=3) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await axis.read(1)
+            found = await asyncio.gather(*(axis.read(1) for _ in range(10)), return_exceptions=True)
+            assert sorted({type(one) for one in found}, key=str) == [BacklogFull, float]
+            assert 3 <= sum(isinstance(one, float) for one in found) <= 4  # one of them on the wire
+
+    run_in_virtual_time(story())
+
+
+def test_a_strict_bus_takes_longer_because_it_holds_ambiguous_replies() -> None:
+    took: dict[bool, float] = {}
+
+    async def story(strict: bool) -> None:
+        line = Line(LineSettings(57600), [EmulatedMint(1)], chance=random.Random(1))
+        async with Bus(MemoryPort(line), strict=strict) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await axis.read(1)
+            began = bus.now()
+            for _ in range(10):
+                await axis.read(1)
+            took[strict] = bus.now() - began
+
+    for strict in (False, True):
+        run_in_virtual_time(story(strict))
+    assert took[True] > took[False]

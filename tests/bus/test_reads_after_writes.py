@@ -331,3 +331,18 @@ def test_a_value_read_after_a_write_in_a_running_cycle_is_counted_once_with_its_
         assert counts.good + counts.late + counts.stale + counts.bad == 89
 
     on_a_line(story)
+
+
+def test_what_a_write_makes_stale_is_reported_to_the_consumers_of_each_group() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        point = point_of(bus, "10")
+        groups = [await polled(bus, point, name=name) for name in ("first", "second", "third")]
+        changes = [group.subscribe(changes=True) for group in groups]
+        await point.write(7.0)
+        assert [(type(one), one.group) for one in [await anext(each) for each in changes]] == [
+            (Outdated, "first"),
+            (Outdated, "second"),
+            (Outdated, "third"),
+        ]
+
+    on_a_line(story)

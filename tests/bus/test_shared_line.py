@@ -251,3 +251,23 @@ def test_whether_a_request_was_sent_is_known_also_after_it_was_cancelled() -> No
         assert [request.sent for request in requests] == [True, False, False]
 
     on_a_bus(story)
+
+
+def test_the_longest_wait_counts_each_queued_write_once_though_writes_to_one_node_wait_for_each_other() -> None:
+    async def story(bus: Bus) -> None:
+        axis, other = Hcp2Controller(bus, 1), Hcp2Controller(bus, 2)
+        for controller in (axis, other):
+            await controller.write(1, 1.0)
+            await controller.read(1)
+        waits = []
+        for waiting in (
+            [axis.write(element, 1.0) for element in range(1, 7)],
+            [axis.read(element) for element in range(1, 7)],
+        ):
+            tasks = [asyncio.ensure_future(one) for one in waiting]
+            await asyncio.sleep(0)
+            waits.append(bus.worst_case_wait(Priority.COMMAND))
+            await asyncio.gather(*tasks)
+        assert waits[0] == waits[1] > bus.worst_case_wait(Priority.COMMAND)
+
+    on_a_bus(story)

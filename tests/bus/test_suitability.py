@@ -103,3 +103,9 @@ def test_a_framing_that_the_documents_name_beside_the_usual_one_is_accepted() ->
         Bus(SerialPort("/dev/ttyS0", baudrate=9600)).node(several, 14)
     with pytest.warns(UserWarning, match="mentor is meant for 7E1 or 8N1, but /dev/ttyS0 is 8N2"):
         Bus(SerialPort("/dev/ttyS0", baudrate=9600, stopbits=2)).node(several, 14)
+
+
+def test_the_framing_behind_a_port_of_raw_tcp_is_that_of_the_serial_server() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Bus(TcpPort("10.0.0.5", 1, baudrate=9600)).node(mentor.PROFILE, 14)

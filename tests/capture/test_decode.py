@@ -225,6 +225,7 @@ def test_dc104_and_its_parameter_whose_reply_looks_like_a_request() -> None:
         "host read 107",
         "node NAK",
     ]
+    assert [frame.answers for frame in frames] == [False, True] * 3
     frames = hear("dc104", "02 AA AA 54", "02 AA 00 05 AF", "02 AA AA 54", "|", "02 AA AA 54", "|")
     assert said(frames) == ["host read 170", "node 170 = 5", "host read 170", "host read 170"]
 
@@ -280,6 +281,12 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
         ),
         ("msc", "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", "node 1 ? = 1234 [unexpected]"),
         ("msc", "06", "node ACK [unexpected]"),
+        ("msc", "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74 06 06", "node 1 ACK [unexpected]"),
+        (
+            "msc",  # a refusal ends the request
+            "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74 15 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",
+            "node 1 ? = 1234 [unexpected]",
+        ),
         ("dc104", "02 AA 01 AB 06", "node ACK [an ACK is not a reply to a read]"),
         ("dc104", "02 AA 01 AB 02 02 00 00 02", "node 2 = 0 [wrong parameter: 1 was requested]"),
         ("dc104", "02 55 01 04 D2 2C 02 01 04 D2 D7", "node 1 = 1234 [a value is not a reply to a write]"),
@@ -322,6 +329,10 @@ def test_noise_is_one_line_and_the_frame_after_it_is_whole() -> None:
         ["unknown 1 byte [no frame]"],
         ["unknown 2 bytes [no frame]"],
     ]
+
+
+def test_a_request_without_its_start_of_text_is_noise() -> None:
+    assert [frame.kind for frame in hear("hcp2", "07 30 32 41 30 31 05 45", "|")] == [Kind.NOISE]
 
 
 def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply() -> None:

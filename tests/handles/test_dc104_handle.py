@@ -44,6 +44,12 @@ async def test_a_written_parameter_is_read_back(line: Parameters) -> None:
 
 
 @pytest.mark.asyncio
+async def test_a_value_is_read_back_with_the_priority_of_its_write(line: Parameters) -> None:
+    await Dc104Drive(line).write(12, 500, 501, verify=True, priority=Priority.BACKGROUND)
+    assert [priority for _, _, priority in line.log] == [Priority.BACKGROUND] * 4
+
+
+@pytest.mark.asyncio
 async def test_a_value_that_the_drive_limits_fails_its_verification(line: Parameters) -> None:
     for values in ((1500,), (1500, 7), (7, 1500)):
         limited = 12 + values.index(1500)

@@ -30,6 +30,7 @@ from busmaster.emulator.line import Line
 from busmaster.protocols.modbus.handle import Place
 from busmaster.registry import make_device
 from busmaster.testing import run_in_virtual_time
+from tests.stories import cycles
 
 
 class PointByPoint(MentorDrive):
@@ -161,6 +162,16 @@ def test_every_value_is_verified_if_that_is_wanted() -> None:
         assert await drive.read("1.17", 3) == (7, 6, 3)
 
     told(Case("mentor", OneMore, ()), story)
+
+
+def test_a_write_of_several_values_makes_no_other_values_of_the_node_stale() -> None:
+    async def story(drive: Any, device: Device, bus: Bus) -> None:
+        points = [drive.point(item) for item in ("1.17", "1.18", "1.19")]
+        await cycles(bus.poll_group("g", period=1000.0, points=points), 1)
+        await drive.write("1.17", 7, 5)
+        assert [bus.latest(point) is None for point in points] == [True, True, False]
+
+    told(CASES["point by point"], story)
 
 
 def test_a_chain_or_a_step_needs_a_count() -> None:
