@@ -525,3 +525,21 @@ def test_a_hold_of_a_client_is_charged_to_it() -> None:
         ext.line_of(bus).release(hold)
 
     on_a_bus(story)
+
+
+def test_a_plan_has_the_period_the_phase_and_the_class_of_each_running_group() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        points = [axis.point(str(element)) for element in range(1, 6)]
+        first = bus.poll_group("first", period=0.5, phase=0.1, points=points[:1])
+        second = bus.poll_group("second", period=2.0, points=points, priority=Priority.BACKGROUND)
+        planned = [group.planned() for group in (first, second)]
+        assert [(one.name, one.period, one.priority) for one in planned] == [
+            ("first", 0.5, Priority.POLL),
+            ("second", 2.0, Priority.BACKGROUND),
+        ]
+        assert planned[0].phase == 0.1
+        one, other = (await bus.plan()).groups
+        assert other.worst_wait - other.period > one.worst_wait - one.period
+
+    on_a_bus(story)

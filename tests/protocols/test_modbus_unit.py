@@ -108,7 +108,7 @@ def test_a_listener_tells_requests_from_replies() -> None:
         frame("11 04 0005 0001").hex(),  # asked again
         frame("11 04 02 0007").hex(),
         frame("00 06 0001 0003").hex(),
-        frame("11 06 0001 0003").hex(),
+        frame("00 06 0001 0003").hex(),  # not a reply: a write to all has none
     )
     bits = ",".join("101" + "0" * 20 + "1")
     assert said(frames) == [
@@ -125,7 +125,7 @@ def test_a_listener_tells_requests_from_replies() -> None:
         "host 17 read input:5",
         "node 17 input:5 = 7",
         "host 0 write holding:1 = 3",
-        "host 17 write holding:1 = 3",  # not a reply: a write to all has none
+        "host 0 write holding:1 = 3",
     ]
 
 
