@@ -43,10 +43,10 @@ def test_a_bus_that_was_closed_is_not_opened_again() -> None:
         with pytest.raises(BusClosed):
             async with bus:
                 pass
-        with pytest.raises(BusClosed):
-            bus.poll_group("late", period=1.0, points=[axis.point("1")])
-        with pytest.raises(BusClosed):
-            bus.events()
+        for use in (lambda: bus.poll_group("late", period=1.0, points=[axis.point("1")]), bus.events):
+            with pytest.raises(BusClosed) as closed:
+                use()
+            assert closed.value.line == bus.endpoint.name
 
     run_in_virtual_time(story())
 

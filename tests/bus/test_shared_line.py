@@ -150,13 +150,20 @@ def test_nothing_is_kept_of_the_writes_to_nodes_that_were_given_back() -> None:
 # stops, and writes that are not of the safe state
 
 
-def test_a_stop_is_reported_at_once_with_its_node() -> None:
+def test_a_stop_and_a_write_are_reported_at_once_to_everyone_with_their_node() -> None:
     async def story(bus: Bus) -> None:
-        stopped: list[str] = []
-        ext.line_of(bus).on_stop.append(lambda record: stopped.append(record.label))
+        stopped, written = list[tuple[int, str]](), list[tuple[int, str]]()
+
+        def follow(who: int) -> None:
+            ext.line_of(bus).on_stop.append(lambda record: stopped.append((who, record.label)))
+            ext.line_of(bus).on_touched.append(lambda record, when: written.append((who, record.label)))
+
+        for who in (1, 2):
+            follow(who)
         await MicroFlexDrive(bus, 2).disable()
         Hcp2Controller(bus, 1).node.note_stop()
-        assert stopped == ["node 2", "node 1"]
+        assert stopped == [(1, "node 2"), (2, "node 2"), (1, "node 1"), (2, "node 1")]
+        assert written == [(1, "node 2"), (2, "node 2")]
 
     on_a_bus(story, make_device("microflex", 2), EmulatedMint(1))
 

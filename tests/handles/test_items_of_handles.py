@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from inspect import signature
 from typing import Any
 
 import pytest
@@ -26,7 +27,7 @@ from busmaster.bus.parameters import FIRST, LAST, USUAL, Parameter
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.protocols.msc.device import EmulatedMsc
-from busmaster.registry import find, make_device
+from busmaster.registry import NodeKind, find, kinds, make_device
 from tests.stories import in_virtual_time
 
 
@@ -260,3 +261,37 @@ def test_a_flag_with_a_number_is_one_item_and_an_address_with_a_count_is_so_many
 
 def test_a_handle_names_its_class_and_its_node() -> None:
     assert repr(Hcp2Controller(Bus(MemoryPort(Line(Hcp2Controller.profile.line))), 5)) == "<Hcp2Controller node 5>"
+
+
+@pytest.mark.parametrize(
+    ("kind", "item", "bits", "whole"),
+    [
+        ("hcp2", "1", 32, False),
+        ("microflex", "status_word", 32, False),
+        ("mentor", "1.17", 16, True),
+        ("mentor", "1.17:wide", 16, True),
+        ("mentor", "1.17:20", 0, True),
+        ("ct-ansi", "1.21", 32, False),
+        ("ct-ansi", "1.21:8", 0, False),
+        ("ei-bisynch", "PV", 16, False),
+        ("ei-bisynch", "SW:hex", 16, True),
+        ("ei-bisynch", "PV,SL", 0, False),
+        ("dc104", "5", 16, True),
+        ("msc", "2008", 32, True),
+        ("msc", "2008:4", 0, True),
+        ("msc", "flag:5", 1, True),
+        ("msc", "flags", 256, True),
+        ("msc", "status", 16, True),
+    ],
+)
+def test_an_item_has_so_many_bits_and_is_a_whole_number_or_not(kind: str, item: str, bits: int, whole: bool) -> None:
+    assert (find(kind).width(item), find(kind).whole_numbers(item)) == (bits, whole)
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
+def test_the_options_of_a_kind_are_the_arguments_of_its_handle(kind: NodeKind) -> None:
+    usual = {"self", "bus", "address", "timings", "retries", "profile"}
+    arguments = set(signature(kind.handle.__init__).parameters) - usual
+    assert {option.name for option in kind.options} | ({"decimals"} if kind.takes_decimals else set()) == arguments
+    reading = set(signature(kind.handle._read_item).parameters) - {"self", "item", "options"}
+    assert {option.name for option in kind.read_options} == reading

@@ -465,11 +465,12 @@ def test_a_line_that_is_nearly_full_gets_the_advice_of_one_that_is_too_full() ->
     assert prediction.advice[-2:] == ("it would fit with all periods 1.06 times as long", "it would fit at 115200 baud")
 
 
-def test_a_period_that_is_offered_has_two_digits() -> None:
-    node = PlannedNode(hcp2.PROFILE, 1, reply_time=0.063 - 20 * TAU)
-    prediction = planned(group("a", 0.1, 2, node=node))
-    assert prediction.groups[0].line_time == pytest.approx(0.126)
-    assert prediction.groups[0].fitting_period == 0.14  # 0.126 s of work are 90 % of it
+def test_a_period_that_is_offered_has_two_digits_and_is_not_longer_than_necessary() -> None:
+    for hundredths in range(11, 100):
+        period = hundredths / 100
+        node = PlannedNode(hcp2.PROFILE, 1, reply_time=0.9 * period - 20 * TAU)
+        [one] = planned(group("a", 0.05, 1, node=node)).groups
+        assert one.fitting_period == period
 
 
 def test_r9_the_probe_of_each_node_counts_with_its_own_timings() -> None:
