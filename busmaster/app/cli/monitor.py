@@ -94,10 +94,17 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
         try:
             until_ended(run, recorder)
         finally:
-            if overheard.ambiguous:
-                note(f"{overheard.ambiguous} replies could belong to earlier requests and were discarded")
+            if text := ambiguous_text(overheard.ambiguous):
+                note(text)
             for counts in line.outputs.statistics():
                 note(output_text(counts))
+
+
+def ambiguous_text(count: int) -> str:
+    """Return how many replies were discarded because they could belong to another request, "" for none."""
+    if count == 1:
+        return "1 reply could belong to an earlier request and was discarded"
+    return f"{count} replies could belong to earlier requests and were discarded" if count else ""
 
 
 def plain_values(snapshot: Snapshot) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import random
 import signal
 import subprocess
@@ -16,14 +17,14 @@ from typing import Any
 
 import pytest
 
-from busmaster import LEARNED, Priority
+from busmaster import LEARNED, Bus, Priority
 from busmaster.app.cli import bench
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import find, make_device
 from busmaster.testing.bench import BenchReport, EmulatedLine, Workload
 from busmaster.testing.latency_report import Times
-from tests.app.cli.conftest import ENVIRONMENT, ROOT, Command, started
+from tests.app.cli.conftest import ENVIRONMENT, ROOT, Command, owner_here, started
 from tests.patience import PATIENCE
 
 HCP2 = ("--protocol", "hcp2")
@@ -180,6 +181,20 @@ def test_each_option_of_the_emulated_line_defines_it(
     assert made == [line]
 
 
+def test_the_seed_is_that_of_a_bus_on_a_port_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[Any] = []
+
+    def bus(*arguments: Any, **options: Any) -> Bus:
+        seeds.append(options["seed"])
+        return Bus(*arguments, **options)
+
+    monkeypatch.setattr(bench, "Bus", bus)
+    for seed in ((), ("--seed", "9")):
+        with ExitStack() as lines:
+            run_of("/dev/ttyS0", "--nodes", "1", *seed)._measurement(lines)
+    assert seeds == [1, 9]
+
+
 # budgets
 
 
@@ -241,6 +256,15 @@ def test_a_port_that_is_not_there_is_one_clear_line_and_status_1(busmaster: Comm
     done = busmaster("bench", port, *HCP2, "--nodes", "1", "--seconds", "1")
     assert (done.status, done.out) == (1, "")
     assert port.removeprefix("socket://") in done.err.splitlines()[-1]
+
+
+def test_a_port_that_another_program_owns_is_not_measured(
+    busmaster: Command, file: Path, three_controllers: TcpServer
+) -> None:
+    with owner_here(file):
+        done = busmaster("bench", three_controllers.path, *HCP2, "--nodes", "1", "--seconds", "1")
+    assert (done.status, done.out) == (1, "")
+    assert f"is owned by process {os.getpid()}; stop that process first" in done.err
 
 
 @pytest.mark.slow
@@ -485,6 +509,20 @@ def test_bad_arguments_are_wrong_usage_and_nothing_is_opened(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("form", [(), ("--json",)])
+def test_a_plot_is_drawn_whatever_the_form_of_the_report(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, form: tuple[str, ...]
+) -> None:
+    drawn: list[tuple[int, str]] = []
+    monkeypatch.setattr(bench, "check_plot", lambda path: None)
+    monkeypatch.setattr(bench, "plot", lambda report, path: drawn.append((report.values, path)))
+    done = busmaster(*VIRTUAL, "--plot", "latency.png", *form)
+    assert (done.status, done.err) == (0, "")
+    [(values, path)] = drawn
+    assert str(values) in done.out
+    assert path == "latency.png"
+
+
 def test_a_plot_is_drawn_after_what_is_printed(busmaster: Command, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "latency.png"

@@ -20,6 +20,7 @@ from busmaster.app.service.authorisation import WriteRequest
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Action
 from busmaster.bus.limits import Limit
+from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import InvalidCommand
@@ -108,11 +109,13 @@ def test_a_reset_cancels_the_errors(busmaster: Command, drive: TcpServer) -> Non
         ("7@PORT", ("reset", *MICROFLEX, "--within", "1"), "reset takes no --within"),
         ("7@PORT", ("enable", *MICROFLEX, "--at-least", "1"), "enable takes no --at-least"),
         ("7@PORT", ("enable", *MICROFLEX, "--wihtin", "1"), "no such option '--wihtin'"),
+        ("7@PORT", ("--enable", *MICROFLEX), "no such option '--enable'"),
         ("7@PORT", ("enable", *MICROFLEX, "--within", "0"), "a time must be above 0"),
         ("drive@PORT", ("enable", *MICROFLEX), "on a PORT, name the node by its address"),
         ("7", ("enable", *MICROFLEX), "'7' is not a node"),
-        ("11@PORT", ("enable", "--protocol", "mentor"), "mentor has no actions"),
+        ("11@PORT", ("enable", "--protocol", "mentor"), "mentor has no actions; write its values with busmaster write"),
         ("2@PORT", ("execute", "1", "--protocol", "hcp"), "execute needs --within S"),
+        ("2@PORT", ("execute", "1", "--protocol", "hcp", "--at-least", "1"), "execute needs --within S"),
         ("2@PORT", ("execute", "--protocol", "hcp", "--within", "1"), "0 numbers do not fit; write: execute COMMAND"),
         ("2@PORT", ("execute", "0", "--protocol", "hcp", "--within", "1"), "0 is not a command"),
         ("2@PORT", ("execute", "1", "x", "--protocol", "hcp", "--within", "1"), "'x' is not a number"),
@@ -210,6 +213,43 @@ def test_an_action_that_fails_is_on_record(busmaster: Command, file: Path, drive
     file.write_text(file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05"))
     assert busmaster("do", f"drive@{file}", "enable").status == 1
     assert audit(file) == [("busmaster do enable", "drive/command_word", 128, "unconfirmed")]
+
+
+def quick_start(file: Path, timing: str = "window = 0.3") -> None:
+    """Reduce the longest reply delay, for which a new line is first listened to."""
+    file.write_text(file.read_text().replace("window = 1.0", timing))
+
+
+def test_a_reply_of_0_is_printed(busmaster: Command, file: Path, drive: TcpServer) -> None:
+    drive.call(lambda line, now: microflex(line).set_hardware_enable(False, now))
+    quick_start(file)
+    ran = busmaster("do", f"drive@{file}", "disable")
+    assert (ran.status, ran.out, ran.err) == (0, "disable ok 0\n", "")
+
+
+def test_a_late_reply_to_an_action_is_reported_with_the_key_of_the_file(
+    busmaster: Command, file: Path, drive: TcpServer
+) -> None:
+    drive.call(lambda line, now: setattr(microflex(line), "delay", Delay(0.03)))
+    quick_start(file, "window = 0.01, max_reply_delay = 0.2")
+    ran = busmaster("do", f"drive@{file}", "disable")
+    assert ran.status == 0, ran.err
+    assert "drive: late reply, " in ran.err
+    assert "; set timing = { window = 0." in ran.err
+
+
+def test_an_output_that_cannot_store_the_record_of_an_action_is_reported(
+    busmaster: Command, file: Path, drive: TcpServer
+) -> None:
+    (file.parent / "line.sqlite").mkdir()
+    quick_start(file)
+    ran = busmaster("do", f"drive@{file}", "disable")
+    assert (ran.status, ran.out) == (0, "disable ok 64 HARDWARE_ENABLE\n")
+    down, incomplete = ran.err.splitlines()
+    assert down.startswith("busmaster: sqlite is down: ")
+    assert incomplete.startswith("busmaster: sqlite: the audit log is incomplete: ")
+    assert down.endswith("Is a directory")
+    assert incomplete.endswith("Is a directory")
 
 
 @pytest.mark.parametrize("option", [("--protocol", "microflex"), ("--baud", "9600")])

@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 import sqlite3
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from socket import create_server
 from typing import Any
 
 import pytest
 
-from busmaster.app.cli import main
+from busmaster.app.cli import main, monitor
+from busmaster.app.cli.monitor import plain_values
 from busmaster.app.cli.overheard import HeardGroup, Overheard
 from busmaster.app.config import load
 from busmaster.app.line import ConfiguredLine
+from busmaster.app.outputs.settings import MqttSettings
 from busmaster.bus.samples import Quality, Sample
 from busmaster.capture.decode import Decoder
 from busmaster.contract.frames import Direction
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import find
-from tests.app.cli.conftest import started
+from tests.app.cli.conftest import Command, started
 from tests.app.outputs.brokers import needs_mosquitto, running
 from tests.app.outputs.cycles import until
 from tests.app.outputs.test_mqtt import heard as heard_of
@@ -291,6 +295,106 @@ def test_what_is_overheard_is_never_good_and_as_old_as_its_first_byte_may_be(tmp
     assert not sample.quality.is_current
     assert before - 3.1 < sample.finished <= time.monotonic() - 3.0
     assert sample.age(time.monotonic()) >= 3.0
+
+
+@contextmanager
+def line_of(*pieces: bytes, then: Callable[[int], object] = lambda _: None) -> Iterator[int]:
+    """The port of a line that carries these bytes, and calls `then` with the number of each piece; then it is lost."""
+    with create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection:
+                for number, piece in enumerate(pieces):
+                    connection.sendall(piece)
+                    then(number)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield server.getsockname()[1]
+        finally:
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    ("line", "note"),
+    [
+        (asked(2) + REPLY, ""),
+        (asked(3) + asked(2) + REPLY, "1 reply could belong to an earlier request and was discarded"),
+        (
+            asked(3) + asked(2) + REPLY + asked(2) + REPLY,
+            "2 replies could belong to earlier requests and were discarded",
+        ),
+    ],
+)
+def test_the_number_of_replies_that_were_discarded_is_reported_at_the_end(
+    busmaster: Command, tmp_path: Path, line: bytes, note: str
+) -> None:
+    with line_of(line) as port:
+        ran = busmaster("monitor", str(written(tmp_path, port)))
+    assert ran.status == 1
+    reports = [text for text in ran.err.splitlines() if "discarded" in text]
+    assert reports == ([f"busmaster: {note}"] if note else [])
+    assert "busmaster: sqlite: " in ran.err
+    assert ran.err.splitlines()[-1].startswith("busmaster: the line was closed")
+
+
+def test_the_end_of_an_alarm_is_of_less_weight_than_its_start(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the journal of systemd, to which standard error leads here."""
+    status = os.fstat(sys.stderr.fileno())
+    monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+    stored = tmp_path / "line.sqlite"
+    low = asked(2) + bytes.fromhex("02 30 31 33 03 31")
+    with line_of(asked(2) + REPLY, low, then=lambda number: until(lambda: len(rows(stored)) > number)) as port:
+        ran = busmaster("monitor", str(written(tmp_path, port)))
+    assert [line for line in ran.err.splitlines() if "winder/tension" in line] == [
+        "<4>busmaster: winder/tension = 0.5 N is above its high of 0.4 N",
+        "<5>busmaster: winder/tension is back at 0.3 N, was above its high of 0.4 N",
+    ]
+
+
+def test_an_output_that_fails_is_reported_while_it_listens(busmaster: Command, tmp_path: Path) -> None:
+    (tmp_path / "line.sqlite").mkdir()
+    with line_of(asked(2) + REPLY) as port:
+        ran = busmaster("monitor", str(written(tmp_path, port)))
+    assert "busmaster: sqlite is down: " in ran.err
+
+
+def test_a_listener_accepts_no_commands_of_a_broker(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[ConfiguredLine] = []
+
+    def kept(*arguments: Any, **options: Any) -> ConfiguredLine:
+        made.append(ConfiguredLine(*arguments, **options))
+        return made[0]
+
+    monkeypatch.setattr(monitor, "ConfiguredLine", kept)
+    with line_of(asked(2) + REPLY) as port:
+        path = written(tmp_path, port)
+        path.write_text(path.read_text() + '[outputs.mqtt]\nport = 1\nallow_commands = ["winder/tension"]\n')
+        busmaster("monitor", str(path))
+    settings = made[0].file.outputs["mqtt"]
+    assert isinstance(settings, MqttSettings)
+    assert settings.allow_commands == ()
+
+
+def test_a_value_is_printed_with_the_time_at_which_it_was_received(tmp_path: Path) -> None:
+    line = ConfiguredLine(load(written(tmp_path)), outputs=False)
+    points = line.members("fast")
+    overheard = Overheard(find("hcp2").protocol, points, lambda: 0.0)
+    overheard.groups.append(HeardGroup("fast", 0.1, points, 0.0))
+    for frame in Decoder(find("hcp2").protocol.dialect()).feed(asked(2) + REPLY, 0.0, Direction.UNKNOWN):
+        overheard.heard(frame)
+    snapshot = overheard.groups[0].turn(time.monotonic(), time.time() + 3600)
+    assert snapshot is not None
+    [text] = plain_values(snapshot)
+    moment, name, value = text.split()
+    assert (name, value) == ("winder/tension", "0.5")
+    assert abs(datetime.fromisoformat(moment).timestamp() - time.time()) < PATIENCE
 
 
 @pytest.mark.slow
