@@ -42,6 +42,14 @@ def test_installed_interfaces_are_listed_by_name_and_replace_no_command(monkeypa
     assert cli.list_commands(click.Context(cli, **cli.context_settings)) == [*COMMANDS, "alloy", "zinc"]
 
 
+def test_a_mistyped_interface_has_its_suggestion(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = EntryPoint("profinet", "nowhere:command", app.INTERFACES)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: [entry] if group == app.INTERFACES else [])
+    ran = busmaster("profinte")
+    assert (ran.status, ran.out) == (2, "")
+    assert ran.err == "busmaster: no such command 'profinte'; did you mean 'profinet'?\n"
+
+
 def test_completion_has_the_line_of_each_command() -> None:
     offered = {item.value: item.help for item in cli.shell_complete(click.Context(cli, **cli.context_settings), "re")}
     assert offered == {name: COMMANDS[name] for name in ("read", "replay")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -147,6 +147,22 @@ def test_every_option_of_a_port_reaches_the_command() -> None:
         "/dev/ttyS0", "msc", 4800, True, 0.25, 0, "a", {"address_step": 4}
     )
     assert connection_of("--protocol", "msc", "--timeout", "learned", or_file=True).timeout is LEARNED
+
+
+def test_options_of_a_protocol_reach_each_of_several_ports() -> None:
+    seen: list[Connection] = []
+
+    @click.command(cls=NodeCommand)
+    @partial(connected, port=False)
+    def command(connection: Callable[[str], Connection]) -> None:
+        seen.extend((connection("/dev/ttyS0"), connection("/dev/ttyS1")))
+
+    arguments = ["--protocol", "msc", "--address-step", "4"]
+    assert CliRunner().invoke(command, arguments, catch_exceptions=False).exit_code == 0
+    assert [(one.port, one.options) for one in seen] == [
+        ("/dev/ttyS0", {"address_step": 4}),
+        ("/dev/ttyS1", {"address_step": 4}),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
@@ -454,6 +455,29 @@ async def test_ctrl_c_is_told_from_leaving(key: str, status: int) -> None:
     assert screen.return_value == status
 
 
+@pytest.mark.asyncio
+@pytest.mark.parametrize("keys", [("w",), ("s",), ("slash",), ("question_mark",)])
+async def test_ctrl_c_ends_the_view_from_each_dialog(keys: tuple[str, ...]) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+        await pilot.press(*keys)
+        await pilot.pause()
+        assert len(screen.screen_stack) == 2
+        await pilot.press("ctrl+c")
+        await pilot.pause()
+    assert screen.return_value == 130
+    assert line.said == []
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("keys", [("w", "5", "enter", "n"), ("s", "n")])
+async def test_no_closes_a_question(keys: tuple[str, ...]) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+        await pilot.press(*keys)
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+    assert line.said == []
+
+
 async def pressed(*keys: str, point: Any, read_only: bool = False) -> list[tuple[Any, ...]]:
     """What is wished of the line when these keys are pressed on that row."""
     async with drawn(tell(Picture(), point), read_only=read_only) as (_, line, pilot):
@@ -619,6 +643,18 @@ async def test_silence_of_the_owner_is_told(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.asyncio
+async def test_silence_of_the_owner_is_shown_without_a_key_or_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "SILENT_AFTER", 0.2)
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        screen.heard = time.monotonic()
+        screen.draw()
+        await pilot.pause()
+        async with asyncio.timeout(PATIENCE):
+            while "no data for " not in lines(screen)[0]:
+                await pilot.pause(0.02)
+
+
+@pytest.mark.asyncio
 async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -> None:
     async with drawn(tell(Picture(), row())) as (screen, _, pilot):
         screen.away = "no program serves /run/line.sock"
@@ -678,6 +714,16 @@ async def test_nothing_that_the_owner_says_is_obeyed_by_a_terminal() -> None:
             shown = "".join(lines(screen))
             assert shown.isprintable()
             assert r"\u001b[2J" in shown
+
+
+def test_the_line_of_keys_has_as_many_as_there_is_room_for() -> None:
+    every = (
+        " ? keys  q leave  Enter details  / filter  o order  p pause  s suspend  w write  d poll now  ",
+        " trouble ? keys  q leave  Enter details  ",
+    )
+    assert keys_line(len(every[0]), "leave", "").plain == every[0]
+    assert keys_line(len(every[0]) - 1, "leave", "").plain == every[0].partition("d poll")[0]
+    assert keys_line(45, "leave", "trouble").plain == every[1]
 
 
 @pytest.mark.parametrize("leave", ["leave", "end the run"])

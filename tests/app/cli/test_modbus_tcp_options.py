@@ -45,7 +45,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> type[Served]:
         values: Values, rules: Rules, listen: tuple[str, int], opened: Any, report: Any, idle: float = IDLE
     ) -> None:
         Last.rules, Last.listen, Last.idle = rules, listen, idle
-        opened("127.0.0.1:1502")
+        opened("127.0.0.1:40123")
 
     monkeypatch.setattr(modbus_tcp, "Values", Noted)
     monkeypatch.setattr(modbus_tcp, "serve", serve)
@@ -60,7 +60,7 @@ def test_by_default_all_points_are_served_to_this_machine_and_none_is_written(
     assert busmaster(*LINE).status == 0
     assert notes == [
         ("a point is left out", Level.WARNING),
-        ("serving Modbus TCP at 127.0.0.1:1502", Level.INFO),
+        ("serving Modbus TCP at 127.0.0.1:40123", Level.INFO),
     ]
     assert (served.listen, served.idle, served.line.read_only) == (("127.0.0.1", 1502), IDLE, False)
     assert served.rules == Rules()
