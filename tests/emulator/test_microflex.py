@@ -195,6 +195,14 @@ def test_a_restart_disables_it_and_forgets_its_references(drive: EmulatedMicroFl
     assert [read(line, element, element) for element in (103, 108, 109, 118, 120)] == [0, 0, HARDWARE, 0, 0]
 
 
+def test_a_drive_that_was_enabled_is_disabled_after_a_restart(drive: EmulatedMicroFlex, line: Line) -> None:
+    write(line, 108, "128", 0)
+    line.restart(drive, 1.0)
+    assert read(line, 109, 2) == HARDWARE
+    assert write(line, 118, "50", 3) == ACK
+    assert read(line, 120, 9) == 0, "it stands until the next command"
+
+
 def test_a_ripple_makes_the_measured_speed_live(drive: EmulatedMicroFlex, line: Line) -> None:
     drive.ripple = 0.01
     write(line, 108, "128", 0)

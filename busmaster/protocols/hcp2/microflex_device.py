@@ -160,6 +160,7 @@ class EmulatedMicroFlex(HostCommsDevice):
     def restart(self, now: float) -> None:
         super().restart(now)
         self.command_word = 0
+        self.enabled = False
         self.speed_reference = self.torque_reference = 0.0
         self.axis_error = self.causes
         self.drive_error = 0
