@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -10,8 +11,9 @@ from hypothesis import strategies as st
 
 from busmaster.emulator.motion import Motion
 from busmaster.emulator.traceable import TraceableMemory, traceable_value
+from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.device import HCP, HCP2, number_text, numbers
-from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, winding
+from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, make_mint, winding
 from busmaster.wire.checks import xor
 from tests.emulator.lines import TAU, ask, ask_bytewise, hexed, line_of
 
@@ -317,6 +319,139 @@ def test_a_restart_loses_what_was_in_ram() -> None:
     ask(line, write(1, 1, "3"))
     line.restart(mint, 1.0)
     assert value(ask(line, read(1, 1), 2.0)) == "0"
+
+
+def test_a_restart_stops_the_axes_clears_the_outputs_and_starts_the_program_again() -> None:
+    mint = EmulatedMint(1, program=command_handshake)
+    line = line_of(mint)
+    mint.axes[1].jog(10.0, 0.0)
+    mint.axes[2].error = 5
+    assert ask(line, write(1, 222, "9")) == ACK
+    ask(line, read(1, 1), 1.0)
+    line.restart(mint, 2.0)
+    assert [value(ask(line, read(1, element), 3.0)) for element in (115, 116, 133, 222)] == ["0", "0", "0", "0"]
+    ask(line, write(1, 1, "7"), 3.0)
+    ask(line, read(1, 1), 4.0)
+    assert value(ask(line, read(1, 1), 5.0)) == "0", "the first statement of the program clears Comms(1)"
+
+
+def test_half_a_request_is_lost_in_a_restart() -> None:
+    mint = EmulatedMint(1)
+    line = line_of(mint)
+    ask(line, write(1, 1, "3")[:-3])
+    line.restart(mint, 1.0)
+    assert ask(line, write(1, 1, "3")[-2:], 2.0) == SILENCE
+    assert mint.comms[1] == 0
+
+
+@pytest.mark.parametrize(("now", "cleared"), [(5.0, False), (5.002, True)])
+def test_the_time_of_a_program_begins_with_the_first_request(now: float, cleared: bool) -> None:
+    mint = EmulatedMint(1, program=command_handshake)
+    mint.comms[1] = 7
+    assert mint.read_element(1, 5.0) == 7
+    assert (mint.read_element(1, now) == 0) is cleared
+
+
+# Initial values
+
+
+@pytest.mark.parametrize(
+    ("item", "given", "element", "read_back"),
+    [
+        ("1", (1.5, -2.0), 2, "-2"),
+        ("100", (12.5,), 105, "12500"),
+        ("103", (4,), 234, "0"),
+        ("118", (4,), 234, "1"),
+        ("224", (1.0, -99.5), 225, "-99.5"),
+        ("220", (255,), 220, "255"),
+        ("222", (7,), 222, "7"),
+        ("239", (6000,), 239, "6000"),
+    ],
+)
+def test_initial_values_are_those_of_the_element_and_of_those_after_it(
+    item: str, given: tuple[float, ...], element: int, read_back: str
+) -> None:
+    mint = EmulatedMint(1)
+    mint.preset(item, *given)
+    assert value(ask(line_of(mint), read(1, element))) == read_back
+
+
+@pytest.mark.parametrize(
+    ("item", "given"),
+    [
+        ("x", (1,)),
+        ("0", (1,)),
+        ("-1", (1,)),
+        ("99", (1, 2, 3)),
+        ("101", (1,)),
+        ("115", (1,)),  # there is one axis
+        ("221", (1,)),
+        ("255", (1, 1)),
+        ("1", (1.1e9,)),
+        ("1", (-1.1e9,)),
+        ("103", (0.5,)),
+        ("220", (-1,)),
+    ],
+)
+def test_an_initial_value_that_a_controller_cannot_hold_is_refused(item: str, given: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidCommand):
+        EmulatedMint(1, axes=1).preset(item, *given)
+
+
+def test_an_hcp_controller_has_initial_values_up_to_element_99() -> None:
+    mint = EmulatedMint(1, HCP)
+    mint.preset("99", 5)
+    assert mint.comms[99] == 5
+    with pytest.raises(InvalidCommand, match="an emulated controller's element 100 cannot be given"):
+        mint.preset("100", 5)
+
+
+def test_an_initial_value_has_single_precision_where_the_controller_has() -> None:
+    mint = EmulatedMint(1, single_precision=True)
+    mint.preset("1", 16777217)
+    assert value(ask(line_of(mint), read(1, 1))) == "16777216"
+
+
+def test_positions_are_not_reported_over_a_given_element_also_after_a_restart() -> None:
+    mint = make_mint(HCP2, 1, lively=True)
+    mint.preset("12", 33)
+    line = line_of(mint)
+    assert [value(ask(line, read(1, 12), now)) for now in (0.0, 10.0)] == ["33", "33"]
+    line.restart(mint, 20.0)
+    assert [value(ask(line, read(1, 12), now)) for now in (21.0, 30.0)] == ["0", "0"]
+
+
+def test_positions_go_on_being_reported_if_another_element_is_given() -> None:
+    mint = make_mint(HCP2, 1, lively=True)
+    mint.preset("19", 33)
+    line = line_of(mint)
+    assert len({value(ask(line, read(1, 12), now)) for now in (0.0, 10.0, 20.0)}) > 1
+
+
+# What a line file can ask for
+
+
+def test_a_lively_controller_with_a_program_runs_that_program() -> None:
+    mint = make_mint(HCP2, 1, lively=True, program="winding", statement=0.01)
+    assert (mint.program, mint.statement) == (winding, 0.01)
+    assert mint.axes[0].motion is Motion.IDLE
+    assert make_mint(HCP2, 1, lively=True).statement == 0.05
+    assert make_mint(HCP2, 1, lively=False).statement == 0.001
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"axes": 0}, "1 to 8 axes"),
+        ({"axes": 9}, "1 to 8 axes"),
+        ({"axes": 1, "program": "command_handshake"}, "2 to 8 axes for its program, not 1"),
+        ({"statement": 0.00009}, "a statement takes 0.0001 s at least, not 9e-05 s"),
+    ],
+)
+def test_a_controller_that_cannot_be_is_refused(options: dict[str, Any], reason: str) -> None:
+    with pytest.raises(InvalidCommand, match=reason):
+        make_mint(HCP2, 1, lively=False, **options)
+    make_mint(HCP2, 1, lively=False, axes=2, program="command_handshake", statement=0.0001)
 
 
 # The traceable
