@@ -62,6 +62,8 @@ def test_faults_are_read_from_text() -> None:
         ("lost=1.5", "fault lost is a probability from 0 to 1, not 1.5"),
         ("lost=nan", "probability"),
         ("late_by=-1", "fault late_by is a number of seconds"),
+        ("late_by=inf", "fault late_by is a number of seconds, 0 or more, not inf"),
+        ("away_for=inf", "fault away_for is a number of seconds, 0 or more, not inf"),
         ("hearing=1", "no such fault"),
     ],
 )
@@ -84,6 +86,8 @@ def test_every_fault_is_inside_or_outside_the_masters_assumption() -> None:
     assert set(HEARING) | set(SPEAKING) == WITHIN | BEYOND
     assert Faults.parse(["lost=0.1", "flip=0.1"]).beyond == frozenset()
     assert Faults.parse(["lost=0.1", "forged=0.1"]).beyond == {"forged"}
+    assert {name for name in (*HEARING, *SPEAKING) if Faults.parse([f"{name}=0.1"]).beyond == {name}} == BEYOND
+    assert Faults.parse(f"{name}=0.1" for name in (*HEARING, *SPEAKING)).beyond == BEYOND
 
 
 def test_the_same_seed_does_the_same() -> None:
@@ -370,6 +374,11 @@ def test_a_lost_frame_has_no_other_fault_and_others_add_up() -> None:
     assert distort(faults, (1.0, b"abc", 0), None, 0.01, Most()) == []
     faults.lost, faults.babble, faults.split = 0.0, 0.0, 1.0
     assert distort(faults, (1.0, b"abc", 0), None, 0.01, Most()) == [(1.0, b"abcabc", 4)]
+
+
+def test_a_frame_that_is_truncated_to_nothing_may_be_replaced_by_noise() -> None:
+    found = distort(Faults.parse(["truncated=1", "babble=1"]), (1.0, b"abc", 0), None, 0.01, Least())
+    assert found == [(1.0, b"\0", 0)]
 
 
 def received(fault: str, *, request: bool = True, free_at: float = 0.0) -> tuple[bool, EmulatedMint]:

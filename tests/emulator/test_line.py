@@ -346,6 +346,25 @@ def test_a_cut_may_spare_the_devices_before_it() -> None:
     assert ask(line, hexed(READ_3), 1.0) == ""
 
 
+def test_each_cut_disconnects_further_devices_until_all_are_restored() -> None:
+    line = line_of(mint(2), mint(3), mint(4))
+    line.cut(0.0, line.device(2))
+    line.cut(0.0, line.device(3))
+    read = [hcp2.Read(1).open(address, hcp2.PROFILE.timings).request for address in (2, 3, 4)]
+    assert [ask(line, hexed(request), 1.0 + n) for n, request in enumerate(read)] == ["", "", REPLY]
+    line.restore(5.0)
+    assert [ask(line, hexed(request), 6.0 + n) for n, request in enumerate(read)] == [REPLY] * 3
+
+
+def test_a_reply_behind_that_of_another_device_is_lost_in_a_cut() -> None:
+    line = line_of(mint(2, delay=0.05), far := mint(3, delay=0.1))
+    line.send(READ_2, 0.0)
+    line.send(READ_3, 0.01)
+    line.cut(0.04, far)
+    [(when, _), _] = arrivals(line, 1.0)
+    assert when == pytest.approx(8 * TAU + 0.05 + TAU)
+
+
 # Anything, in any order
 
 
@@ -440,7 +459,7 @@ def test_delays_are_read_as_milliseconds(text: str, delay: Delay) -> None:
     assert Delay.parse(text) == delay
 
 
-@pytest.mark.parametrize("text", ["", "x", "-5", "100-50", "1-2-3", "nan", "inf"])
+@pytest.mark.parametrize("text", ["", "x", "-5", "50-", "100-50", "1-2-3", "nan", "inf"])
 def test_a_delay_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(InvalidCommand, match="reply delay"):
         Delay.parse(text)
@@ -585,6 +604,37 @@ def test_after_a_byte_without_a_stop_bit_the_next_start_bit_begins_a_byte() -> N
     heard = list(collision.heard(Ear()))
     assert [byte for _, byte in heard] == [0x00, 0x55]
     assert heard[1][0] == pytest.approx(20 * bit)
+
+
+def test_all_devices_of_a_route_hear_a_frame_that_none_of_them_takes() -> None:
+    ears = [Ear(), Ear()]
+    for ear in ears:
+        ear.attentive = False
+        ear.routes = (READ_2[:3],)
+    ask(line_of(*ears), hexed(READ_2))
+    assert [bytes(byte for _, byte in ear.heard) for ear in ears] == [READ_2, READ_2]
+
+
+def test_a_device_sends_one_transmission_after_another_until_it_restarts() -> None:
+    device = Ear()
+    device.tau = TAU
+    assert device.reply(b"abc", 1.0, 0.01) == pytest.approx(1.01 + 3 * TAU)
+    assert device.reply(b"d", 1.0, 0.0) == pytest.approx(1.01 + 4 * TAU)
+    assert [start for start, _ in device.outbox] == pytest.approx([1.01, 1.01 + 3 * TAU])
+    device.restart(1.005)
+    assert device.outbox == []
+    assert device.reply(b"e", 1.006, 0.0) == pytest.approx(1.006 + TAU)
+
+
+def test_a_dead_device_sends_nothing_of_its_own_accord() -> None:
+    device = Insister(1)
+    device.wakeup = 0.005
+    device.faults.dead = 1.0
+    line = line_of(device)
+    line.prompt = False
+    assert arrivals(line, 0.02) == []
+    device.faults.dead = 0.0
+    assert [round(when - 4 * TAU, 6) for when, _ in arrivals(line, 0.03)] == [0.025]
 
 
 def test_a_device_that_is_away_sends_nothing_of_its_own_accord() -> None:
