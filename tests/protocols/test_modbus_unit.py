@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
+from random import Random
+from typing import Any
 
 import pytest
 
 from busmaster.capture.decode import Decoder
 from busmaster.contract.frames import Kind
+from busmaster.emulator.traceable import TraceableMemory
+from busmaster.errors import InvalidCommand
 from busmaster.protocols.modbus.codec import PROFILE, WriteRegisters
-from busmaster.protocols.modbus.device import EmulatedModbus
+from busmaster.protocols.modbus.device import EmulatedModbus, make_device
 from busmaster.registry import find
 from tests.capture.hearing import HOST, NODE, hear, said
 from tests.protocols.modbus_frames import UNIT, frame
@@ -87,6 +91,145 @@ def test_taken_whole_or_heard_byte_by_byte_a_request_gets_the_same_answer() -> N
 
 def test_a_request_that_only_silence_ends_is_heard_and_not_taken() -> None:
     assert not EmulatedModbus(UNIT).take(frame("11 2b 0e 01 00"), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        ("11 01 0002 0003", "11 01 01 05"),
+        ("11 02 0002 0003", "11 02 01 02"),
+        ("11 03 0002 0001", "11 03 02 0007"),
+        ("11 04 0002 0001", "11 04 02 0009"),
+        ("11 05 0003 ff00", "11 05 0003 ff00"),
+        ("11 05 0002 0000", "11 05 0002 0000"),
+        ("11 0f 0002 0003 01 02", "11 0f 0002 0003"),
+        ("11 03 03e7 0001", "11 03 02 0000"),  # the last address
+    ],
+)
+def test_each_function_has_its_own_table(request_: str, answer: str) -> None:
+    unit = EmulatedModbus(UNIT)
+    unit.coils[2:5], unit.discretes[2:5] = [True, False, True], [False, True, False]
+    unit.registers[2], unit.inputs[2] = 7, 9
+    assert heard_by(unit, (0.0, frame(request_))) == [frame(answer)]
+    if request_.startswith("11 05 0003"):
+        assert unit.coils[2:5] == [True, True, True]
+    if request_.startswith("11 05 0002"):
+        assert unit.coils[2:5] == [False, False, True]
+    if request_.startswith("11 0f"):
+        assert unit.coils[2:6] == [False, True, False, False]
+
+
+@pytest.mark.parametrize(("request_", "size"), [("11 03 0000 007d", 250), ("11 01 0000 03e8", 125)])
+def test_as_much_as_one_reply_carries_can_be_read(request_: str, size: int) -> None:
+    assert len(heard_by(EmulatedModbus(UNIT), (0.0, frame(request_)))[0]) == 5 + size
+
+
+@pytest.mark.parametrize(
+    ("request_", "refused"),
+    [("11 06 0005 0001", True), ("11 10 0004 0002 04 0001 0002", True), ("11 10 0003 0002 04 0001 0002", False)],
+)
+def test_a_write_that_includes_a_read_only_register_stores_nothing(request_: str, refused: bool) -> None:
+    unit = EmulatedModbus(UNIT, read_only=frozenset({5}))
+    [answer] = heard_by(unit, (0.0, frame(request_)))
+    assert (answer[1] & 0x80 != 0, answer[2] == 3 and refused) == (refused, refused)
+    assert any(unit.registers) is not refused
+
+
+def test_a_function_that_is_left_out_is_refused_and_the_others_are_there() -> None:
+    unit = EmulatedModbus(UNIT, functions=frozenset({4}))
+    assert heard_by(unit, (0.0, REQUEST)) == [frame("11 83 01")]
+    assert heard_by(unit, (1.0, frame("11 04 0000 0001")))[1:] == [frame("11 04 02 0000")]
+
+
+@pytest.mark.parametrize("request_", [frame("00 2b 0e 01 00"), frame("11 2b 0e 01 00")[:-1] + b"x"])
+def test_an_unknown_function_to_all_or_in_a_damaged_frame_is_not_answered(request_: bytes) -> None:
+    assert heard_by(EmulatedModbus(UNIT), (0.0, request_)) == []
+
+
+def test_half_a_request_is_lost_in_a_restart() -> None:
+    unit = EmulatedModbus(UNIT)
+    unit.registers[7] = 5
+    unit.hear(REQUEST[:4], 0.0)
+    unit.restart(0.0005)
+    assert heard_by(unit, (0.0006, REQUEST[4:])) == []
+    assert heard_by(unit, (1.0, REQUEST)) == [frame("11 03 02 0005")]
+
+
+@pytest.mark.parametrize(
+    ("item", "values", "table", "stored"),
+    [
+        ("holding:10", (7, 8), "registers", {10: 7, 11: 8}),
+        ("holding:10:2", (7, 8), "registers", {10: 7, 11: 8}),
+        ("input:10:int16", (-1,), "inputs", {10: 0xFFFF}),
+        ("input:40:float32", (1.5,), "inputs", {40: 0x3FC0, 41: 0}),
+        ("input:40:float32:swapped", (1.5,), "inputs", {40: 0, 41: 0x3FC0}),
+        ("holding:998:uint32", (65537,), "registers", {998: 1, 999: 1}),
+        ("coil:5", (1, 0, 1), "coils", {5: 1, 7: 1}),
+        ("discrete:5", (1,), "discretes", {5: 1}),
+    ],
+)
+def test_initial_values_are_those_of_one_table(
+    item: str, values: tuple[float, ...], table: str, stored: dict[int, int]
+) -> None:
+    unit = EmulatedModbus(UNIT)
+    unit.preset(item, *values)
+    for name in ("registers", "inputs", "coils", "discretes"):
+        expected = [stored.get(place, 0) if name == table else 0 for place in range(1000)]
+        assert getattr(unit, name) == expected, name
+
+
+@pytest.mark.parametrize(
+    ("item", "value", "reason"),
+    [
+        ("holding:x", 1, "has no 'holding:x': use holding:100, input:100, coil:5 or discrete:5"),
+        ("register:1", 1, "has no 'register:1'"),
+        ("holding:999:uint32", 1, "is beyond the 1000 addresses of its table"),
+        ("holding:1000", 1, "is beyond the 1000 addresses of its table"),
+        ("coil:1", 2, "coil:1 holds a whole number, 0 to 1, not 2"),
+        ("holding:1", 65536, "holding:1 cannot hold 65536: it is a register of uint16"),
+        ("holding:1:int16", -32769, "it is a register of int16"),
+        ("holding:1", 0.5, "cannot hold 0.5"),
+    ],
+)
+def test_an_initial_value_that_a_unit_cannot_hold_is_refused(item: str, value: float, reason: str) -> None:
+    unit = EmulatedModbus(UNIT)
+    with pytest.raises(InvalidCommand, match=reason):
+        unit.preset(item, value)
+    assert len(unit.registers) == 1000
+    assert not any(unit.registers)
+
+
+@pytest.mark.parametrize(("item", "moves"), [("holding:0", False), ("holding:1", True), ("coil:0", True)])
+def test_a_register_that_is_given_stands_and_others_go_on_moving(item: str, moves: bool) -> None:
+    unit = make_device(UNIT, lively=True, size=10)
+    unit.preset(item, 1)
+    read = frame("11 03 0000 0001")
+    seen = {heard_by(unit, (now, read))[-1] for now in (0.5, 1.0, 2.0)}
+    assert len(seen) == (3 if moves else 1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"address": 0},
+        {"address": 248},
+        {"functions": frozenset({3, 43})},
+        {"traceable": TraceableMemory(1, 2**16 + 1)},
+    ],
+)
+def test_a_unit_that_cannot_be_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InvalidCommand):
+        EmulatedModbus(**{"address": 1, **options})
+    EmulatedModbus(247, functions=frozenset({3}), traceable=TraceableMemory(1, 2**16))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_disguised_reply_comes_from_another_unit_with_a_right_crc(seed: int) -> None:
+    answer = frame("11 03 02 0005")
+    disguised = EmulatedModbus(UNIT).disguise(answer, Random(seed))
+    assert disguised[0] != UNIT
+    assert disguised == frame(f"{disguised[0]:02x} 03 02 0005")
+    assert EmulatedModbus(UNIT).disguise(b"\x15", Random(seed)) == b"\x15"
 
 
 # a listener
