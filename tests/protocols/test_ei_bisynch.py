@@ -419,6 +419,124 @@ def test_the_process_value_follows_the_setpoint() -> None:
     assert instrument.value(b"OP", 200.0) == pytest.approx(0.0, abs=1e-3)
 
 
+def test_the_output_follows_the_error_unless_it_is_in_manual() -> None:
+    instrument = make_device(3, lively=False, delay=Delay(), traceable=None)
+    instrument.preset("SL", 30)
+    assert instrument.value(b"OP", 0.0) == pytest.approx(50.0), "10 degrees below, with a band of 20"
+    instrument.preset("XP", 0)
+    assert instrument.value(b"OP", 0.0) == 100.0
+    instrument.preset("SL", 0)
+    assert instrument.value(b"OP", 0.0) == -100.0
+    instrument.preset("mA", 1)
+    instrument.preset("OP", 25)
+    assert instrument.value(b"OP", 1.0) == 25.0
+
+
+def test_a_restart_forgets_the_last_error_the_last_read_and_half_a_request() -> None:
+    instrument = made(3)
+    says(instrument, enquiry("QQ"))
+    says(instrument, enquiry("PV"))
+    instrument.restart(1.0)
+    assert says(instrument, NAK) == b""
+    assert says(instrument, enquiry("EE")) == reply("EE", ">00C0")
+    says(instrument, enquiry("PV")[:-1])
+    instrument.restart(2.0)
+    assert says(instrument, b"\x05") == b""
+
+
+def test_the_values_outlive_a_restart() -> None:
+    instrument = made(3)
+    says(instrument, selection("SL", "5."))
+    instrument.restart(1.0)
+    assert says(instrument, enquiry("SL")) == reply("SL", "5.")
+
+
+def test_an_instrument_fills_its_numbers_with_zeros_by_option() -> None:
+    instrument = made(3, fixed_width=6)
+    instrument.preset("PV", -1.5)
+    assert says(instrument, enquiry("PV")) == reply("PV", "-001.5")
+    assert says(instrument, enquiry("EE")) == reply("EE", ">00C0"), "not a word"
+
+
+def test_an_instrument_with_printable_checks_sends_and_accepts_them() -> None:
+    instrument = made(3, printable_check=True)
+    body = b"SL5.\x03"
+    check = xor(body)
+    assert check < 32
+    assert says(instrument, b"\x040033\x02" + body + bytes((check + 32,))) == ACK
+    assert says(instrument, b"\x040033\x02" + body + bytes((check,))) == NAK
+    assert says(instrument, enquiry("SL")) == b"\x02" + body + bytes((check + 32,))
+
+
+@pytest.mark.parametrize(
+    ("settings", "fits", "fails"),
+    [
+        ({"high": 5}, (5, -99999), (5.1,)),
+        ({"low": -1}, (-1, 99999), (-1.1,)),
+        ({"low": 3, "high": 3}, (3,), (2, 4)),
+        ({"hexadecimal": True}, (0, 0xFFFF), (-1, 0x10000, 0.5)),
+        ({"hexadecimal": True, "low": 2, "high": 4}, (2, 4), (1, 5)),
+    ],
+)
+def test_limits_of_a_parameter_apply_to_initial_values_also_of_a_known_parameter(
+    settings: dict[str, Any], fits: tuple[float, ...], fails: tuple[float, ...]
+) -> None:
+    for name in ("ZZ", "dm"):
+        instrument = make_device(3, lively=False, parameters={name: settings})
+        for value in fits:
+            instrument.preset(name, value)
+        for value in fails:
+            with pytest.raises(InvalidCommand):
+                instrument.preset(name, value)
+
+
+@pytest.mark.parametrize(
+    ("item", "values", "reason"),
+    [
+        ("SL", (1, 2), "use one value for a mnemonic, such as SL"),
+        ("S", (1,), "has no 'S'"),
+        ("tag1612", (1,), "the last tag is 1611"),
+        ("tag1611", (1, 2), "the last tag is 1611"),
+        ("SL", (-1,), "SL holds 0 to 1200, not -1"),
+        ("SL", (1201,), "SL holds 0 to 1200, not 1201"),
+    ],
+)
+def test_an_initial_value_that_an_instrument_cannot_hold_is_refused(
+    item: str, values: tuple[float, ...], reason: str
+) -> None:
+    with pytest.raises(InvalidCommand, match=reason):
+        made(3).preset(item, *values)
+
+
+def test_initial_values_of_tags_are_those_of_tags_in_a_row() -> None:
+    instrument = made(3)
+    instrument.preset("tag1610", 1, 2)
+    assert says(instrument, enquiry(mnemonic_of_tag(1610))) == reply(mnemonic_of_tag(1610), "1.")
+    assert says(instrument, enquiry(mnemonic_of_tag(1611))) == reply(mnemonic_of_tag(1611), "2.")
+
+
+def test_limits_that_exclude_every_value_are_refused() -> None:
+    with pytest.raises(InvalidCommand, match="an upper limit is at least the lower one, 4, not 3"):
+        make_device(3, lively=False, parameters={"ZZ": {"low": 4, "high": 3}})
+
+
+def test_a_read_only_parameter_of_a_file_refuses_a_write() -> None:
+    instrument = make_device(3, lively=False, parameters={"ZZ": {"read_only": True}})
+    assert says(instrument, selection("ZZ", "1.")) == NAK
+    assert says(instrument, enquiry("EE")) == reply("EE", ">05C8")
+
+
+@pytest.mark.parametrize("text", ["1234567890123.", "1" * 60])
+def test_a_value_that_is_too_long_is_not_stored(text: str) -> None:
+    instrument = made(3)
+    request = selection("SL", text)
+    assert says(instrument, request) == (NAK if len(request) <= 32 else b"")
+    assert says(instrument, enquiry("SL")) == reply("SL", "20.")
+    line = Line(PROFILE.line, [made(3)])
+    line.send(request, 0.0)
+    assert line.receive(1.0) == (NAK if len(request) <= 32 else b"")
+
+
 # the handle
 
 
