@@ -259,6 +259,71 @@ def test_an_emulated_drive_sends_as_the_guides_print_it() -> None:
     assert bytes.fromhex(ask(line_of(drive), "04 31 31 32 32 30 34 32 36 05", 1.0)) == b"\x020426+0\x038"
 
 
+def selection(text: str) -> str:
+    """A write to drive 12 of "0121-47.6", in hexadecimal."""
+    body = text.encode() + b"\x03"
+    check = 0
+    for byte in body:
+        check ^= byte
+    return (b"\x041122\x02" + body + bytes((check if check >= 32 else check + 32,))).hex()
+
+
+@pytest.mark.parametrize(
+    ("text", "stored"),
+    [
+        ("012147.6", 476),
+        ("0121-0.3", -3),
+        ("0121.5", 5),
+        ("0121+5", 50),
+        ("0121 5", 50),
+        ("0121000000047.60", 476),
+        ("04261.0", 1),
+        ("012147.65", None),  # finer than a tenth
+        ("0121000000047.600", None),  # 13 characters
+        ("0121100.1", None),
+        ("0121-100.1", None),
+        ("04260.5", None),
+        ("0121", None),
+        ("01211.2.3", None),
+        ("03021", None),  # read-only
+    ],
+)
+def test_an_emulated_drive_stores_what_its_parameter_can_hold(text: str, stored: int | None) -> None:
+    drive = EmulatedCtAnsi(12)
+    assert bytes.fromhex(ask(line_of(drive), selection(text))) == (NAK if stored is None else ACK)
+    assert drive.value(int(text[:4]), 1.0) == (stored or 0)
+
+
+def test_an_emulated_drive_sends_signs_and_zeros_by_option() -> None:
+    for options, value, sent in (
+        ({"plus": True}, 0, b"+0.0"),
+        ({"plus": True}, -5, b"-0.5"),
+        ({"width": 6}, 476, b"0047.6"),
+        ({"width": 6, "plus": True}, 476, b"+047.6"),
+        ({}, -15, b"-1.5"),
+    ):
+        drive = EmulatedCtAnsi(12, **options)
+        drive.set_value(121, value, 0.0)
+        assert bytes.fromhex(ask(line_of(drive), "04 31 31 32 32 30 31 32 31 05"))[5:-2] == sent
+
+
+def test_initial_values_of_an_emulated_drive_have_its_decimals() -> None:
+    drive = EmulatedCtAnsi(12)
+    drive.preset("1.21", 30.3, 0.1)
+    drive.preset("3.2", 12.5)
+    drive.preset("4.26", 1)
+    assert [drive.value(parameter, 0.0) for parameter in (121, 122, 302, 426)] == [303, 1, 125, 1]
+    for item, value in (("1.21", 0.05), ("1.21", 100.1), ("4.26", 0.5)):
+        with pytest.raises(InvalidCommand, match="without its decimals"):
+            drive.preset(item, value)
+
+
+def test_values_of_an_emulated_drive_have_12_characters_at_most() -> None:
+    EmulatedCtAnsi(12, width=12)
+    with pytest.raises(InvalidCommand, match="12 characters at most, not 13"):
+        EmulatedCtAnsi(12, width=13)
+
+
 def test_a_listener_hears_decimal_points_and_makes_commands_of_this_protocol() -> None:
     frames = hear(
         "ct-ansi",
