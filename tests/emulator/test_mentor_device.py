@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from busmaster.emulator.line import Line
 from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
-from busmaster.protocols.mentor.device import EVEN_PARITY, SPEED_REFERENCE, EmulatedMentor, telegram
+from busmaster.protocols.mentor.device import EVEN_PARITY, SPEED_REFERENCE, EmulatedMentor, make_device, telegram
 from busmaster.wire.checks import bcc
 from tests.emulator.lines import ask, ask_bytewise, hexed, line_of
 
@@ -231,6 +233,7 @@ def test_the_parity_bit_is_dropped_and_given_where_it_was_heard() -> None:
         assert asking(line, with_parity) == hexed(bytes.fromhex(BACKWARDS).translate(EVEN_PARITY))
         assert asking(line, "95", 1.0) == hexed(bytes.fromhex(BACKWARDS).translate(EVEN_PARITY))
         assert asking(line, read(12, "0117"), 2.0) == BACKWARDS
+        assert asking(line, with_parity, 2.5) == hexed(bytes.fromhex(BACKWARDS).translate(EVEN_PARITY))
         assert asking(line, hexed(bytes.fromhex(write(12, "0117-0476")).translate(EVEN_PARITY)), 3.0) == ACK
 
 
@@ -288,6 +291,85 @@ def test_a_write_whose_checksum_arrives_as_enq_is_refused_and_no_read(whole: boo
     garbled = "04 30 30 35 35 02 30 31 31 37 2d 30 34 37 36 03 05"
     assert (ask if whole else ask_bytewise)(line, garbled) == NAK
     assert ask(line, read(5, "0117"), 1.0) == hexed(telegram(117, 0))
+
+
+def test_the_feedback_stays_within_full_speed_whatever_the_ripple() -> None:
+    for speed in (1000, -1000):
+        drive = EmulatedMentor(14, ripple=0.5)
+        drive.preset("3.02", speed)
+        drive.preset("1.17", speed)
+        seen = {drive.value(302, now / 10) for now in range(50)}
+        assert len(seen) > 2
+        assert max(map(abs, seen)) == 1000
+
+
+def test_initial_values_are_those_of_parameters_in_a_row_and_missing_ones_are_added() -> None:
+    drive = EmulatedMentor(14)
+    drive.preset("1.17", -1000, 1000)
+    drive.preset("3.02", 200)
+    drive.preset("7.05", -9999, 9999)
+    drive.preset("15.60:wide", 65535)
+    values = {117: -1000, 118: 1000, 302: 200, 705: -9999, 706: 9999, 1560: 65535}
+    assert {name: drive.value(name, 0.0) for name in values} == values
+    assert drive.value(302, 0.2) == 100, "it follows the reference from there"
+
+
+@pytest.mark.parametrize(
+    ("item", "values", "reason"),
+    [
+        ("117", (1,), "has no '117': use a parameter such as 1.17"),
+        ("1.17", (1001,), r"1\.17, without its decimals, holds a whole number, -1000 to 1000, not 1001"),
+        ("1.17", (-1001,), "-1000 to 1000, not -1001"),
+        ("1.17", (0, 0.5), "a whole number"),
+        ("7.05", (10000,), "-9999 to 9999"),
+        ("15.60", (-1,), "0 to 65535"),
+        ("11.11", (5,), "is the drive's address: it cannot be given"),
+        ("11.10", (0, 5), "is the drive's address: it cannot be given"),
+    ],
+)
+def test_an_initial_value_that_a_drive_cannot_hold_is_refused(
+    item: str, values: tuple[float, ...], reason: str
+) -> None:
+    with pytest.raises(InvalidCommand, match=reason):
+        EmulatedMentor(14).preset(item, *values)
+
+
+@pytest.mark.parametrize(
+    ("settings", "writes"),
+    [
+        ({}, {"+9999": ACK, "-9999": ACK, "+00001": NAK}),
+        ({"low": -5, "high": 5}, {"+0005": ACK, "-0005": ACK, "+0006": NAK, "-0006": NAK}),
+        ({"wide": True}, {"65535": ACK, "65536": NAK, "-0001": NAK}),
+        ({"wide": True, "low": 3}, {"00003": ACK, "00002": NAK}),
+        ({"read_only": True}, {"+0001": NAK}),
+        ({"fine": True}, {"+00001": ACK}),
+    ],
+)
+@pytest.mark.parametrize("item", ["7.05", "4.26"])
+def test_a_parameter_of_a_file_has_its_limits_also_if_the_drive_knows_it(
+    item: str, settings: dict[str, Any], writes: dict[str, str]
+) -> None:
+    line = line_of(make_device(14, lively=False, parameters={item: settings}))
+    menu, _, number = item.partition(".")
+    for now, (data, answer) in enumerate(writes.items()):
+        assert ask(line, write(14, f"{int(menu):02d}{int(number):02d}{data}"), now) == answer, data
+
+
+@pytest.mark.parametrize(
+    ("item", "settings"),
+    [("7", {}), ("7.05", {"low": -10000}), ("7.05", {"low": 5, "high": 4}), ("7.05", {"wide": True, "low": -1})],
+)
+def test_a_parameter_that_cannot_be_is_refused(item: str, settings: dict[str, Any]) -> None:
+    with pytest.raises(InvalidCommand):
+        make_device(14, lively=False, parameters={item: settings})
+
+
+def test_a_drive_has_the_same_acceleration_after_a_restart() -> None:
+    drive = EmulatedMentor(14, acceleration=100.0)
+    line = line_of(drive)
+    line.restart(drive, 5.0)
+    assert ask(line, write(14, "0117+1000"), 6.0) == ACK
+    assert drive.value(302, 7.0) == pytest.approx(100, abs=2)
 
 
 # Properties
