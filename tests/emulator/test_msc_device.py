@@ -334,6 +334,7 @@ def test_the_oracle_holds_data_values_and_counts_writes() -> None:
         lambda: EmulatedMsc(16),
         lambda: EmulatedMsc(1, model="MSC-1000"),
         lambda: EmulatedMsc(1, address_step=3),
+        lambda: EmulatedMsc(1, period=0.0009),
         lambda: EmulatedMsc(1, traceable=TraceableMemory(1)),
     ],
 )
@@ -341,6 +342,118 @@ def test_what_no_msc_is_cannot_be_made(bad: object) -> None:
     assert callable(bad)
     with pytest.raises(InvalidCommand):
         bad()
+
+
+def test_time_in_which_the_flag_is_off_does_not_count() -> None:
+    controller = EmulatedMsc(1, period=0.1)
+    line = line_of(controller)
+    for now, name in ((0.0, "SFLAG"), (20.0, "CFLAG"), (60.0, "SFLAG")):
+        answer(line, request(1, name, RUN_FLAG), now)
+    answer(line, request(1, "RQSTAT"), 80.0)
+    before = controller.value(COUNT)
+    answer(line, request(1, "RQSTAT"), 100.0)
+    assert controller.value(COUNT) - before == 200
+    assert before < 300, "the 40 seconds between are left out"
+
+
+def test_time_in_which_the_program_is_stopped_does_not_count() -> None:
+    controller = EmulatedMsc(1, period=0.1)
+    line = line_of(controller)
+    for now, status in ((0.0, 1), (20.0, 0), (60.0, 0), (80.0, 1)):
+        controller.status = status
+        answer(line, request(1, "SFLAG", RUN_FLAG) if not now else request(1, "RQSTAT"), now)
+    before = controller.value(COUNT)
+    answer(line, request(1, "RQSTAT"), 100.0)
+    assert controller.value(COUNT) - before == 200
+    assert before <= 200
+
+
+def test_the_count_does_not_depend_on_how_often_it_is_read() -> None:
+    counts = []
+    for step in (1.7, 17.0):
+        controller = EmulatedMsc(1, period=1.0)
+        controller.flags.add(RUN_FLAG)
+        line = line_of(controller)
+        for now in (*(number * step for number in range(round(170 / step))), 170.5):
+            ask(line, request(1, "RFLAG", 0), now, 0.5)
+            ask(line, ACK, now + 0.5, 0.5)
+        counts.append(controller.value(COUNT))
+    assert counts == [170, 170]
+
+
+def test_a_power_failure_turns_the_flags_off() -> None:
+    controller = EmulatedMsc(1, battery=True)
+    controller.flags = {5, RUN_FLAG}
+    line = line_of(controller)
+    line.restart(controller, 1.0)
+    assert answer(line, request(1, "RFLAG", 5), 2.0).endswith("00 00 01 A1")
+
+
+def test_half_a_packet_is_lost_in_a_power_failure() -> None:
+    controller = EmulatedMsc(1)
+    line = line_of(controller)
+    ask(line, DREAD[:20], 0.0, 0.1)
+    line.restart(controller, 0.2)
+    assert ask(line, DREAD, 0.25).startswith(ACK)
+
+
+def test_each_packet_is_sent_again_five_times() -> None:
+    controller = EmulatedMsc(1)
+    line = line_of(controller)
+    for now in (0.0, 100.0):
+        ask(line, DREAD, now)
+        arrivals(line, now + 50.0)
+    assert controller.retransmitted == 10
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_the_oracle_counts_the_writes_of_a_block(step: int) -> None:
+    traceable = TraceableMemory(5, 2**31)
+    line = line_of(EmulatedMsc(5, traceable=traceable, address_step=step))
+    sent = [traceable_value(5, 2008 + place * step, 0, 2**31) for place in range(32)]
+    block = b"BWRITE," + (2008).to_bytes(2, "big") + b"".join(value.to_bytes(4, "big") for value in sent)
+    assert answer(line, hexed(packet(5, block)), 0.0) == ACK
+    assert dict(traceable.writes) == {2008 + place * step: 1 for place in range(32)}
+    assert traceable.foreign_writes == 0
+
+
+def test_initial_values_are_data_values_flags_and_the_status() -> None:
+    controller = EmulatedMsc(1)
+    controller.preset("2008", 5, -(2**31))
+    controller.preset("flag:254", 1, 1)
+    controller.preset("status", 0x1234)
+    assert [controller.value(2008), controller.value(2012)] == [5, -(2**31)]
+    assert controller.flags == {254, 255}
+    controller.preset("flag:255", 0)
+    assert controller.flags == {254}
+    controller.preset("flags", 3, 5)
+    assert controller.flags == {3, 5}
+    controller.preset("flags")
+    assert controller.flags == set()
+    heard = answer(line_of(controller), request(1, "RQSTAT"), 0.0)
+    assert heard.split()[14:16] == ["12", "34"]
+
+
+@pytest.mark.parametrize(
+    ("item", "values"),
+    [
+        ("flag:255", (1, 1)),
+        ("flag:256", (1,)),
+        ("flag:5", (2,)),
+        ("flag:x", (1,)),
+        ("flags", (256,)),
+        ("status", (65536,)),
+        ("status", (1, 2)),
+        ("2008", (2**31,)),
+        ("2008", (0.5,)),
+        ("32764", (1, 2)),
+        ("32765", (1,)),
+        ("x", (1,)),
+    ],
+)
+def test_an_initial_value_that_a_controller_cannot_hold_is_refused(item: str, values: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidCommand):
+        EmulatedMsc(1).preset(item, *values)
 
 
 # Properties
