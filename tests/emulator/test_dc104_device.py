@@ -124,6 +124,40 @@ def test_what_no_dc104_is_cannot_be_made() -> None:
         EmulatedDc104(traceable=TraceableMemory(0))
 
 
+def test_initial_values_are_those_of_parameters_in_a_row() -> None:
+    drive = EmulatedDc104()
+    drive.preset("254", 5, 65535)
+    assert drive.registers[253:] == [0, 5, 65535]
+
+
+@pytest.mark.parametrize(
+    ("item", "values", "reason"),
+    [
+        ("0", (1,), "cannot store the values at '0': its last parameter is 10"),
+        ("11", (1,), "its last parameter is 10"),
+        ("10", (1, 2), "its last parameter is 10"),
+        ("x", (1,), "cannot store the values at 'x'"),
+        ("5", (0, 65536), "parameter 6 holds a whole number, 0 to 65535, not 65536"),
+        ("5", (-1,), "parameter 5 holds"),
+    ],
+)
+def test_an_initial_value_that_a_drive_cannot_hold_is_refused(
+    item: str, values: tuple[float, ...], reason: str
+) -> None:
+    with pytest.raises(InvalidCommand, match=reason):
+        EmulatedDc104(maximum=10).preset(item, *values)
+
+
+@pytest.mark.parametrize(("item", "values", "moves"), [("1", (5,), False), ("0", (4, 5), False), ("2", (5,), True)])
+def test_a_parameter_that_is_given_stands_and_others_go_on_moving(
+    item: str, values: tuple[float, ...], moves: bool
+) -> None:
+    drive = EmulatedDc104(lively=True, allow_zero=True)
+    drive.preset(item, *values)
+    seen = {ask(line_of(drive), read(1), now) for now in (0.5, 1.0, 2.0)}
+    assert len(seen) == (3 if moves else 1)
+
+
 @given(st.binary(max_size=20), st.booleans())
 @settings(max_examples=60)
 def test_whatever_it_hears_it_answers_after_a_pause(data: bytes, bytewise: bool) -> None:
