@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from busmaster.emulator.line import Line
-from busmaster.protocols.hcp2.microflex_device import AMBIENT, FULL_SPEED, EmulatedMicroFlex
+from busmaster.errors import InvalidCommand
+from busmaster.protocols.hcp2.microflex_device import AMBIENT, FULL_SPEED, EmulatedMicroFlex, make_device
 from busmaster.wire.checks import xor
 from tests.emulator.lines import ask, hexed, line_of
 
@@ -201,6 +204,101 @@ def test_a_drive_that_was_enabled_is_disabled_after_a_restart(drive: EmulatedMic
     assert read(line, 109, 2) == HARDWARE
     assert write(line, 118, "50", 3) == ACK
     assert read(line, 120, 9) == 0, "it stands until the next command"
+
+
+def test_a_drive_error_alone_disables_the_drive_and_sets_its_error_output(drive: EmulatedMicroFlex, line: Line) -> None:
+    write(line, 108, "128", 0)
+    drive.trip(0, 1.0, drive_errors=2)
+    assert [read(line, element, element) for element in (103, 109, 110, 222)] == [0, HARDWARE | ERROR, 2, 1]
+    write(line, 108, "64", 300)
+    assert [read(line, element, 300 + element) for element in (109, 110, 222)] == [HARDWARE, 0, 0]
+
+
+def test_a_restart_cancels_a_drive_error_and_keeps_an_error_whose_cause_exists(
+    drive: EmulatedMicroFlex, line: Line
+) -> None:
+    drive.causes = 4
+    drive.trip(5, 0.0, drive_errors=2)
+    line.restart(drive, 1.0)
+    assert [read(line, element, element) for element in (103, 110)] == [4, 0]
+
+
+def test_errors_come_after_their_delay_from_the_first_request(line: Line, drive: EmulatedMicroFlex) -> None:
+    drive.trip_after(2.0, 4, 2)
+    assert read(line, 103, 10.0) == 0
+    assert read(line, 103, 11.9) == 0
+    assert [read(line, 103, 12.1), read(line, 110, 13.0)] == [4, 2]
+    write(line, 108, "64", 14)
+    assert [read(line, 103, 20), read(line, 110, 21)] == [0, 0], "they come once"
+
+
+def test_in_reverse_torque_speed_and_their_errors_have_the_other_sign(line: Line) -> None:
+    write(line, 108, "128", 0)
+    write(line, 118, "-50", 1)
+    assert read(line, 121, 1.2) < 0
+    assert read(line, 107, 1.3) < 0
+    assert read(line, 117, 1.4) < 0
+    assert [read(line, element, element) for element in (117, 120, 121)] == [-5, -50, 0]
+
+
+@pytest.mark.parametrize("torque", [150, -150])
+def test_an_overload_is_what_exceeds_full_torque_in_either_direction(torque: int) -> None:
+    line = line_of(EmulatedMicroFlex(7, current_control=True))
+    write(line, 108, "128", 0)
+    write(line, 116, str(torque), 1)
+    assert [read(line, 117, 2), read(line, 124, 3), read(line, 125, 4)] == [torque, 50, 50]
+    assert read(line, 126, 5) == 312.5
+
+
+@pytest.mark.parametrize(
+    ("item", "values", "element", "read_back"),
+    [
+        ("100", (4096,), 100, 4096),
+        ("131", (-4096,), 100, -4096),
+        ("103", (4,), 109, HARDWARE | ERROR),
+        ("110", (4,), 110, 4),
+        ("108", (128,), 109, HARDWARE | ENABLED),
+        ("116", (12.5,), 116, 12.5),
+        ("118", (-12.5,), 118, -12.5),
+        ("220", (65535,), 220, 65535),
+        ("224", (-1.5,), 224, -1.5),
+        ("239", (6000,), 239, 6000),
+    ],
+)
+def test_initial_values(item: str, values: tuple[float, ...], element: int, read_back: float) -> None:
+    drive = EmulatedMicroFlex(7)
+    drive.preset(item, *values)
+    assert read(line_of(drive), element, 0) == read_back
+
+
+@pytest.mark.parametrize(
+    ("item", "values"),
+    [("109", (1,)), ("x", (1,)), ("108", (256,)), ("220", (65536,)), ("103", (0.5,)), ("118", (1, 2)), ("116", (2e9,))],
+)
+def test_an_initial_value_that_a_drive_cannot_hold_is_refused(item: str, values: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidCommand):
+        EmulatedMicroFlex(7).preset(item, *values)
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "errors"),
+    [
+        ({}, HARDWARE, (0, 0)),
+        ({"lively": True}, HARDWARE | ENABLED, (0, 0)),
+        ({"stop_input": True}, HARDWARE | STOP, (0, 0)),
+        ({"hardware_enable": False}, 0, (0, 0)),
+        ({"hardware_enable": False, "lively": True}, 0, (0, 0)),
+        ({"axis_error": 4}, HARDWARE | ERROR, (4, 0)),
+        ({"drive_error": 4}, HARDWARE | ERROR, (0, 4)),
+        ({"axis_error": 4, "drive_error": 2, "trips_after": 1.0}, HARDWARE, (4, 2)),
+    ],
+)
+def test_a_drive_of_a_file_begins_as_its_options_state(
+    options: dict[str, Any], status: int, errors: tuple[int, int]
+) -> None:
+    line = line_of(make_device(7, **{"lively": False, **options}))
+    assert read(line, 109, 10.0) == status
+    assert (read(line, 103, 12.0), read(line, 110, 12.5)) == errors
 
 
 def test_a_ripple_makes_the_measured_speed_live(drive: EmulatedMicroFlex, line: Line) -> None:
