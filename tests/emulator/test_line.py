@@ -356,6 +356,15 @@ def test_each_cut_disconnects_further_devices_until_all_are_restored() -> None:
     assert [ask(line, hexed(request), 6.0 + n) for n, request in enumerate(read)] == [REPLY] * 3
 
 
+def test_a_cut_after_a_restore_in_the_middle_of_a_request_lasts_beyond_its_end() -> None:
+    line = line_of(mint())
+    line.send(WRITE_2, 0.0)
+    line.cut(2.5 * TAU)
+    line.restore(4.5 * TAU)
+    line.cut(6.5 * TAU)
+    assert ask(line, hexed(READ_2), 1.0) == ""
+
+
 def test_a_reply_behind_that_of_another_device_is_lost_in_a_cut() -> None:
     line = line_of(mint(2, delay=0.05), far := mint(3, delay=0.1))
     line.send(READ_2, 0.0)
@@ -524,6 +533,13 @@ def test_a_restart_happens_at_its_time_and_not_before() -> None:
     line.restart(device, 1.0)
     assert hexed(line.receive(1.0)) == "02 30 31 35 03 37"
     assert device.comms[1] == 0
+
+
+def test_a_reply_that_would_begin_at_the_moment_of_a_restart_is_not_sent() -> None:
+    line = line_of(device := mint(delay=0.0))
+    line.send(READ_2, 0.0)
+    line.restart(device, 8 * line.tau)
+    assert arrivals(line, 1.0) == []
 
 
 def test_a_cut_of_some_devices_leaves_the_reply_of_another_alone() -> None:

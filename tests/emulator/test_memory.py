@@ -148,6 +148,19 @@ def test_it_can_be_unplugged_once_and_then_says_nothing_more() -> None:
     run_in_virtual_time(ask())
 
 
+def test_the_rest_of_a_reply_is_not_delivered_after_the_loss() -> None:
+    async def ask() -> None:
+        transport, recorder = await opened(line())
+        transport.write(b"\x05")
+        await recorder.heard(b"p")
+        transport.lose(None)
+        await asyncio.sleep(1.0)
+        assert recorder.received == b"p"
+        assert recorder.losses == [None]
+
+    run_in_virtual_time(ask())
+
+
 @pytest.mark.asyncio
 async def test_it_works_in_real_time() -> None:
     transport, recorder = await opened(line())
