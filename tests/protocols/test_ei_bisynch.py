@@ -432,6 +432,13 @@ def test_the_output_follows_the_error_unless_it_is_in_manual() -> None:
     assert instrument.value(b"OP", 1.0) == 25.0
 
 
+@pytest.mark.parametrize(("value", "text"), [(-0.00001, "0."), (-0.0001, "-0.0001"), (0.00004, "0."), (9.99999, "10.")])
+def test_numbers_of_an_instrument_have_four_decimals_and_zero_has_no_sign(value: float, text: str) -> None:
+    instrument = made(3)
+    instrument.preset("S1", value)
+    assert says(instrument, enquiry("S1")) == reply("S1", text)
+
+
 def test_a_restart_forgets_the_last_error_the_last_read_and_half_a_request() -> None:
     instrument = made(3)
     says(instrument, enquiry("QQ"))

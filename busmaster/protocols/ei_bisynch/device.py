@@ -290,6 +290,7 @@ class EmulatedBisynch(Device):
         """Return a value as it is sent: in hexadecimal, or with a decimal point and without unnecessary zeros."""
         if parameter.hexadecimal and self.traceable is None:
             return b">%04X" % int(value)
+        value = round(value, 4)  # never "-0."
         digits = b"%d." % value if value == int(value) else (b"%.4f" % value).rstrip(b"0")
         return digits.zfill(self._width)
 
