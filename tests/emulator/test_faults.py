@@ -381,6 +381,38 @@ def test_a_frame_that_is_truncated_to_nothing_may_be_replaced_by_noise() -> None
     assert found == [(1.0, b"\0", 0)]
 
 
+class Same(Least):
+    """A source of chance that draws one number again and again."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def randrange(self, start: int, stop: int) -> int:
+        assert start <= self.number < stop
+        return self.number
+
+
+@pytest.mark.parametrize(
+    ("protocol", "address", "request_", "number"),
+    [
+        ("hcp2", 2, READ, 1),
+        ("hcp", 2, "04 32 32 02 30 31 05", 1),
+        ("mentor", 12, "04 31 31 32 32 30 31 31 37 05", 117),
+        ("ct-ansi", 12, "04 31 31 32 32 30 31 31 37 05", 117),
+        ("dc104", 1, "02 AA 01 AB", 1),
+        ("msc", 1, "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74", 1),
+        ("modbus", 2, "02 03 00 00 00 01 84 39", 2),
+    ],
+)
+def test_a_disguised_reply_is_never_that_to_the_request(
+    protocol: str, address: int, request_: str, number: int
+) -> None:
+    device = make_device(protocol, address)
+    reply = bytes.fromhex(ask(line_of(device), request_)).removeprefix(b"\x06")
+    for drawn in (max(1, number - 1), number):
+        assert device.disguise(reply, Same(drawn)) != reply
+
+
 def received(fault: str, *, request: bool = True, free_at: float = 0.0) -> tuple[bool, EmulatedMint]:
     """Return whether a device with this fault misses bytes on the line from 1 s to 2 s, and the device."""
     device = EmulatedMint(2)

@@ -91,6 +91,8 @@ def test_hcp_answers_as_the_document_says(node: int, request_: str, reply: str) 
         ("00 00 07 30 31 02 30 31 35 03 34", ACK),  # idle bytes in front
         ("07 30 07 30 31 02 30 31 35 03 34", ACK),  # a reset byte begins anew
         ("07 30 31 02 30 31 35 02 34", SILENCE),  # a control character in the data: no frame
+        ("07 30 31 02 30 31 35 01 03 35", SILENCE),
+        ("07 30 31 02 01 31 05 36", SILENCE),  # and in the element
         ("07 30 31 02 30 31 35 03", SILENCE),  # cut
     ],
 )
@@ -125,6 +127,18 @@ def test_all_or_nothing_stores_nothing_of_a_bad_write() -> None:
     assert ask(line_of(mint), write(1, 99, "7,8")) == NAK
     assert mint.comms[99] == 0
     assert ask(line_of(mint), write(1, 98, "7,8")) == ACK
+    assert ask(line_of(mint), write(1, 10, "1,x,3")) == NAK
+    assert mint.comms[10] == 0
+    assert ask(line_of(mint), write(1, 222, "5")) == ACK
+    assert mint.outputs == 5
+
+
+@pytest.mark.parametrize("data", ["5.", "5 ", "1,5.", "5 x", "1,"])
+def test_data_that_do_not_end_with_a_digit_are_refused(data: str) -> None:
+    for asking in (ask, ask_bytewise):
+        mint = EmulatedMint(1)
+        assert asking(line_of(mint), write(1, 10, data)) == NAK
+        assert mint.comms[10] == 0
 
 
 def test_a_data_field_of_sixty_characters_is_taken_and_one_of_sixty_one_refused() -> None:
@@ -215,7 +229,7 @@ def test_inputs_outputs_and_analog_channels_can_be_read() -> None:
     mint = EmulatedMint(1)
     line = line_of(mint)
     mint.inputs, mint.adc[3] = 5, 12.25
-    assert ask(line, write(1, 222, "9")) == ACK
+    assert ask(line, write(1, 222, "8.6")) == ACK
     assert [value(ask(line, read(1, element), element)) for element in (220, 222, 227, 239)] == [
         "5",
         "9",
@@ -236,11 +250,19 @@ def test_reserved_elements_read_zero_or_are_refused_if_so_set() -> None:
 
 def test_a_write_to_the_first_five_elements_raises_its_event_even_if_nothing_changed() -> None:
     heard: list[tuple[int, float]] = []
-    mint = EmulatedMint(1, events=[lambda mint, element, now: heard.append((element, mint.comms[element]))])
+    others: list[int] = []
+    mint = EmulatedMint(
+        1,
+        events=[
+            lambda mint, element, now: heard.append((element, mint.comms[element])),
+            lambda mint, element, now: others.append(element),
+        ],
+    )
     line = line_of(mint)
     for element in (1, 1, 5, 6):
         ask(line, write(1, element, "3"))
     assert heard == [(1, 3), (1, 3), (5, 3)]
+    assert others == [1, 1, 5]
 
 
 def test_event_comms1_jogs_the_axis() -> None:
@@ -467,3 +489,10 @@ def test_with_an_oracle_every_element_tells_node_element_and_writes() -> None:
     assert mint.traceable.foreign_writes == 0
     ask(line, write(7, 5, str(traceable_value(6, 5, 1))))
     assert mint.traceable.foreign_writes == 1
+
+
+def test_with_an_oracle_too_a_write_past_the_last_element_is_refused() -> None:
+    mint = EmulatedMint(1, HCP, traceable=TraceableMemory(1))
+    assert ask(line_of(mint), "04 31 31 02 39 39 31 2C 32 03 2C") == NAK
+    assert mint.traceable is not None
+    assert set(mint.traceable.writes) == {99}
