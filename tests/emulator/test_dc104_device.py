@@ -108,6 +108,14 @@ def test_parameters_outlive_a_power_failure_and_half_a_packet_does_not() -> None
     assert ask(line, read(1), 1.52) == "02 01 04 D2 D7"
 
 
+def test_half_a_packet_is_lost_in_a_restart_however_short() -> None:
+    drive = EmulatedDc104()
+    line = line_of(drive)
+    ask(line, "02 AA", 0.0, 0.01)
+    line.restart(drive, 0.02)
+    assert ask(line, read(1), 0.03) == "02 01 00 00 01"
+
+
 def test_the_oracle_answers_and_counts_writes() -> None:
     traceable = TraceableMemory(0, 2**16)
     line = line_of(EmulatedDc104(traceable=traceable))

@@ -138,7 +138,15 @@ def test_a_malformed_read_request_gets_silence_or_by_option_nak(text: str) -> No
         assert asking(line_of(EmulatedMentor(13, refuse_malformed=True)), text) == SILENCE
 
 
-@pytest.mark.parametrize("text", ["04 31 31 32 32 02 30 31 07", "04 31 31 32 32 02 30 31 31 37 31 01 03 20", "04 02"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "04 31 31 32 32 02 30 31 07",
+        "04 31 31 32 32 02 30 31 03 20",
+        "04 31 31 32 32 02 30 31 31 37 31 01 03 20",
+        "04 02",
+    ],
+)
 def test_a_control_character_inside_a_frame_ends_it_unanswered(text: str) -> None:
     for asking in (ask, ask_bytewise):
         assert asking(line_of(EmulatedMentor(12, refuse_malformed=True)), text) == SILENCE

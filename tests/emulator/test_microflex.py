@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from busmaster.emulator.line import Line
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.hcp2.microflex_device import AMBIENT, FULL_SPEED, EmulatedMicroFlex, make_device
 from busmaster.wire.checks import xor
@@ -165,6 +166,11 @@ def test_a_drive_that_ignores_unmapped_elements_does_not_reply_to_a_read_of_one(
     assert ask(line, read_request(element), 0) == ""
     assert ask(line, read_request(element), 1) == "", "the same request once more"
     assert read(line, 109, 2) == 64
+
+
+def test_with_an_oracle_every_element_is_mapped() -> None:
+    line = line_of(EmulatedMicroFlex(7, ignore_unmapped=True, traceable=TraceableMemory(7)))
+    assert read(line, 1, 0) == traceable_value(7, 1, 0)
 
 
 @pytest.mark.parametrize("word", ["-1", "256"])

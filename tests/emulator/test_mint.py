@@ -111,6 +111,18 @@ def test_every_element_can_be_read_and_names_itself_in_hex() -> None:
             assert reply[-1] == xor(reply[1:-1])
 
 
+def test_a_byte_behind_a_request_does_not_change_its_reply() -> None:
+    for asking in (ask, ask_bytewise):
+        assert value(asking(line_of(EmulatedMint(1)), read(1, 1) + " 00")) == "0"
+
+
+def test_the_length_of_one_request_does_not_count_in_the_next() -> None:
+    line = line_of(EmulatedMint(1))
+    for now in (0.0, 1.0):
+        assert ask_bytewise(line, write(1, 1, "0" * 39 + "7"), now) == ACK
+    assert value(ask_bytewise(line, read(1, 1), 2.0)) == "7"
+
+
 # Values
 
 
@@ -198,7 +210,9 @@ def test_single_precision_keeps_24_bits() -> None:
     mint = EmulatedMint(1, single_precision=True)
     ask(line_of(mint), write(1, 1, "16777217"))
     assert value(ask(line_of(mint), read(1, 1))) == "16777216"
-    assert ask(line_of(mint), write(1, 1, "9" * 60)) == ACK
+    for number in ("9" * 60, "-" + "9" * 59):
+        assert ask(line_of(mint), write(1, 1, number)) == ACK
+        assert abs(mint.comms[1]) == pytest.approx(3.4028235e38)
 
 
 @given(st.binary(max_size=40), st.sampled_from([HCP, HCP2]), st.booleans())
@@ -220,7 +234,9 @@ def test_an_axis_tells_position_velocity_encoder_and_idle() -> None:
     assert float(value(ask(line, read(1, 130), 10.0))) == pytest.approx(100, abs=0.5)
     assert value(ask(line, read(1, 131), 11.0)) == "10"
     assert value(ask(line, read(1, 132), 11.5)) == str(int(Motion.JOG))
-    assert float(value(ask(line, read(1, 135), 12.0))) == pytest.approx(120_000, rel=0.01)
+    assert int(value(ask(line, read(1, 135), 12.0))) == pytest.approx(120_000, rel=0.01)
+    assert value(ask(line, read(1, 134), 12.3)) == "10", "% of full speed"
+    assert value(ask(line, read(1, 137), 12.6)) == "0.02", "the lag"
     assert value(ask(line, read(1, 136), 13.0)) == "0"
     assert value(ask(line, read(1, 106), 14.0)) == "1"  # axis 0 stands
 
@@ -362,8 +378,7 @@ def test_half_a_request_is_lost_in_a_restart() -> None:
     line = line_of(mint)
     ask(line, write(1, 1, "3")[:-3])
     line.restart(mint, 1.0)
-    assert ask(line, write(1, 1, "3")[-2:], 2.0) == SILENCE
-    assert mint.comms[1] == 0
+    assert value(ask_bytewise(line, read(1, 1), 2.0)) == "0"
 
 
 @pytest.mark.parametrize(("now", "cleared"), [(5.0, False), (5.002, True)])
@@ -440,7 +455,8 @@ def test_positions_are_not_reported_over_a_given_element_also_after_a_restart() 
     line = line_of(mint)
     assert [value(ask(line, read(1, 12), now)) for now in (0.0, 10.0)] == ["33", "33"]
     line.restart(mint, 20.0)
-    assert [value(ask(line, read(1, 12), now)) for now in (21.0, 30.0)] == ["0", "0"]
+    assert ask(line, write(1, 12, "44"), 21.0) == ACK
+    assert [value(ask(line, read(1, 12), now)) for now in (22.0, 30.0)] == ["44", "44"]
 
 
 def test_positions_go_on_being_reported_if_another_element_is_given() -> None:

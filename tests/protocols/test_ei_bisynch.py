@@ -316,6 +316,7 @@ def test_after_the_last_parameter_there_is_no_next() -> None:
     instrument = made(3)
     assert says(instrument, enquiry("S1"), ACK) == EOT
     assert says(instrument, ACK) == b""
+    assert says(make_device(3, lively=False), enquiry("fi"), ACK) == EOT
 
 
 @pytest.mark.parametrize("ends", [b"\x040044PV\x05", b"x", EOT], ids=["another", "a character", "an EOT"])
@@ -368,7 +369,12 @@ def test_short_commands_end_with_a_read_that_is_refused() -> None:
 
 def test_parity_is_answered_with_parity() -> None:
     even = bytes(byte | byte.bit_count() % 2 << 7 for byte in enquiry("SL"))
-    assert says(made(3), even) == bytes(byte | byte.bit_count() % 2 << 7 for byte in reply("SL", "20."))
+    answer = bytes(byte | byte.bit_count() % 2 << 7 for byte in reply("SL", "20."))
+    assert says(made(3), even) == answer
+    instrument = made(3)
+    for request in (even, enquiry("SL"), even):
+        assert instrument.take(request, 1.0)
+    assert [data for _, data in instrument.outbox] == [answer, reply("SL", "20."), answer]
 
 
 def test_a_disguised_reply_is_of_another_parameter() -> None:
