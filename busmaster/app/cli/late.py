@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 import anyio
 
-from busmaster import Bus, NoReply
+from busmaster import Bus, BusError, NoReply
 from busmaster.app.cli.output import Level, note
 from busmaster.app.service.remote import RemoteBus
 from busmaster.events import MaxReplyDelayRaised, RepliesLate
@@ -18,6 +18,8 @@ STEP = 0.05
 """Suggested windows are multiples of this many seconds."""
 ROOM = 1.5
 """Factor of the suggested window to the time of the late reply."""
+OWNER_REPLIES_WITHIN = 1.0
+"""Seconds to wait at the end for events from the owner of a line."""
 
 
 class LateNodes:
@@ -66,6 +68,10 @@ async def late_nodes(bus: Bus | RemoteBus, *, in_file: bool = False) -> AsyncIte
     await asyncio.sleep(0)  # it listens from now on
     try:
         yield late
+        if isinstance(bus, RemoteBus):
+            # The owner sends an event after the reply that caused it: a further reply comes after that.
+            with suppress(BusError), anyio.move_on_after(OWNER_REPLIES_WITHIN):
+                await bus.statistics()
     finally:
         await asyncio.sleep(0)  # it receives the last events
         listening.cancel()

@@ -6,6 +6,7 @@ import asyncio
 import json
 import random
 from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty, serve_tcp
 from busmaster.errors import NoReply
 from busmaster.events import MaxReplyDelayRaised, NodeChanged, RepliesLate
 from busmaster.registry import find, make_device
-from tests.app.cli.conftest import Command
+from tests.app.cli.conftest import Command, owner_here
 
 LATE = Delay(0.13)
 TOO_LATE = Delay(0.2)
@@ -79,6 +80,79 @@ def test_a_write_that_is_confirmed_late_says_what_to_try(busmaster: Command, slo
     assert (done.status, done.out) == (0, "1 ok\n")
     assert "node 2: late reply, 1" in done.err
     assert "; try --timeout 2" in done.err
+
+
+SLOW_FILE = """
+port = "PORT"
+[nodes.winder]
+protocol = "hcp"
+address = 2
+timing = { window = 0.02, max_reply_delay = 0.3 }
+points.force = { item = "10" }
+"""
+SET = """format = 1
+[drive]
+protocol = "hcp"
+address = 2
+identity = {}
+[saved]
+time = 2026-01-31T12:00:00Z
+[parameters]
+"10" = { value = 5 }
+"""
+IN_FILE, OPTION = "in its section of the file", "; try --timeout "
+
+
+@pytest.mark.parametrize("owned", [False, True])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("read", "FILE", "winder/force"),
+        ("write", "FILE", "winder/force=5"),
+        ("trend", "FILE", "winder/force", "--seconds", "0.4"),
+        ("params", "save", "FILE", "winder", "-o", "NEW", "--items", "force"),
+        ("params", "diff", "SET", "winder@FILE"),
+        ("params", "load", "SET", "winder@FILE", "--yes", "--enabled", "--undo", "NEW"),
+    ],
+)
+def test_the_advice_for_a_node_of_a_file_is_a_key_of_the_file(
+    busmaster: Command, tmp_path: Path, command: tuple[str, ...], owned: bool
+) -> None:
+    device = make_device("hcp", 2, delay=Delay(0.04))
+    path, saved = tmp_path / "line.toml", tmp_path / "one.toml"
+    saved.write_text(SET)
+    with serve_tcp(Line(find("hcp").profile.line, [device], chance=random.Random(1), paced=False)) as server:
+        path.write_text(SLOW_FILE.replace("PORT", server.path))
+        places = {"FILE": str(path), "SET": str(saved), "NEW": str(tmp_path / "new.toml")}
+        for name, where in places.items():
+            command = tuple(word.replace(name, where) for word in command)
+        with owner_here(path, outputs=False) if owned else nullcontext():
+            done = busmaster(*command)
+    assert "winder: late reply, " in done.err, done.err
+    assert IN_FILE in done.err
+    assert OPTION not in done.err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("trend", "PORT", "2/10", "--seconds", "0.4"),
+        ("params", "save", "PORT", "2", "-o", "NEW", "--items", "10"),
+        ("params", "diff", "SET", "2@PORT"),
+        ("params", "load", "SET", "2@PORT", "--yes", "--enabled", "--undo", "NEW"),
+    ],
+)
+def test_the_advice_for_a_node_of_a_port_is_an_option(
+    busmaster: Command, slow: TcpServer, tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    saved = tmp_path / "one.toml"
+    saved.write_text(SET)
+    for name, where in {"PORT": slow.path, "SET": str(saved), "NEW": str(tmp_path / "new.toml")}.items():
+        command = tuple(word.replace(name, where) for word in command)
+    done = busmaster(*command, "--protocol", "hcp")
+    assert "node 2: late reply, 1" in done.err, done.err
+    assert OPTION in done.err
+    assert IN_FILE not in done.err
 
 
 @dataclass
