@@ -277,7 +277,7 @@ def test_an_echo_that_differs_from_what_was_sent_is_shown() -> None:
 # Nodes in trouble
 
 
-@pytest.mark.parametrize("second", [Delay(0.012), Delay(0.04)])
+@pytest.mark.parametrize("second", [Delay(0.012), Delay(0.04), Delay(0.1)])
 def test_two_nodes_with_one_address_that_answer_after_each_other_are_found(second: Delay) -> None:
     """Within the silence after a reply, or so late that the reply comes to the next request."""
     findings = examined(line_of("hcp2", [hcp2(5), hcp2(5, second), hcp2(6)]), (5, 6))
@@ -297,6 +297,15 @@ def test_a_node_that_is_garbled_while_the_others_are_clean_may_have_a_twin() -> 
     assert findings.wrong == {"node 5"}
     assert "replies garbled" in findings.on("node 5").what
     assert "another node with address 5" in findings.on("node 5").advice
+
+
+def test_the_reply_window_of_the_options_is_that_of_the_requests() -> None:
+    line, findings = line_of("hcp2", [hcp2(5, Delay(0.2))]), Findings()
+    timings = find("hcp2").profile.timings.with_window(0.3)
+    patient = Patient(MemoryPort(line), "hcp2", timings, addresses=(5,), named=True)
+    run_in_virtual_time(examine(patient, findings.append))
+    assert findings.on("node 5").ok
+    assert findings.on("windows").what.endswith("set are 150 / 300 / 450 ms (late_after / window / max_reply_delay)")
 
 
 def test_where_all_nodes_are_garbled_the_line_is_suspected() -> None:

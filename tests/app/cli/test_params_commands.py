@@ -162,6 +162,7 @@ def test_what_cannot_be_compared_is_status_2(busmaster: Command, tmp_path: Path)
     drive = str(written(tmp_path / "drive.toml", '"1.17" = { value = 1 }', protocol="mentor"))
     for other, complaint in (
         (str(tmp_path / "none.toml"), "none.toml: No such file or directory"),
+        (str(tmp_path), f"{tmp_path}: Is a directory"),
         (f"1@{NOBODY}", "refused the connection"),
         (drive, f"{one} belongs to a hcp2, {drive} to a mentor; their items differ"),
     ):
@@ -281,6 +282,31 @@ def test_a_set_is_loaded_into_a_node_of_a_file_and_each_write_is_in_the_audit_lo
     assert (same.status, same.out) == (0, "")
     assert "make sure that it is not" not in same.err
     assert list(tmp_path.glob("one.undo*")) == []
+
+
+def test_the_audit_log_has_each_write_of_a_load_in_the_unit_of_its_point_or_by_its_item(
+    busmaster: Command, file: Path, three_controllers: TcpServer, tmp_path: Path
+) -> None:
+    path = written(tmp_path / "one.toml", '"10" = { value = 400 }\n"11" = { value = 11, name = "torque" }')
+    ran = busmaster("params", "load", str(path), f"winder@{file}", "--yes", "--enabled")
+    assert ran.status == 0, ran.err
+    assert audit(tmp_path) == [
+        ("command line", "busmaster params load", "winder/force", 40, "written"),
+        ("command line", "busmaster params load", "winder/11", 11, "written"),
+    ]
+
+
+def test_a_comparison_with_a_node_of_a_file_has_the_names_and_units_of_its_points(
+    busmaster: Command, file: Path, three_controllers: TcpServer, tmp_path: Path
+) -> None:
+    preset(three_controllers, 125, 7)
+    path = str(written(tmp_path / "one.toml", '"10" = { value = 400 }\n"11" = { value = 8 }'))
+    compared = busmaster("params", "diff", f"winder@{file}", path, "--json")
+    assert compared.status == 1, compared.err
+    assert [json.loads(line) for line in compared.lines] == [
+        {"item": "10", "name": "force", "unit": "N", "one": 12.5, "other": 40},
+        {"item": "11", "name": None, "unit": "", "one": 7, "other": 8},
+    ]
 
 
 def test_what_a_limit_excludes_is_named_each_and_the_others_are_written(

@@ -189,6 +189,31 @@ def test_talk_that_nobody_knows_is_left_alone_too() -> None:
     assert "with an unknown protocol" in discovery.talk
 
 
+def test_a_protocol_is_recognised_only_at_settings_at_which_it_is_tried() -> None:
+    request = bytes.fromhex("07 30 35 02 30 31 05 03")  # HCP2: read element 1 of node 5
+
+    class Master(Device):
+        def __init__(self) -> None:
+            super().__init__(0)
+            self.wakeup = 0.1
+
+        def hear_byte(self, byte: int, now: float) -> None:
+            raise AssertionError("something was sent")
+
+        def wake(self, now: float) -> None:
+            self.reply(request, now, 0.0)
+            self.wakeup = now + 0.3
+
+    for tried, talk in (
+        (LineSettings(9600), "another master is active, with Host Comms Protocol 2 at 9600 8N1: "),
+        (LineSettings(57600), "another master is active, with an unknown protocol: "),
+    ):
+        master = Master()
+        master.attentive = True
+        asked = [*steps([find("hcp2")], None, tried), *steps([find("modbus")], None, LineSettings(9600))]
+        assert looked(line_of(LineSettings(9600), master), asked).talk.startswith(talk)
+
+
 def test_an_adapter_that_echoes_is_noticed() -> None:
     told: list[str] = []
     line = line_of(LineSettings(9600), make_device("hcp2", 3), echo=Echo())

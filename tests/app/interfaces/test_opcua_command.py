@@ -242,6 +242,16 @@ def test_each_option_reaches_the_rules_and_the_server(busmaster: Command, served
     assert (served.rules.is_signed, served.rules.is_local) == (True, False)
 
 
+def test_messages_are_signed_with_a_certificate_whether_or_not_the_clients_are_named(
+    busmaster: Command, served: Served, tmp_path: Path
+) -> None:
+    own, key = certificate(tmp_path / "own", "server")
+    assert busmaster(*LINE, "--certificate", own, "--key", key).status == 0
+    assert (served.rules.is_signed, served.rules.trusted) == (True, None)
+    assert busmaster(*LINE).status == 0
+    assert (served.rules.is_signed, served.rules.trusted) == (False, None)
+
+
 def test_a_key_without_a_certificate_is_wrong_usage(busmaster: Command, served: Served) -> None:
     ran = busmaster(*LINE, "--key", __file__)
     assert (ran.status, served.line) == (2, None)
