@@ -224,6 +224,13 @@ def test_poll_that_ends_without_a_value_ends_with_1(busmaster: Command, controll
     assert "p50" not in polled.err, "there is no latency of a node that never answered"
 
 
+def test_poll_ends_with_0_if_any_of_its_nodes_has_replied(busmaster: Command, controllers: TcpServer) -> None:
+    options = ("--nodes", "1,99", "--items", "1", "--period", "0.05", "--seconds", "0.4", "--plain")
+    polled = busmaster("poll", controllers.path, *HCP2, *options)
+    assert polled.status == 0, polled.err
+    assert "no value was received" not in polled.err
+
+
 def test_scan_prints_a_line_for_each_node_that_answers(busmaster: Command, controllers: TcpServer) -> None:
     found = busmaster("scan", controllers.path, *HCP2, "--nodes", "6-7,200", "--timeout", "300")
     assert (found.status, found.lines) == (0, ["6 read element 1: 0", "7 read element 1: 0"])

@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import sqlite3
+import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, closing
 from datetime import datetime
@@ -20,6 +21,7 @@ import pytest
 
 from busmaster import Priority
 from busmaster.app.cli import params, targets
+from busmaster.app.cli.output import Level
 from busmaster.app.config import LineFile, load
 from busmaster.app.line.parameter_sets import read_set
 from busmaster.capture.pcapng import read_packets
@@ -284,12 +286,14 @@ def test_a_set_is_loaded_into_a_node_of_a_file_and_each_write_is_in_the_audit_lo
     assert list(tmp_path.glob("one.undo*")) == []
 
 
-def test_the_audit_log_has_each_write_of_a_load_in_the_unit_of_its_point_or_by_its_item(
+def test_a_load_names_the_command_that_undoes_it_and_its_writes_are_in_the_audit_log(
     busmaster: Command, file: Path, three_controllers: TcpServer, tmp_path: Path
 ) -> None:
     path = written(tmp_path / "one.toml", '"10" = { value = 400 }\n"11" = { value = 11, name = "torque" }')
-    ran = busmaster("params", "load", str(path), f"winder@{file}", "--yes", "--enabled")
+    node, undo = f"winder@{file}", str(tmp_path / "undo.toml")
+    ran = busmaster("params", "load", str(path), node, "--yes", "--enabled", "--undo", undo)
     assert ran.status == 0, ran.err
+    assert f"the old values are in {undo}; to restore them: busmaster params load {undo} {node}\n" in ran.err
     assert audit(tmp_path) == [
         ("command line", "busmaster params load", "winder/force", 40, "written"),
         ("command line", "busmaster params load", "winder/11", 11, "written"),
@@ -307,6 +311,9 @@ def test_a_comparison_with_a_node_of_a_file_has_the_names_and_units_of_its_point
         {"item": "10", "name": "force", "unit": "N", "one": 12.5, "other": 40},
         {"item": "11", "name": None, "unit": "", "one": 7, "other": 8},
     ]
+    few = str(written(tmp_path / "few.toml", '"10" = { value = 400 }\n"12" = { value = 0 }'))
+    compared = busmaster("params", "diff", f"winder@{file}", few, "--items", "11,12")
+    assert [line.split() for line in compared.lines[1:]] == [["11", "7", "-"]]
 
 
 def test_what_a_limit_excludes_is_named_each_and_the_others_are_written(
@@ -367,6 +374,17 @@ def test_through_an_owner_a_set_is_saved_and_loaded_and_the_limits_of_both_apply
         assert ran.status == 1
         assert held(three_controllers, 10) == [0]
     assert [row[0] for row in audit(tmp_path) if row[4] == "written"] == ["service"]
+
+
+def test_through_an_owner_no_audit_log_is_needed_here(
+    busmaster: Command, file: Path, three_controllers: TcpServer, tmp_path: Path
+) -> None:
+    path = written(tmp_path / "one.toml", '"11" = { value = 11 }')
+    with owner_here(file):
+        file.write_text(file.read_text().replace("line.sqlite", "none/line.sqlite"))
+        ran = busmaster("params", "load", str(path), f"winder@{file}", "--yes")
+        assert ran.status == 0, ran.err
+    assert [row[0] for row in audit(tmp_path)] == ["service"]
 
 
 def test_the_bar_of_a_save_and_of_a_comparison_counts_each_parameter(
@@ -469,8 +487,17 @@ def test_a_drive_that_was_started_during_the_question_is_not_written(
     ],
 )
 def test_a_drive_in_operation_is_written_only_if_that_is_permitted(
-    capfd: pytest.CaptureFixture[str], why: str | None, enabled: bool, again: bool, written: bool, reported: str
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    why: str | None,
+    enabled: bool,
+    again: bool,
+    written: bool,
+    reported: str,
 ) -> None:
+    stream = os.fstat(sys.stderr.fileno())
+    monkeypatch.setenv("JOURNAL_STREAM", f"{stream.st_dev}:{stream.st_ino}")
+
     async def in_operation(**_: object) -> str | None:
         return why
 
@@ -481,6 +508,8 @@ def test_a_drive_in_operation_is_written_only_if_that_is_permitted(
     err = capfd.readouterr().err
     assert reported in err
     assert bool(err) == bool(reported)
+    level = Level.WARNING if written else Level.ERROR
+    assert not err or err.startswith(f"<{level:d}>busmaster: ")
 
 
 # the end of a load

@@ -149,6 +149,21 @@ def test_a_table_on_standard_input_may_be_as_long_as_a_file(
     assert ("standard input has more than 100 bytes" in shown.err) == (status == 2)
 
 
+def test_a_program_in_the_same_pipe_can_edit_the_file_before_it_ends_its_table(
+    busmaster: Command, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Pipe(io.BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            path.write_text(path.read_text().replace("[nodes.w.points]", '[nodes.w.points]\nspeed = { item = "12" }'))
+            return super().read(size)
+
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=Pipe(b"node,point,factor\nw,position,2\n")))
+    shown = busmaster("points", str(path), "--from", "-")
+    assert (shown.status, shown.lines) == (0, ["w/position: factor 0.001 -> 2"])
+    assert 'speed = { item = "12" }' in path.read_text()
+    assert "factor = 2" in path.read_text()
+
+
 def test_all_points_that_limit_a_point_are_named(busmaster: Command, path: Path) -> None:
     names = "".join(f'{name} = {{ item = "20", maximum = {limit} }}\n' for name, limit in (("b", 5), ("c", 6)))
     path.write_text(

@@ -144,11 +144,22 @@ def test_a_line_that_does_not_run_is_reported_before_the_missing_terminal(
     assert "nobody" in ran.err
 
 
-def test_what_is_missing_is_named_once_and_ends_it(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(top, "find_spec", lambda name: None)
+@pytest.mark.parametrize(
+    ("missing", "extras"),
+    [
+        (("textual", "msgspec", "websockets"), "tui,service"),
+        (("textual",), "tui"),
+        (("msgspec",), "service"),
+        (("websockets",), "service"),
+    ],
+)
+def test_what_is_missing_is_named_once_and_ends_it(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, missing: tuple[str, ...], extras: str
+) -> None:
+    monkeypatch.setattr(top, "find_spec", lambda name: None if name in missing else name)
     ran = busmaster("top", "nobody")
     assert ran.status == 2
-    assert "the live view needs an extra: pip install 'busmaster[tui,service]'" in ran.err
+    assert f"the live view needs an extra: pip install 'busmaster[{extras}]'" in ran.err
 
 
 @pytest.mark.parametrize("of_owner", [False, True])
@@ -174,6 +185,28 @@ def test_the_end_of_the_owner_is_shown_and_ends_only_its_own_view(
         assert "the program that owns the line has ended" in ran.err
     else:
         assert (ran.status, ran.err) == (0, "")
+
+
+def test_the_screen_shows_the_line_again_when_its_owner_returns(
+    busmaster: Command, file: Path, terminal: dict[str, bool]
+) -> None:
+    first, second = owner_here(file), owner_here(file)
+    first.__enter__()
+
+    async def story(screen: FakeScreen) -> None:
+        await screen.until(lambda: screen.taken > 1)
+        await asyncio.to_thread(first.__exit__, None, None, None)
+        await screen.until(lambda: bool(screen.away))
+        await asyncio.to_thread(second.__enter__)
+        await screen.until(lambda: not screen.away and bool(screen.picture.rows))
+        screen.exit(0)
+
+    plays(story)
+    try:
+        ran = busmaster("top", "slitter")
+    finally:
+        second.__exit__(None, None, None)
+    assert (ran.status, ran.err) == (0, "")
 
 
 def test_control_characters_of_the_line_do_not_reach_the_screen(

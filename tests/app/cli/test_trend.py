@@ -103,6 +103,7 @@ def test_a_value_that_is_not_finite_is_counted_but_is_neither_lowest_nor_highest
         trace.take(since, value)
     assert (trace.samples, trace.lowest, trace.highest) == (5, -2.0, 1.0)
     assert [value for _, value in trace.shown] == [1.0, -2.0]
+    assert trace.last == -math.inf, "the last value is printed as it is"
 
 
 @in_virtual_time
