@@ -42,7 +42,7 @@ from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.refusals import LimitedReport, peer_of
 from busmaster.app.service.remote import RemoteBus
-from busmaster.app.service.tcp import listening
+from busmaster.app.service.tcp import address_text, listening
 from busmaster.app.service.touches import Touches
 from busmaster.ext import meant, protocols, read_file
 
@@ -920,7 +920,7 @@ async def serve(
         tasks.create_task(values.run())
         tasks.create_task(values.line.follow())
         async with await asyncio.start_server(server.accept, sock=socket, limit=UNREAD) as accepting:
-            opened("{}:{}".format(*accepting.sockets[0].getsockname()[:2]))
+            opened(address_text(*accepting.sockets[0].getsockname()[:2]))
             await accepting.serve_forever()
 
 

@@ -39,6 +39,7 @@ from busmaster.app.interfaces.reported_refusals import FailedLogins
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.remote import RemoteBus
+from busmaster.app.service.tcp import address_text
 from busmaster.app.service.touches import Touches
 from busmaster.ext import read_file
 
@@ -470,7 +471,7 @@ async def serving(
     shown = LineServer(server, line, rules, report)
     guard(server, rules, shown.write, FailedLogins("opcua", line, report).note)
     host, port = listen
-    server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{port}/")
+    server.set_endpoint(f"opc.tcp://{address_text(host, port)}/")
     server.socket_address = listen
     await server.start()
     try:
@@ -482,7 +483,7 @@ async def serving(
                 async with asyncio.timeout(LISTEN_AFTER):
                     await shown.has_points.wait()
             await server.acceptor.listen()
-            yield f"opc.tcp://{host}:{server.acceptor.port}/"
+            yield f"opc.tcp://{address_text(host, server.acceptor.port)}/"
             for task in running:
                 task.cancel()
     finally:

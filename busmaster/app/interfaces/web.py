@@ -43,7 +43,7 @@ from busmaster.app.service.messages import encode_json
 from busmaster.app.service.picture import Row
 from busmaster.app.service.record import cut
 from busmaster.app.service.refusals import Logins, wait_text
-from busmaster.app.service.tcp import HostPort, listening
+from busmaster.app.service.tcp import HostPort, address_text, listening
 
 PAGE = Path(__file__).parent / "page"
 NUMBER = re.compile(r"[-+]?[0-9]{1,20}(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,3})?")
@@ -377,7 +377,7 @@ async def serving(application: Any, listen: HostPort, report: Report = lambda _:
         task = asyncio.ensure_future(server.serve(sockets=[opened]))
         host, port = opened.getsockname()[:2]
         try:
-            yield f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+            yield f"http://{address_text(host, port)}/"
         finally:
             server.should_exit = True
             await task

@@ -57,6 +57,8 @@ class KeptTimes:
     def take(self, path: str | None, nodes: Mapping[str, Node]) -> None:
         """Continue with these nodes and this file. New nodes start with the times loaded at the start."""
         fresh = {name: node for name, node in nodes.items() if node not in self._nodes.values()}
+        if path != self._path:
+            self._kept = ""  # the other file does not have these times yet
         self._path, self._nodes = path, dict(nodes)
         for name, node in fresh.items():
             if name in self._known and self._known[name]["settings"] == self._settings(node):

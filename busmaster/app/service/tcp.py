@@ -33,13 +33,18 @@ def check_listening(listen: HostPort, *, tokens: bool) -> None:
         )
 
 
+def address_text(host: str, port: int) -> str:
+    """Return an address as HOST:PORT, with an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 def listening_error(host: str, port: int, error: OSError) -> str:
     """Return why nothing can listen there."""
     if error.errno == errno.EADDRINUSE:
-        return f"{host}:{port} is in use by another program; end that one, or use another port"
+        return f"{address_text(host, port)} is in use by another program; end that one, or use another port"
     # the text of create_server repeats the address
     what = os.strerror(error.errno) if error.errno and not isinstance(error, socket.gaierror) else error.strerror
-    return f"cannot listen on {host}:{port}: {what or error}"
+    return f"cannot listen on {address_text(host, port)}: {what or error}"
 
 
 def listening(listen: HostPort) -> socket.socket:
@@ -60,7 +65,7 @@ def is_our_name(host: str, listen: HostPort) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:
-        return name in (listen[0], socket.gethostname())
+        return name.lower() in (listen[0].lower(), socket.gethostname().lower())  # a browser sends small letters
     return True
 
 

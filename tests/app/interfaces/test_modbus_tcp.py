@@ -65,6 +65,7 @@ from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Command, busmaster, owner, serve, started
 from tests.app.interfaces.test_following import Remote, connected, row, shown_frame
 from tests.app.outputs.cycles import cycle
+from tests.app.service.test_interfaces import has_ipv6
 from tests.patience import PATIENCE
 
 __all__ = ["busmaster"]
@@ -552,6 +553,61 @@ def test_requests_of_replaced_connections_count_as_those_of_their_address(monkey
     with_server(story, SlowUnit())
 
 
+def test_a_connection_whose_request_was_replied_to_makes_room_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 2)
+
+    async def story(connect: Connect, _echo: Echo, _reports: list[str]) -> None:
+        readers = []
+        for _ in range(4):
+            reader, writer = await connect()
+            writer.write(frame(READ))
+            assert await reader.readexactly(len(frame(READ))) == frame(READ)
+            readers.append(reader)
+        assert [await is_closed(reader) for reader in readers[:2]] == [True, True]
+
+    with_server(story)
+
+
+def test_replaced_connections_no_longer_count_when_their_requests_are_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_PER_PEER", 2)
+    go_on = asyncio.Event()
+
+    class SlowUnit(Echo):
+        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
+            reply = await super().reply(peer, unit, pdu)
+            if unit == 1:
+                await go_on.wait()
+            return reply
+
+    async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
+        many = [await connect("127.0.0.1") for _ in range(2)]
+        for _, writer in many:
+            writer.write(frame(READ, unit=1))
+        while echo.counts[1] < 2:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        reader, writer = await connect("127.0.0.2")  # replaces one of 127.0.0.1
+        writer.write(frame(READ, unit=2))
+        await reader.readexactly(len(frame(READ)))
+        go_on.set()
+        writer.close()
+        reader, writer = many[1]
+        await reader.readexactly(len(frame(READ)))
+        writer.close()
+        for _ in range(3):
+            reader, writer = await connect("127.0.0.1")
+            writer.write(frame(READ, unit=2))
+            assert await reader.readexactly(len(frame(READ)))
+            writer.close()
+            await writer.wait_closed()
+        opened = [await connect("127.0.0.1") for _ in range(2)]  # as many as before
+        for reader, writer in opened:
+            writer.write(frame(READ, unit=2))
+            assert await reader.readexactly(len(frame(READ)))
+
+    with_server(story, SlowUnit())
+
+
 # the command, beside an owner, by real clients
 
 TEXT = """
@@ -883,6 +939,60 @@ def test_an_address_has_few_requests_on_the_line_and_does_not_delay_another(monk
     assert [reply[-1] for reply in replies] == [*range(10), 99]
     assert most == 5
     assert all(0 < left < 3.0 for left in times), "the wait for the turn counts"
+
+
+def test_the_addresses_of_an_ipv6_network_have_few_requests_on_the_line_together() -> None:
+    on_line: list[int] = []
+    go_on = asyncio.Event()
+
+    class Unit:
+        async def request(self, command: Any, **_options: Any) -> Any:
+            on_line.append(command.first)
+            await go_on.wait()
+            return (command.first,)
+
+    line: Any = SimpleNamespace(
+        is_connected=True,
+        picture=SimpleNamespace(nodes={("modbus", 3): None}),
+        remote=SimpleNamespace(find=lambda _protocol, _unit: Unit()),
+    )
+
+    async def run() -> None:
+        answers = Answers(Values(line), Rules(pass_through=True), lambda _: None)
+        peers = [f"2001:db8::{number}" for number in range(1, 9)]
+        replies = [
+            asyncio.ensure_future(answers.reply(peer, 3, b"\x03" + struct.pack(">HH", first, 1)))
+            for first, peer in enumerate([*peers, "2001:db8:0:1::1"])
+        ]
+        await asyncio.sleep(0)
+        assert on_line == [*range(modbus_tcp.MOST_ON_LINE), 8]
+        go_on.set()
+        await asyncio.gather(*replies)
+
+    asyncio.run(run())
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+def test_an_ipv6_address_is_reported_in_brackets() -> None:
+    async def story() -> str:
+        line = connected(Owner())
+        opened: asyncio.Queue[str] = asyncio.Queue()
+
+        async def follow() -> None:
+            await asyncio.Event().wait()
+
+        line.follow = follow  # type: ignore[method-assign,assignment]  # replaced here
+        values = values_of(line, row_of("1"))
+        serving = asyncio.ensure_future(
+            modbus_tcp.serve(values, Rules(), ("::1", 0), opened.put_nowait, lambda _: None)
+        )
+        async with asyncio.timeout(PATIENCE):
+            address = await opened.get()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        return address
+
+    assert re.fullmatch(r"\[::1\]:\d+", asyncio.run(story()))
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import datetime
 import re
 import signal
@@ -19,12 +20,14 @@ from cryptography.x509.oid import NameOID
 from opcua import ua
 
 from busmaster.app.interfaces import opcua
+from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua import read_trusted
 from busmaster.app.interfaces.opcua_access import Rules
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import InvalidCommand
 from tests.app.cli.conftest import Command, busmaster, owner, serve, started
 from tests.app.interfaces.opcua_client import other_client
+from tests.app.service.test_interfaces import has_ipv6
 from tests.patience import PATIENCE
 
 __all__ = ["busmaster"]
@@ -145,6 +148,23 @@ def test_with_a_certificate_only_trusted_clients_come_and_users_with_a_token_wri
                 pass
         with pytest.raises(ua.UaError), other_client(url):  # nobody is let in who says things openly
             pass
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+def test_clients_connect_to_an_ipv6_address_as_it_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opcua, "LISTEN_AFTER", 0.0)
+
+    async def story() -> None:
+        line = Following(lambda: "unix:/nobody")
+        async with opcua.serving(line, Rules(), ("::1", 0), lambda _: None) as url:
+            assert url.startswith("opc.tcp://[::1]:")
+            entered = other_client(url)
+            client = await asyncio.to_thread(entered.__enter__)
+            assert (await asyncio.to_thread(client.read, "Line Connected")).value is False
+            await asyncio.to_thread(entered.__exit__, None, None, None)
+
+    asyncio.run(story())
 
 
 def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:

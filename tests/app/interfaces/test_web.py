@@ -8,6 +8,7 @@ import os
 import socket
 import threading
 import time
+from collections.abc import AsyncIterator
 from math import inf
 from pathlib import Path
 from types import SimpleNamespace
@@ -47,6 +48,7 @@ from busmaster.registry import kinds
 from tests.app.interfaces.lines import HERE, ONE, READS, Page, Past, assert_goes_on_alone, page, poll, shows
 from tests.app.interfaces.test_following import Remote, connected, row, shown_frame
 from tests.app.service.lines import Served, served, until
+from tests.app.service.test_interfaces import has_ipv6
 from tests.patience import PATIENCE
 
 NETWORK = ("192.0.2.7", 8420)
@@ -117,6 +119,8 @@ async def test_a_point_that_is_not_known_yet_is_not_told_to_be_none(tmp_path: Pa
         answer = await of.client.get(ONE)
         assert (answer.status_code, answer.json()["error"]) == (503, "LineDown")
         check("/api/points/{group}/{key}", "get", 503, answer.json())
+        await until(lambda: "no program serves" in getattr(of.line.state, "why", ""))
+        assert "not known yet: no program serves" in (await of.client.get(ONE)).json()["what"].replace("\n", " ")
 
 
 @pytest.mark.asyncio
@@ -348,6 +352,14 @@ async def test_requests_for_history_beyond_the_bound_are_refused_and_all_else_go
         await past_of(of)  # their places are free again
 
 
+@pytest.mark.asyncio
+async def test_a_history_that_cannot_be_read_leaves_its_place_to_the_next_request() -> None:
+    of = Local(history=Past(OSError("disk I/O error")))
+    for _ in range(MOST_HISTORY + 1):
+        answer = await of.client.get("/api/history/axes/winder/10")
+        assert (answer.status_code, answer.json()["what"]) == (503, "disk I/O error")
+
+
 # who is let in
 
 EVIL = [
@@ -566,6 +578,18 @@ async def test_the_wire_is_looked_at_only_while_a_page_wants_it(tmp_path: Path) 
         await until(lambda: not tapped(line))
 
 
+@pytest.mark.asyncio
+async def test_a_page_stops_and_resumes_the_exchanges(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of, stream_of(of) as stream:
+        poll(line)
+        await shows(of.line)
+        for _ in range(2):
+            await stream.send('{"exchanges":true}')
+            await until(lambda: tapped(line))
+            await stream.send('{"exchanges":false}')
+            await until(lambda: not tapped(line))
+
+
 def tapped(line: Served) -> bool:
     return line.bus._pump.tap is not None
 
@@ -631,6 +655,17 @@ async def test_a_port_that_is_taken_is_one_sentence() -> None:
     ):
         async with serving(None, taken.getsockname()):
             pass
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+@pytest.mark.asyncio
+async def test_the_url_of_an_ipv6_address_can_be_opened() -> None:
+    line = connected(Remote())
+    listen = ("::1", 0)
+    async with serving(application(line, Guard(listen, {})), listen) as url:
+        assert url.startswith("http://[::1]:")
+        async with httpx.AsyncClient(base_url=url, timeout=PATIENCE, trust_env=False) as client:
+            assert (await client.get("/api/line")).status_code == 200
 
 
 @pytest.mark.asyncio
@@ -764,6 +799,29 @@ async def test_a_body_is_a_value_as_json_of_at_most_its_bound(body: bytes, kind:
     of = Local()
     assert (await of.put(body, content_type=kind)).status_code == status
     assert len(of.overview.writes) == (status == 200)
+
+
+@pytest.mark.asyncio
+async def test_the_parts_of_a_body_are_within_its_bound_together() -> None:
+    async def parts() -> AsyncIterator[bytes]:
+        yield b'{"value":'
+        yield b" " * (LONGEST_COMMAND - 10)
+        yield b"1}"
+
+    of = Local()
+    headers = {"content-type": "application/json"}
+    answer = await of.client.put("/api/points/axes/winder/10", content=parts(), headers=headers)
+    assert answer.status_code == 413
+    assert of.overview.writes == []
+
+
+@pytest.mark.asyncio
+async def test_points_are_not_known_in_the_moment_in_which_the_owner_is_found() -> None:
+    of = Local()
+    of.line.picture.frame = None
+    answer = await of.client.get("/api/points/axes/winder/10")
+    assert answer.status_code == 503
+    assert "not known yet: its program was found a moment ago" in answer.json()["what"]
 
 
 @pytest.mark.parametrize(

@@ -233,6 +233,18 @@ def test_a_file_that_is_read_again_does_not_begin_with_the_kept_times_again(
     assert begun == ["winder", "drive"]
 
 
+def test_a_file_that_is_read_again_may_name_another_place_for_the_times(text: str, kept: Path) -> None:
+    other = kept.with_name("other.json")
+
+    async def main() -> None:
+        async with opened(text) as line:
+            await asyncio.sleep(1.5 * OFTEN)
+            await line.take(read(Source("line.toml", text.replace(kept.name, other.name))))
+
+    run_in_virtual_time(main())
+    assert json.loads(other.read_text())["nodes"].keys() == json.loads(kept.read_text())["nodes"].keys()
+
+
 def test_the_times_of_each_kind_of_request_are_kept(text: str, kept: Path) -> None:
     async def main() -> int:
         async with opened(text) as line:
@@ -305,6 +317,43 @@ def test_it_is_enough_that_one_node_learns(text: str, kept: Path) -> None:
     one = text.replace('timing = "learned"\n', "").replace("address = 2", 'address = 2\ntiming = "learned"')
     assert run_for(one, LONG) == {"drive"}
     assert set(json.loads(kept.read_text())["nodes"]) == {"drive"}
+
+
+@pytest.mark.slow
+def test_times_that_could_be_kept_again_are_reported_when_they_cannot_be_kept_any_more(text: str, kept: Path) -> None:
+    told: list[str] = []
+
+    def block(is_blocked: bool) -> None:
+        """Have a folder in the place of the file, or nothing."""
+        if not is_blocked:
+            return kept.rmdir()
+        kept.unlink(missing_ok=True)
+        return kept.mkdir()
+
+    async def main() -> None:
+        async with opened(text, told.append) as line:
+            block(True)
+            await asyncio.sleep(1.5 * OFTEN)
+            block(False)
+            await asyncio.sleep(OFTEN)
+            block(True)
+            for value in range(250):  # more is learned, so that there is something to keep
+                await line.nodes["winder"].write(10, value)
+            await asyncio.sleep(OFTEN)
+
+    run_in_virtual_time(main())
+    assert told == 2 * [f"{kept}: Is a directory; the learned reply times are not stored"]
+
+
+def test_a_line_whose_file_was_read_again_leaves_no_task_when_it_is_closed(text: str) -> None:
+    async def main() -> None:
+        before = asyncio.all_tasks()
+        async with opened(text) as line:
+            for _ in range(2):
+                await line.take(read(Source("line.toml", text)))
+        assert asyncio.all_tasks() == before
+
+    run_in_virtual_time(main())
 
 
 def test_an_error_of_the_file_that_comes_back_is_reported_again() -> None:

@@ -191,6 +191,7 @@ def test_the_kind_of_a_token_is_written_in_small_or_large_letters(form: str, tmp
         ("gateway.example", True),
         ("gateway.example:7420", True),
         ("this-machine:7420", True),
+        ("THIS-machine", True),
         ("plant.example:7420", False),
         ("[plant.example]:7420", False),
         ("", False),
@@ -199,7 +200,7 @@ def test_the_kind_of_a_token_is_written_in_small_or_large_letters(form: str, tmp
 def test_a_host_is_ours_by_an_address_by_where_we_listen_and_by_the_name_of_the_machine(
     host: str, ours: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(socket, "gethostname", lambda: "this-machine")
+    monkeypatch.setattr(socket, "gethostname", lambda: "This-Machine")
     assert is_our_name(host, ("gateway.example", 7420)) is ours
 
 
