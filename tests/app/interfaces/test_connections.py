@@ -186,6 +186,26 @@ async def test_beyond_the_bound_the_oldest_that_says_nothing_is_closed_and_that_
             writer.close()
 
 
+@pytest.mark.asyncio
+async def test_beyond_the_bound_a_connection_that_is_idle_after_its_requests_is_closed_for_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with crowded(tmp_path, FEWEST, monkeypatch) as (url, told):
+        request = b"HEAD /docs HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+
+        async def replied_to() -> End:
+            end = await end_of(url)
+            end[1].write(request)
+            assert b" 200 " in await asyncio.wait_for(end[0].readuntil(b"\r\n\r\n"), PATIENCE)
+            return end
+
+        ends = [await replied_to() for _ in range(FEWEST + 1)]
+        assert await closed(ends[0]) == b""
+        assert told
+        for _, writer in ends:
+            writer.close()
+
+
 def test_the_bound_leaves_descriptors_free(monkeypatch: pytest.MonkeyPatch) -> None:
     for soft, most in (
         (resource.RLIM_INFINITY, 512),

@@ -111,6 +111,18 @@ async def test_every_reply_has_the_headers_and_a_refusal_its_status() -> None:
     assert (await replied("lifespan"))[0]["headers"] == [(b"own", b"1")]
 
 
+def test_the_headers_keep_other_content_and_frames_out_and_nothing_stale_in() -> None:
+    headers = {name.decode(): value.decode() for name, value in HEADERS}
+    policy = {part.strip() for part in headers.pop("content-security-policy").split(";")}
+    assert policy == {"default-src 'self'", "frame-ancestors 'none'", "base-uri 'none'", "form-action 'none'"}
+    assert headers == {
+        "x-content-type-options": "nosniff",
+        "referrer-policy": "no-referrer",
+        "cross-origin-resource-policy": "same-origin",
+        "cache-control": "no-cache",
+    }
+
+
 @pytest.mark.asyncio
 @pytest.mark.parametrize("hosts", [(b"localhost", b"evil.example"), (b"evil.example", b"localhost")])
 async def test_a_request_with_two_hosts_is_refused(hosts: tuple[bytes, bytes]) -> None:

@@ -293,6 +293,8 @@ async def test_groups_that_end_are_requested_again_and_count_what_was_dropped(mo
     story.has(row_of("1", "other"))
     await story.show()
     assert group.closes == 2
+    await story.show(read_cycle(5.0, at=101.0), group="other")
+    assert story.shown.state("winder/1") == [(5.0, "Good")], "the values are those of the group that has the point now"
     await story.end()
 
 
@@ -390,7 +392,9 @@ async def test_a_value_beyond_a_limit_is_out_of_range() -> None:
     story.overview.wrote = lambda: setattr(story.overview, "is_gone", True)
     assert await story.write() == "BadRequestNotAllowed", "the limits are not known any more"
     story.overview.error = NotStarted("busy")
-    assert await story.write() == "BadNoCommunication"
+    story.overview.wrote = lambda: None
+    story.overview.is_gone = False
+    assert await story.write() == "BadNoCommunication", "it was not refused, whatever the limits are"
     await story.end()
 
 

@@ -112,6 +112,11 @@ def test_a_quantity_that_was_whole_by_chance_stays_a_double() -> None:
 def test_a_unit_has_its_number_where_there_is_one() -> None:
     assert unit_of("mm").UnitId == 5066068  # MMT
     assert unit_of("°C").UnitId == 4408652  # CEL
+    known = {"%": 20529, "A": 4279632, "bar": 4342098, "deg": 17476, "°": 17476, "m": 5067858, "m/min": 12888}
+    known |= {"kW": 4937556, "kg": 4933453, "m/s": 5067859, "mA": 13387, "mm/s": 4403510, "rad/s": 12865, "µm": 13384}
+    known |= {"Hz": 4740186, "N": 5129559, "Nm": 20053, "V": 5655636, "W": 5723220, "min": 5065038, "ms": 4403766}
+    known |= {"rpm": 5394509, "s": 5457219}
+    assert {unit: unit_of(unit).UnitId for unit in known} == known  # UNECEUnitIds of OPC UA, Part 8
     assert (unit_of("counts").UnitId, unit_of("counts").DisplayName.Text) == (-1, "counts")
 
 

@@ -229,6 +229,13 @@ def test_a_problem_in_a_template_names_the_template(tmp_path: Path) -> None:
     assert (error.file, error.line) == (str(tmp_path / "ours.toml"), 3)
 
 
+def test_problems_of_the_file_itself_are_before_those_of_its_templates(tmp_path: Path) -> None:
+    (tmp_path / "ours.toml").write_text('protocol = "hcp2"\npoints.speed = { item = "1", factor = 0 }\n')
+    text = f'{HEAD}{NODE}template = "ours.toml"\n{GROUP.replace("0.1", "0")}'
+    found = problems(tmp_path, text)
+    assert [(Path(error.file).name, error.line) for error in found] == [("line.toml", 7), ("ours.toml", 2)]
+
+
 def test_nothing_is_opened_and_nothing_written(tmp_path: Path) -> None:
     outputs = f'[outputs.sqlite]\npath = "{tmp_path}/line.sqlite"\nspill = "{tmp_path}/spool"\n'
     path = written(tmp_path, f'{GOOD}{outputs}[outputs.csv]\npath = "{tmp_path}/line.csv"\n')
@@ -247,6 +254,15 @@ def test_doubts_are_warnings(tmp_path: Path) -> None:
         "nothing is polled, because the file has no poll group; add [groups.NAME]",
         "outputs.csv.path",
     ]
+
+
+def test_a_warning_of_several_nodes_is_reported_once(tmp_path: Path) -> None:
+    head = 'port = "/dev/nothing-is-there?baudrate=9600"\n'
+    drives = '[nodes.drive3-5]\nprotocol = "mentor"\naddress = "3-5"\n'
+    report = check(written(tmp_path, f"{head}{drives}{GROUP.replace('winder/1', 'drive3-5/1.17').replace('0.1', '1')}"))
+    assert report.problems == ()
+    [warning] = report.warnings
+    assert warning.startswith("mentor: addresses below 10")
 
 
 def test_a_schedule_that_does_not_fit_is_a_warning(tmp_path: Path) -> None:

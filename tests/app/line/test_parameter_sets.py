@@ -84,6 +84,19 @@ def test_an_interrupted_save_goes_on_without_the_line_that_was_cut(tmp_path: Pat
     assert not beside.exists()
 
 
+def test_a_save_that_is_interrupted_twice_goes_on_each_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    beside = tmp_path / "a.toml.part"
+    for number, one in enumerate(WANTED):
+        with PartFile(str(path), EMPTY, WANTED, KIND) as part:
+            assert [missing.item for missing in part.missing] == [missing.item for missing in WANTED[number:]]
+            part.add(Found(one, number))
+        beside.write_bytes(beside.read_bytes() + b'"1.19" = { val')
+    with PartFile(str(path), EMPTY, WANTED, KIND) as part:
+        assert part.missing == ()
+    assert [entry.value for entry in part.finish().entries.values()] == [0, 1, 2]
+
+
 def test_what_was_begun_with_another_list_is_not_gone_on_with(tmp_path: Path) -> None:
     path = str(tmp_path / "a.toml")
     with PartFile(path, EMPTY, WANTED, KIND):

@@ -138,6 +138,20 @@ def test_what_waits_for_the_line_waits_until_the_safe_state_is_sent() -> None:
     on_a_line(story, "winder/speed")
 
 
+def test_a_safe_value_is_in_the_unit_of_its_point() -> None:
+    text = LIMITED.replace("maximum = 500", "maximum = 500, factor = 0.1").replace("POINT", "force")
+
+    async def run() -> None:
+        file = read(Source("line.toml", text.replace("VALUE", "12.5")))
+        devices: list[Device] = [EmulatedMint(2)]
+        port = MemoryPort(Line(Hcp2Controller.profile.line, devices, chance=random.Random(1)))
+        async with ConfiguredLine(file, port=port, outputs=False) as line:
+            assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/force": None}
+            assert await line.nodes["winder"].read(11) == 125
+
+    run_in_virtual_time(run())
+
+
 @pytest.mark.parametrize("leaving", [True, False])
 def test_a_line_that_is_left_takes_no_other_write_and_one_that_is_not_left_does(leaving: bool) -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
