@@ -143,6 +143,36 @@ async def test_a_waiting_write_does_not_keep_its_client_from_reading(
         assert await waiting == "Good"
 
 
+async def test_write_requests_beyond_the_bound_are_refused_until_others_have_their_replies(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opcua_connections, "MOST_WAITING_WRITES", 2)
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        go_on, waiting_requests = asyncio.Event(), []
+        write = opened.line.write
+
+        async def held(*what: Any) -> None:
+            waiting_requests.append(what)
+            await go_on.wait()
+            await write(*what)
+
+        monkeypatch.setattr(opened.line, "write", held)
+        waiting = asyncio.create_task(opened.write("5/10", 1.0))
+        await until(lambda: waiting_requests)
+        [processor] = [one.processor for one in opened.server.acceptor.clients if one.processor.has_session]
+        more = asyncio.create_task(opened.write("5/10", 2.0))
+        await until(lambda: processor._writes.qsize() == 1)
+        with pytest.raises(ua.UaStatusCodeError, match="BadTooManyOperations"):
+            await opened.write("5/10", 3.0)
+        go_on.set()
+        assert [await waiting, await more] == ["Good", "Good"]
+        for number in range(3):
+            assert await opened.write("5/10", float(number)) == "Good"
+        assert [value for _, _, value in waiting_requests] == [1.0, 2.0, 0.0, 1.0, 2.0], "in their order"
+
+
 async def test_monitored_items_beyond_the_bounds_are_refused(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     async with opened.owned() as line:
         line.poll("10")
@@ -186,6 +216,36 @@ def closes(address: tuple[str, int], sent: bytes) -> int:
 async def test_a_message_that_is_too_long_or_out_of_order_ends_its_connection(opened: Opened, sent: bytes) -> None:
     host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
     await asyncio.to_thread(closes, (host, int(port)), sent)
+
+
+def hello(receive: int, send: int) -> bytes:
+    """A Hello with these sizes of buffers, in bytes."""
+    return b"HELF" + struct.pack("<IIIIIIi", 32, 0, receive, send, 0, 0, -1)
+
+
+@pytest.mark.parametrize(
+    ("sent", "acknowledged"),
+    [
+        pytest.param(hello(65_536, 65_536) * 2, 1, id="a second Hello"),
+        pytest.param(hello(8_191, 65_536), 0, id="a client that receives short chunks"),
+        pytest.param(hello(65_536, 8_191), 0, id="a client that sends short chunks"),
+        pytest.param(hello(8_192, 8_192) * 2, 1, id="the shortest buffers that are taken"),
+    ],
+)
+async def test_a_second_hello_and_one_with_too_short_buffers_end_the_connection(
+    opened: Opened, sent: bytes, acknowledged: int
+) -> None:
+    host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
+
+    def received() -> bytes:
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+            connection.sendall(sent)
+            found = b""
+            while part := connection.recv(4096):
+                found += part
+            return found
+
+    assert (await asyncio.to_thread(received)).count(b"ACKF") == acknowledged
 
 
 async def test_a_connection_without_a_session_is_closed(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:

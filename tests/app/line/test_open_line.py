@@ -12,6 +12,7 @@ from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
+from busmaster.app.service.authorisation import WriteRequest
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing import run_in_virtual_time
 
@@ -94,6 +95,9 @@ def test_it_is_closed_when_it_is_left() -> None:
             pass
         with pytest.raises(BusClosed):
             await line.point("winder/11").read()
+        # an output is closed last, and can still receive a command
+        command = WriteRequest(interface="mqtt", by="hmi", name="winder/11", point=line.point("winder/11"), value=1)
+        assert (await line.authorisation.write(command)).error == "the line is closing; nothing was sent"
 
     run_in_virtual_time(main())
 
