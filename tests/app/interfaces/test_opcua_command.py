@@ -6,10 +6,13 @@ import asyncio
 import datetime
 import re
 import signal
+import socket
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -165,6 +168,51 @@ def test_clients_connect_to_an_ipv6_address_as_it_is_reported(monkeypatch: pytes
             await asyncio.to_thread(entered.__exit__, None, None, None)
 
     asyncio.run(story())
+
+
+@pytest.mark.slow
+def test_a_port_that_is_in_use_leaves_no_task_and_no_thread() -> None:
+    async def story(address: tuple[str, int]) -> None:
+        tasks = asyncio.all_tasks()
+        with pytest.raises(OSError, match="in use"):
+            async with opcua.serving(Following(lambda: "unix:/nobody"), Rules(), address, lambda _: None):
+                pass
+        assert asyncio.all_tasks() == tasks
+
+    threads = set(threading.enumerate())
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        asyncio.run(story(taken.getsockname()))
+    assert set(threading.enumerate()) == threads
+
+
+def read_certificate(path: str) -> x509.Certificate:
+    return x509.load_der_x509_certificate(Path(path).read_bytes())
+
+
+class WithCertificate:
+    """A server, as far as its certificate."""
+
+    def __init__(self) -> None:
+        self.iserver: Any = SimpleNamespace(certificate=None)
+        self.formats: list[str] = []
+        self.uris: list[str] = []
+
+    async def load_certificate(self, path: str, format_: str) -> None:
+        self.formats.append(format_)
+        self.iserver.certificate = read_certificate(path)
+
+    async def load_private_key(self, _path: str, *, format: str) -> None:  # noqa: A002  the name in the library
+        self.formats.append(format)
+
+    async def set_application_uri(self, uri: str) -> None:
+        self.uris.append(uri)
+
+
+def test_a_server_has_the_name_that_its_certificate_has(tmp_path: Path) -> None:
+    server: Any = WithCertificate()
+    asyncio.run(opcua.load_certificate(server, *certificate(tmp_path / "own", "interface")))
+    assert server.uris == ["urn:interface"]
+    assert server.formats == ["der", "pem"]
 
 
 def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:

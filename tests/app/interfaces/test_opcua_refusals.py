@@ -11,11 +11,12 @@ from typing import Any
 
 import opcua
 import pytest
+from asyncua.ua.ua_binary import nodeid_from_binary
 from opcua import ua
 
 from busmaster.app import bounds
 from busmaster.app.interfaces import opcua_connections, opcua_sessions
-from tests.app.interfaces.opcua_client import OtherClient
+from tests.app.interfaces.opcua_client import OtherClient, other_client
 from tests.app.interfaces.test_opcua import Opened, opened
 from tests.app.service.lines import until
 from tests.patience import PATIENCE
@@ -171,6 +172,55 @@ async def test_write_requests_beyond_the_bound_are_refused_until_others_have_the
         for number in range(3):
             assert await opened.write("5/10", float(number)) == "Good"
         assert [value for _, _, value in waiting_requests] == [1.0, 2.0, 0.0, 1.0, 2.0], "in their order"
+
+
+async def test_a_session_ends_after_the_writes_before_it(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        go_on, begun, closing = asyncio.Event(), asyncio.Event(), asyncio.Event()
+        process, write = opcua_connections.Requests.process_message, opened.line.write
+        had_session: list[bool] = []
+        processors: list[opcua_connections.Requests] = []
+
+        async def noted(processor: opcua_connections.Requests, seqhdr: Any, body: Any) -> bool:
+            kind = nodeid_from_binary(body.copy())
+            if kind == opcua_connections.OF_THE_SESSION[-1]:
+                processors.append(processor)
+                closing.set()
+            return await process(processor, seqhdr, body)
+
+        async def held(*what: Any) -> None:
+            begun.set()
+            await go_on.wait()
+            had_session.append(processors[0].has_session)
+            await write(*what)
+
+        monkeypatch.setattr(opcua_connections.Requests, "process_message", noted)
+        monkeypatch.setattr(opened.line, "write", held)
+        entered = other_client(opened.url)
+        client = await asyncio.to_thread(entered.__enter__)
+        waiting = asyncio.create_task(asyncio.to_thread(client.write, "5/10", 12.0))
+        await begun.wait()
+        leaving = asyncio.create_task(asyncio.to_thread(entered.__exit__, None, None, None))
+        await closing.wait()
+        for _ in range(20):
+            await asyncio.sleep(0)
+        go_on.set()
+        assert await waiting == "Good"
+        await leaving
+        assert had_session == [True]
+
+
+async def test_a_connection_with_many_requests_is_read_again_when_these_have_their_replies(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opcua_connections, "MOST_QUEUED", 1)
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        for _ in range(3):
+            assert (await asyncio.to_thread(opened.client.read, "5/10")).status == "Good"
 
 
 async def test_monitored_items_beyond_the_bounds_are_refused(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -867,6 +867,20 @@ async def test_who_guesses_tokens_is_told_how_many_whole_seconds_to_wait() -> No
 
 
 @pytest.mark.asyncio
+async def test_who_waits_as_long_as_the_reply_advises_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(web, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    of = Local(secrets={"hmi": digest_of(TOKEN)})
+    while (await of.put(authorization="Bearer wrong")).status_code == 401:
+        pass
+    now[0] += 0.25
+    answer = await of.put(authorization=f"Bearer {TOKEN}")
+    assert answer.status_code == 429
+    now[0] += int(answer.headers["retry-after"])
+    assert (await of.put(authorization=f"Bearer {TOKEN}")).status_code == 200
+
+
+@pytest.mark.asyncio
 async def test_history_is_requested_in_the_unit_of_the_point_for_the_last_hour_unless_it_has_a_range() -> None:
     past = Past(History(labels=(("1", "jog"),)))
     of = Local(row(unit="mm"), history=past)

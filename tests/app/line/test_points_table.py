@@ -324,6 +324,14 @@ def test_a_bad_row_is_named_with_its_column(row: str, fault: str) -> None:
     assert told.startswith("points.csv: ")
 
 
+def test_a_number_is_not_true_or_false_although_it_is_equal() -> None:
+    held = file('points = { a = { item = "10", writable = true }, b = { item = "11" } }\n')
+    assert take(held, "node,point,writable", "w,a,TRUE").changes == ()
+    assert faults(held, "node,point,writable", "w,a,1") == [
+        "points.csv: row 2, column writable: must be true or false, not 1"
+    ]
+
+
 def test_of_a_row_that_is_too_short_no_comma_is_suspected() -> None:
     [told] = faults(file(INLINE), "node,point,item,bits,maximum", "w,c,12")
     assert told == "points.csv: row 2: the row has 3 cells instead of 5"
