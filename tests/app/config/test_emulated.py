@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from busmaster import LineSettings
 from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
@@ -211,6 +212,11 @@ VALUES: list[tuple[str, str, dict[str, Any]]] = [
         {"speed_reference_1": 12.3, "1.17": 123},
     ),
     (
+        node("mentor", 14, "points.w = { item = '15.60:wide', decimals = 1 }", "values = { '15.60:wide' = 5432.1 }"),
+        "mentor",
+        {"w": 5432.1, "15.60:wide": 5432.1},
+    ),
+    (
         node("ct-ansi", 12, "points.ref = { item = '1.17', decimals = 1 }", "values = { ref = -47.6, '7.05' = 9 }"),
         "ct-ansi",
         {"ref": -47.6, "7.05": 9},
@@ -353,3 +359,12 @@ def test_pace_and_seed_of_a_command_go_before_those_of_the_file() -> None:
     first = emulated_line(file, seed=8).chance.random()
     assert emulated_line(file, seed=8).chance.random() == first
     assert emulated_line(file, seed=7).chance.random() == emulated_line(file).chance.random() != first
+    assert emulated_line(file, seed=0).chance.random() not in (first, emulated_line(file).chance.random())
+
+
+@pytest.mark.parametrize("port", ["path = '/dev/ttyS0'", "host = '10.0.0.5'\nport = 4001\nrfc2217 = true"])
+def test_an_emulated_line_has_the_framing_of_the_port(port: str) -> None:
+    settings = "baudrate = 19200\nbytesize = 7\nparity = 'E'\nstopbits = 2\n"
+    text = f"[port]\n{port}\n{settings}{node('hcp2', 5).removeprefix(HEAD)}"
+    line = emulated_line(read(Source("line.toml", text)))
+    assert line.settings == LineSettings(19200, bytesize=7, parity="E", stopbits=2)

@@ -338,6 +338,32 @@ async def test_cycles_that_the_loop_was_too_slow_for_are_counted_once_with_all_o
 
 @pytest.mark.usefixtures("_listed")
 @pytest.mark.asyncio
+async def test_missed_cycles_count_with_all_of_their_values_though_some_are_suppressed() -> None:
+    outputs = Distributor(BUS)
+    outputs.add("all", Settings())
+    steps = [(meant(cycle(number, 1.0, 2.0), Meaning(deadband=5), Meaning()), number - 1) for number in (1, 2)]
+    outputs.start([Fed("axes", *steps)])
+    await asyncio.gather(*outputs._feeding.values())
+    [counts] = outputs.statistics()
+    await outputs.close()
+    assert (counts.dropped, counts.suppressed) == (2, 1)
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_a_new_group_of_the_same_name_is_followed_while_the_one_before_it_has_not_ended() -> None:
+    outputs = Distributor(BUS)
+    outputs.add("all", Settings())
+    outputs.start([Fed("axes", (cycle(1, 1.0), 0))])
+    await outputs.replace({"all": Wanted(Settings(), {})}, [Fed("axes", (cycle(2, 1.0), 0))])
+    await asyncio.gather(*outputs._feeding.values())
+    [output] = listed(outputs).values()
+    assert output.cycles == [1, 2]
+    await outputs.close()
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
 async def test_a_source_that_has_ended_is_followed_again_when_it_is_there_again() -> None:
     outputs = Distributor(BUS)
     outputs.add("all", Settings())

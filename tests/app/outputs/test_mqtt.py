@@ -444,6 +444,7 @@ def test_each_file_is_checked_at_its_own_key(tmp_path: Path) -> None:
     for settings in (
         MqttSettings(password_file=none, tls=True, ca_file=none),
         MqttSettings(password_file=text, tls=True, ca_file=text),
+        MqttSettings(password_file=text, tls=True, ca_file=none),
         MqttSettings(password_file=text, ca_file=none),  # without TLS it is not used
     ):
         found: list[tuple[str, str]] = []
@@ -455,6 +456,7 @@ def test_each_file_is_checked_at_its_own_key(tmp_path: Path) -> None:
             ("ca_file", f"{none} cannot be read: No such file or directory"),
         ],
         [("ca_file", f"{text} holds no certificate in PEM form")],
+        [("ca_file", f"{none} cannot be read: No such file or directory")],
         [],
     ]
 

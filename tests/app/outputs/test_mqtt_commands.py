@@ -407,6 +407,21 @@ async def test_behind_a_closed_interface_nothing_is_carried_out_answered_or_reco
 
 
 @pytest.mark.asyncio
+async def test_commands_that_are_not_permitted_are_answered_before_the_interface_is_closed(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt_forbidden, "REST", 0.02)  # the last of them is read some time after it has arrived
+    monkeypatch.setattr(mqtt, "LAST_ANSWERS", PATIENCE)
+    async with plant(broker) as there:
+        for number in range(10):
+            await there.send(json.dumps({"value": number, "id": number}), "5/2")
+        await asyncio.to_thread(there.output.close_interface)
+        answers = await there.answers(10)
+    assert sorted(answer["id"] for _, answer in answers) == [str(number) for number in range(10)]
+    assert sorted(record.value for record in there.records) == list(range(10))
+
+
+@pytest.mark.asyncio
 async def test_a_stop_passes_while_commands_are_refused(broker: Broker) -> None:
     async with plant(broker) as there:
         for _ in range(300):

@@ -7,6 +7,7 @@ import json
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,25 @@ def test_what_could_not_be_written_at_the_end_is_written_by_the_next_process(tmp
     counts = again.statistics()
     assert (counts.written, counts.dropped, counts.spilled, counts.waiting) == (51, 0, 0, 0)
     assert numbers(tmp_path / "x") == list(range(1, 52))
+
+
+@every
+def test_an_output_that_is_ended_at_once_does_not_write_new_values_before_those_on_disk(
+    tmp_path: Path, make: Make
+) -> None:
+    (tmp_path / "x").mkdir()
+    for number in (1, 2):
+        output = make(tmp_path, lambda _: None)
+        output.offer(cycle(number, number))
+        output.start()
+        output.close(PATIENCE)
+        if number == 1:
+            (tmp_path / "x").rmdir()
+    last = make(tmp_path, lambda _: None)
+    last.start()
+    until(lambda: last.spilled == 0 and (tmp_path / "x").exists() and settled(last))
+    last.close(PATIENCE)
+    assert numbers(tmp_path / "x") == [1, 2]
 
 
 def test_events_and_writes_survive_on_disk_as_they_were(tmp_path: Path) -> None:
@@ -237,6 +257,25 @@ async def test_another_output_of_the_kind_finds_the_spool_of_the_one_before_and_
     assert spooled(tmp_path) == (300 if other_file else 301)
     assert not any("another process" in text for text in told)
     assert sum("300 values stay in" in text for text in told) == other_file
+
+
+@pytest.mark.asyncio
+async def test_values_of_an_earlier_process_are_counted_once_when_the_output_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()  # which keeps the output down
+    earlier = csv(tmp_path, lambda _: None)
+    earlier.start()
+    earlier.offer(cycle(1, 1, 2))
+    earlier.close(PATIENCE)
+    (tmp_path / "x").rmdir()
+    settings = FileSettings(path=str(tmp_path / "x"), spill=str(tmp_path / "spool"))
+    outputs = Distributor(BUS)
+    outputs.add("csv", settings)
+    outputs.start(())
+    await asyncio.to_thread(until, lambda: outputs.statistics()[0].written == 2)
+    await outputs.replace({"csv": Wanted(replace(settings, buffer=7), {})}, ())
+    await outputs.close()
+    [counts] = outputs.statistics()
+    assert (counts.written, counts.dropped, counts.waiting, counts.spilled) == (2, 0, 0, 0)
 
 
 @pytest.mark.asyncio

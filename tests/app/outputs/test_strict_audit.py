@@ -6,6 +6,7 @@ import os
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -109,12 +110,29 @@ def test_a_transaction_with_an_entry_is_synced(tmp_path: Path) -> None:
 
 def test_what_is_dropped_or_left_at_the_end_is_reported_as_that(tmp_path: Path) -> None:
     output = JsonlOutput("jsonl", FileSettings(path=str(tmp_path / "x"), buffer=1, audit="strict"))
-    found: list[str] = []
-    output.offer_entry(entry(1), found.append)  # its thread is not started: nothing is written
-    output.offer_entry(entry(2), found.append)
-    assert found == ["jsonl dropped it, because its queue was full"]
+    found: list[tuple[int, str]] = []
+
+    def note(number: int, why: str) -> None:
+        found.append((number, why))
+
+    for number in (1, 2):  # its thread is not started: nothing is written
+        output.offer_entry(entry(number), partial(note, number))
+    assert found == [(1, "jsonl dropped it, because its queue was full")]
     output.close(0.0)
-    assert found[1:] == ["jsonl ended before it was written"]
+    assert found[1:] == [(2, "jsonl ended before it was written")]
+
+
+def test_each_entry_of_a_batch_is_reported(tmp_path: Path) -> None:
+    output = JsonlOutput("jsonl", FileSettings(path=str(tmp_path / "x"), audit="strict"))
+    found: list[tuple[int, str]] = []
+
+    def note(number: int, why: str) -> None:
+        found.append((number, why))
+
+    for number in (1, 2, 3):  # before its thread is started: they are written at once
+        output.offer_entry(entry(number), partial(note, number))
+    closed_after(output, lambda: None)
+    assert found == [(1, ""), (2, ""), (3, "")]
 
 
 def test_an_entry_that_is_spilled_is_durable_in_the_spool(tmp_path: Path) -> None:
