@@ -10,6 +10,7 @@ from busmaster.app.config.names import expanded
 from busmaster.app.config.point_section import PointSection
 from busmaster.app.config.points import Scale
 from busmaster.app.config.sections import LineFile, NodeSection, decimals_of
+from busmaster.app.config.source import FileError
 from busmaster.emulator import Device, Echo, Line
 from busmaster.ext import guess, make_device
 
@@ -67,6 +68,8 @@ def _hold(device: Device, node: NodeSection, key: str, values: tuple[float, ...]
         try:
             sent = map(_scale(node, point, item).write, values)
             device.preset(f"{named.get(base, base)}{colon}{rest}", *sent)
+        except FileError:
+            raise
         except InvalidCommand as error:
             raise InvalidCommand(f"{error}{'' if name in known else guess(name, known)}") from None
 

@@ -48,6 +48,23 @@ def test_problems_are_a_line_each_and_end_with_1(busmaster: Command, path: Path)
     assert verdict == f"{path}: 2 problems"
 
 
+@pytest.mark.parametrize(
+    ("text", "problems"),
+    [
+        ("title = 'x'\n", ["'port' is missing", "the file has no nodes"]),
+        (GOOD.replace("0.1", "-1").replace('points = ["winder/1"]\n', ""), ["8: groups.axes.period: "]),
+        (f"{GOOD}[service]\nshare = 'x'\n", ["11: service.share: "]),
+    ],
+)
+def test_each_problem_is_reported_once_and_none_that_only_follows_from_another(
+    busmaster: Command, path: Path, text: str, problems: list[str]
+) -> None:
+    path.write_text(text)
+    *lines, _ = busmaster("check", str(path)).lines
+    assert len(lines) == len(problems)
+    assert all(problem in line for problem, line in zip(problems, lines, strict=True))
+
+
 def test_schema_option_prints_the_published_json_schema_and_needs_no_file(busmaster: Command) -> None:
     printed = busmaster("check", "--schema")
     assert (printed.status, printed.err) == (0, "")

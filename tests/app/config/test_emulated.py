@@ -114,11 +114,13 @@ def test_an_emulated_device_may_be_another_than_the_file_says_the_node_is() -> N
 def test_what_is_said_of_a_range_of_nodes_a_table_of_one_goes_before() -> None:
     text = (
         f'{HEAD}[nodes.d4-6]\nprotocol = "mentor"\naddress = "14-16"\n'
-        "[emulator]\nlively = false\n[emulator.nodes.d4-6]\nripple = 0.5\nvalues = { '1.17' = 100, '1.18' = 5 }\n"
+        "[emulator]\nlively = false\n[emulator.nodes.d4-6]\nripple = 0.5\nshort_after_write = true\n"
+        "values = { '1.17' = 100, '1.18' = 5 }\n"
         "[emulator.nodes.d5]\nripple = 0.25\nlively = true\nvalues = { '1.18' = 6 }\n"
     )
     drives = emulated_line(read(Source("line.toml", text))).devices
     assert [drive.ripple for drive in drives if isinstance(drive, EmulatedMentor)] == [0.5, 0.25, 0.5]
+    assert [drive.short_after_write for drive in drives if isinstance(drive, EmulatedMentor)] == [True] * 3
     found = [(drive.value(117, 0.0), drive.value(118, 0.0)) for drive in drives if isinstance(drive, EmulatedMentor)]
     assert found == [(100, 5), (100, 6), (100, 5)]
 
@@ -341,6 +343,15 @@ def test_values_of_every_kind_of_node_can_be_said() -> None:
         (node("modbus", 1, emulated="functions = [3, 43]"), "an emulated unit knows the functions [1, 2, 3,"),
         (node("ct-ansi", 12, emulated="width = 13"), "a value has 12 characters at most, not 13"),
         (node("msc", 1, "address_step = 3"), "line.toml:2: nodes.n: no MSC is unit 1"),
+        (
+            node(
+                "mentor",
+                14,
+                "points.a = { item = '1.17', decimals = 1 }\npoints.b = { item = '1.17:hires' }",
+                "values = { a = 1 }",
+            ),
+            "line.toml:6: nodes.n.points.b: 1.17 has 1 decimals at another point",
+        ),
     ],
 )
 def test_what_an_emulated_device_cannot_be_is_said_with_its_place_and_nearest_name(text: str, complaint: str) -> None:
@@ -348,6 +359,13 @@ def test_what_an_emulated_device_cannot_be_is_said_with_its_place_and_nearest_na
         emulated_line(read(Source("line.toml", text)))
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert str(caught.value).count("line.toml") == 1
+
+
+def test_parameter_0_can_be_read_only_too() -> None:
+    drive = device_of(node("dc104", None, "allow_zero = true", "read_only = [0, 3]"))
+    assert isinstance(drive, EmulatedDc104)
+    assert drive.read_only == {0, 3}
 
 
 def test_pace_and_seed_of_a_command_go_before_those_of_the_file() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from busmaster import Priority, Rfc2217Port, Rs485, SerialPort, TcpPort
+from busmaster.app.bounds import LONGEST_TITLE
 from busmaster.app.config import FileError, LineFile, emulated_line, load
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
@@ -147,8 +148,9 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_warned_about_once() -> Non
 # nodes and points
 
 
-def test_a_range_of_names_takes_a_range_of_addresses() -> None:
-    nodes = parse(f'{HEAD}[nodes.drive4-6]\nprotocol = "microflex"\naddress = "11-13"\n').nodes
+@pytest.mark.parametrize("addresses", ["11-13", " 11-13 "])
+def test_a_range_of_names_takes_a_range_of_addresses(addresses: str) -> None:
+    nodes = parse(f'{HEAD}[nodes.drive4-6]\nprotocol = "microflex"\naddress = "{addresses}"\n').nodes
     assert {name: node.address for name, node in nodes.items()} == {"drive4": 11, "drive5": 12, "drive6": 13}
 
 
@@ -176,6 +178,31 @@ def test_reply_times_could_be_learned_of_a_node_unless_they_are_also_if_it_has_t
     timing: str, could: bool
 ) -> None:
     assert parse(HEAD + NODE + timing).nodes["winder"].could_learn is could
+
+
+@pytest.mark.parametrize("step", ["read", "write", "packet"])
+def test_the_reply_times_of_one_step_do_not_change_those_of_another(step: str) -> None:
+    base = parse(SLOW + PRESS).nodes["press"].profile.timings
+    timings = documented(parse(f"{SLOW}{PRESS}timing = {{ {step} = {{ window = 3.5 }} }}").nodes["press"].timings)
+    assert timings is not None
+    changed = {other for other in ("read", "write", "packet") if getattr(timings, other) != getattr(base, other)}
+    assert changed == {step}
+    assert getattr(timings, step).window == 3.5
+
+
+def test_a_line_has_the_name_of_its_file_unless_the_file_has_a_title() -> None:
+    assert read(Source("/etc/lines/slitter.toml", HEAD + NODE)).title == "slitter.toml"
+    assert read(Source("/etc/lines/slitter.toml", f'title = "Slitter 2"\n{HEAD}{NODE}')).title == "Slitter 2"
+
+
+def test_a_title_has_as_many_characters_as_the_bound() -> None:
+    title = "x" * LONGEST_TITLE
+    assert parse(f'title = "{title}"\n{HEAD}{NODE}').title == title
+
+
+def test_symbols_stand_for_addresses_of_thirty_two_bits() -> None:
+    nodes = parse(f"{SLOW}{PRESS}symbols = {{ first = 0, last = 4294967295 }}\n").nodes
+    assert nodes["press"].options["symbols"] == {"first": 0, "last": 0xFFFF_FFFF}
 
 
 def test_a_time_is_at_most_the_longest_that_the_reference_names() -> None:
@@ -348,6 +375,37 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             "line.toml:4: nodes.a1-3.address: 3 names need 3 addresses",
         ),
         (
+            f'{HEAD}[nodes.a1-2]\nprotocol = "hcp"\naddress = "1-3"',
+            "line.toml:4: nodes.a1-2.address: 2 names need 2 addresses, not 3",
+        ),
+        (
+            f'{HEAD}[nodes.a1-2]\nprotocol = "hcp"\naddress = "1-2"\n[nodes.a2]\nprotocol = "hcp"\naddress = 3',
+            "line.toml:5: nodes.a2: two nodes have the name 'a2'; rename one",
+        ),
+        (
+            f'{HEAD}[nodes."w\\u0031"]\nprotocol = "hcp"\naddress = 1\nretries = -1',
+            "line.toml:5: nodes.w1.retries: must",
+        ),
+        (f"{SLOW}[protocols.msc]\nsymbols = {{ a = 1 }}\n{PRESS}", "line.toml:3: protocols.msc.symbols: no such key"),
+        (
+            f'{HEAD}[protocols.hcp]\ntiming = "learned"\n[nodes.a]\nprotocol = "hcp"\naddress = 1',
+            "line.toml:3: protocols.hcp.timing: hcp: reply windows cannot be learned",
+        ),
+        (
+            f"{HEAD}{NODE}[safe]\nwithin = 0\nwrites = {{ 'winder/1' = 0 }}",
+            "line.toml:6: safe.within: must be more than 0 and at most 60 seconds, not 0",
+        ),
+        (
+            f"{HEAD}{NODE}[safe]\nwrites = {{ 'winder/1' = [0, 1] }}",
+            "line.toml:6: safe.writes.winder/1: must be one value; write the others as points of their own",
+        ),
+        (f"{HEAD}[outputs.csv]\npath = 'x'\naudit = 'strict'", "line.toml:4: outputs.csv.audit: no such key"),
+        (f"{HEAD}[outputs.metrics]\nbuffer = 5", "line.toml:3: outputs.metrics.buffer: no such key"),
+        (
+            f"{HEAD}[outputs.csv]\npath = 'x'\nsync_every = -1",
+            "line.toml:4: outputs.csv.sync_every: must be 0 or more, not -1",
+        ),
+        (
             f'{HEAD}[nodes."a b"]\nprotocol = "hcp"\naddress = 1',
             "line.toml:2: nodes.a b: a node's name can contain letters",
         ),
@@ -435,6 +493,10 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         ),
         (f"{HEAD}{NODE}[emulator.faults]\nlost = 2", "line.toml:6: emulator.faults.lost: fault lost is a probability"),
         (f"{HEAD}[emulator]\nreply_delay = [2, 1]", "line.toml:3: emulator.reply_delay: a reply delay is"),
+        (
+            f"{HEAD}[emulator]\nreply_delay = []",
+            "line.toml:3: emulator.reply_delay: must be a number of seconds, or two",
+        ),
         (f"{HEAD}[emulator]\nreply_delay = 'x'", "line.toml:3: emulator.reply_delay: must be a number of seconds"),
         (
             f"{HEAD}{NODE}[emulator.nodes.widner]",

@@ -204,6 +204,8 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
             "high: is not possible for coil:1, which is a bit and not a quantity; for each of its changes, and these",
         ),
         ("modbus", 'item = "coil:1", deadband = 0.5', "deadband: of a bit must be 0, because every change is reported"),
+        ("microflex", 'item = "status_word", deadband = 2', "deadband: of a word must be 0, because every change"),
+        ("msc", 'item = "flags", deadband = 2', "deadband: of a set must be 0, because every change is reported"),
         ("modbus", 'item = "coil:1", labels = { 2 = "x" }', "labels: coil:1 cannot be 2, because it has 1 bit"),
         ("msc", 'item = "flags", bits = { A = 256 }', "bits: A is bit 256, but the highest bit of flags is 255"),
         ("msc", 'item = "flags", high = 1', "high: is not possible for flags, which is a set and not a quantity"),
@@ -314,6 +316,16 @@ def test_a_name_that_is_no_topic_is_refused_before_a_broker_does(messages: str, 
     text = f'"{point}" = {{ item = "10" }}\n[groups.{group}]\nperiod = 1\npoints = "w/{point}"\n'
     with pytest.raises(FileError, match=complaint):
         ConfiguredLine(file("hcp2", f'{text}[outputs.mqtt]\nmessages = "{messages}"\n'))
+
+
+def test_a_run_of_values_has_precision_deadband_and_heartbeat() -> None:
+    run = parse("msc", 'a = { item = "2008:4", precision = 1, deadband = 2, heartbeat = 60 }').point("w/a")
+    assert run.meaning == Meaning(precision=1, deadband=2, heartbeat=60)
+
+
+def test_a_point_without_a_unit_of_its_own_has_that_of_its_item() -> None:
+    line = parse("mentor", 'a = { item = "speed_reference_1" }\nb = { item = "speed_reference_1", unit = "rpm" }')
+    assert (line.point("w/a").unit, line.point("w/b").unit) == ("%", "rpm")
 
 
 def test_metrics_take_one_flag_of_a_set_and_counts_take_all() -> None:

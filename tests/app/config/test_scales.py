@@ -28,6 +28,7 @@ def test_a_scaled_value_is_the_decimal_that_a_person_would_write() -> None:
     assert Scale.of(0.001).reader()(14.2953) == 0.0142953
     assert Scale.of(0.06).reader()(70.2514) == 4.215084
     assert Scale.of(0.01, -273.15).reader()(27315) == 0.0
+    assert Scale.of(0.1, 0.2).reader()(1) == 0.3
     assert Scale.of(1, -273.15).write(0.0) == 273.15
 
 

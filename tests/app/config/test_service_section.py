@@ -135,6 +135,12 @@ def test_what_is_wrong_in_the_section_is_refused_with_its_place(said: str, compl
         parse(f"{TEXT}[service]\n{said}\n")
 
 
+@pytest.mark.parametrize("mode", ["0606", "0660"])
+def test_a_group_can_have_a_role_if_it_can_open_the_socket(mode: str) -> None:
+    section = parse(f'{TEXT}[service]\nmode = "{mode}"\ngroups.{GROUP}.role = "read"\n').service
+    assert [role.role for role in section.groups.values()] == [Role.READ]
+
+
 def tokens(folder: Path, text: str, mode: int = 0o600, roles: str = "") -> dict[str, bytes]:
     path = folder / "tokens"
     path.write_text(text)
@@ -144,7 +150,7 @@ def tokens(folder: Path, text: str, mode: int = 0o600, roles: str = "") -> dict[
 
 
 def test_a_file_of_tokens_has_a_name_and_a_token_a_line(tmp_path: Path) -> None:
-    found = tokens(tmp_path, f"# of the plant\n\n{HMI}logger\tanother-token-0002\n")
+    found = tokens(tmp_path, f"# of the plant\n\n{HMI}  # of the office\nlogger\tanother-token-0002\n")
     assert found == {"hmi": digest_of("a-token-of-the-hmi-0001"), "logger": digest_of("another-token-0002")}
 
 

@@ -220,6 +220,23 @@ def test_a_value_that_does_not_change_keeps_its_spelling() -> None:
     assert 'a = { item = "10", maximum = 1_000, unit = "mm" }   # ours\n' in back.text
 
 
+def test_values_of_a_point_in_a_section_that_do_not_change_keep_their_spelling() -> None:
+    before = "[nodes.w.points.a]\nitem = '10'\nmaximum = 1_000\nfactor = 0.10\n"
+    assert take(file(before, ""), "node,point,maximum", "w,a,900").text == HEAD + before.replace("1_000", "900")
+
+
+def test_rows_can_come_in_another_order_than_the_points_of_the_file() -> None:
+    before = '[nodes.w.points]\na = { item = "10", maximum = 1 }\nb = { item = "11", maximum = 2 }\n'
+    after = before.replace("= 1 }", "= 3 }").replace("= 2 }", "= 4 }")
+    assert take(file(before, ""), "node,point,maximum", "w,b,4", "w,a,3").text == HEAD + after
+
+
+def test_a_new_point_stands_behind_the_last_of_the_dotted_ones() -> None:
+    before = 'points.a.item = "10"\npoints.b.item = "11"\n'
+    after = before + 'points.c = { item = "12" }\n'
+    assert take(file(before, ""), "node,point,item", "w,a,10", "w,b,11", "w,c,12").text == HEAD + after
+
+
 def test_a_column_or_a_row_that_is_not_there_changes_nothing() -> None:
     back = take(file(INLINE), "point,node,unit", "b,w,mm")
     assert back.stay == ("w/a",)

@@ -54,6 +54,7 @@ def test_a_slow_drift_is_told_since_it_is_measured_from_what_was_told() -> None:
 
 def test_the_heartbeat_tells_what_did_not_change_on_the_grid() -> None:
     assert news(*[5] * 11, period=0.1, heartbeat=0.3) == [5, 5, 5, 5]
+    assert news(*[5] * 20, period=0.1, heartbeat=0.2) == [5] * 10
     assert news(5, 5, 5, 6, 6, 6, 6, period=1, deadband=0, heartbeat=3) == [5, 6, 6]
 
 

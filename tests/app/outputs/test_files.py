@@ -48,6 +48,16 @@ def test_csv_has_a_line_a_value_under_a_head_and_grows(tmp_path: Path) -> None:
     assert before - 1 < moment.timestamp() < time.time() + 1
 
 
+def test_the_time_of_a_value_is_that_of_its_own_reply(tmp_path: Path) -> None:
+    output = CsvOutput("csv", FileSettings(path=str(tmp_path / "x.csv")))
+    found = cycle(1, 1, 2)
+    samples = {point: sample._replace(wall=1e9 + sample.value) for point, sample in found.samples.items()}
+    output.commit([output.format(replace(found, samples=samples)) or b""])
+    output.shut()
+    times = [row["time"] for row in csv.DictReader(written(tmp_path / "x.csv"))]
+    assert times == ["2001-09-09T01:46:41.000Z", "2001-09-09T01:46:42.000Z"]
+
+
 @pytest.mark.parametrize(
     ("path", "field"),
     [
@@ -97,10 +107,12 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
 def test_a_new_file_begins_when_the_date_in_its_name_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     days = iter([1, 2])
     monkeypatch.setattr(time, "strftime", lambda pattern: pattern.replace("%d", str(next(days, 2))))
-    output = CsvOutput("csv", FileSettings(path=str(tmp_path / "x-%d.csv")))
+    reported: list[str] = []
+    output = CsvOutput("csv", FileSettings(path=str(tmp_path / "x-%d.csv")), reported.append)
     for number in (1, 2):
         output.commit([output.format(cycle(number, number)) or b""])
     output.shut()
+    assert reported == []
     assert [len(written(tmp_path / f"x-{day}.csv")) for day in (1, 2)] == [2, 2]
 
 
@@ -177,14 +189,15 @@ def test_a_file_that_was_emptied_begins_with_its_head_again(tmp_path: Path) -> N
     assert written(path) == [",".join(COLUMNS), "second"]
 
 
-def test_a_half_line_that_a_crash_left_is_closed_off_and_that_is_told(tmp_path: Path) -> None:
+@pytest.mark.parametrize("before", ['{"whole": 1}\n{"half', "{"])
+def test_a_half_line_that_a_crash_left_is_closed_off_and_that_is_told(tmp_path: Path, before: str) -> None:
     path = tmp_path / "x.jsonl"
-    path.write_bytes(b'{"whole": 1}\n{"half')
+    path.write_text(before)
     told: list[str] = []
     output = JsonlOutput("jsonl", FileSettings(path=str(path)), report=told.append)
     output.commit([b"{}\n"])
     output.shut()
-    assert written(path) == ['{"whole": 1}', '{"half', "{}"]
+    assert written(path) == [*before.splitlines(), "{}"]
     assert told == [f"jsonl: {path} ended with an incomplete line, which was closed"]
 
 

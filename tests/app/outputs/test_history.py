@@ -113,6 +113,14 @@ def test_a_read_that_takes_too_long_ends_with_a_proposal(tmp_path: Path, monkeyp
         found.read("5/1", "", 0, 1e11, 10)
 
 
+@pytest.mark.parametrize("version", range(1, VERSION + 1))
+def test_a_database_of_each_layout_is_read(tmp_path: Path, version: int) -> None:
+    found = with_samples(tmp_path / "x.db", 1)
+    with closing(sqlite3.connect(tmp_path / "x.db")) as database:
+        database.execute(f"pragma user_version = {version}")
+    assert len(found.read("5/1", "", 0, 1e11, 10).samples) == 1
+
+
 @pytest.mark.parametrize("version", [0, VERSION + 1])
 def test_a_database_of_something_else_is_not_read(tmp_path: Path, version: int) -> None:
     found = with_samples(tmp_path / "x.db", 1)

@@ -51,10 +51,10 @@ pytestmark = pytest.mark.skipif(
 Metrics = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
-def scraped(port: int) -> Metrics:
+def scraped(port: int, host: str = "127.0.0.1") -> Metrics:
     parser = importlib.import_module("prometheus_client.openmetrics.parser")
     request = urllib.request.Request(
-        f"http://127.0.0.1:{port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
+        f"http://{host}:{port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
     )
     with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
         text = answer.read().decode()
@@ -208,6 +208,15 @@ async def served(**options: Any) -> AsyncIterator[MetricsOutput]:
         finally:
             await asyncio.to_thread(output.close, PATIENCE)
     assert not output._thread.is_alive()
+
+
+@pytest.mark.asyncio
+async def test_scrapes_of_another_address_of_this_machine_are_answered_and_counted() -> None:
+    async with served(host="127.0.0.2") as output:
+        for _ in range(2):
+            await asyncio.to_thread(scraped, output.port, "127.0.0.2")
+        counts = output.statistics()
+    assert (counts.what, counts.written, counts.waiting, counts.dropped) == ("answered", 2, 0, 0)
 
 
 @pytest.mark.asyncio

@@ -19,6 +19,7 @@ from busmaster.app.outputs.base import Happening
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.distributor import Distributor, Wanted
 from busmaster.app.outputs.files import CsvOutput, JsonlOutput
+from busmaster.app.outputs.mqtt import MqttOutput
 from busmaster.app.outputs.settings import FileSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.app.outputs.sqlite import SqliteOutput
 from busmaster.errors import InvalidCommand
@@ -257,6 +258,34 @@ async def test_another_output_of_the_kind_finds_the_spool_of_the_one_before_and_
     assert spooled(tmp_path) == (300 if other_file else 301)
     assert not any("another process" in text for text in told)
     assert sum("300 values stay in" in text for text in told) == other_file
+
+
+@pytest.mark.asyncio
+async def test_no_values_are_reported_to_stay_in_a_spool_that_is_empty(tmp_path: Path) -> None:
+    reported: list[str] = []
+    settings = FileSettings(path=str(tmp_path / "x"), spill=str(tmp_path / "spool"))
+    outputs = Distributor(BUS, reported.append)
+    outputs.add("csv", settings)
+    outputs.start(())
+    await outputs.replace({"csv": Wanted(replace(settings, spill=None), {})}, ())
+    await outputs.close()
+    await asyncio.sleep(0)
+    assert reported == []
+
+
+def test_cycles_that_wait_on_disk_are_counted_by_their_values(tmp_path: Path) -> None:
+    pytest.importorskip("aiomqtt", reason="the extra mqtt is not installed")
+    settings = MqttSettings(port=free_port(), messages="cycle", spill=str(tmp_path / "spool"))
+    output = MqttOutput("mqtt", settings, BUS)
+
+    async def start() -> None:
+        output.start()
+
+    asyncio.run(start())
+    output.offer(cycle(1, 1, 2, 3))
+    until(lambda: output.spilled == 3)
+    output.close(PATIENCE)
+    assert spooled(tmp_path) == 3
 
 
 @pytest.mark.asyncio

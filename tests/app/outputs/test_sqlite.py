@@ -111,15 +111,18 @@ def test_a_database_of_0_2_is_continued_with_all_that_it_holds(tmp_path: Path) -
     assert query(path, "select count(*) from history") == [(2,)]
 
 
-def test_a_database_of_a_newer_version_is_left_alone_and_the_error_says_what_to_do(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", [sqlite.VERSION + 1, 99])
+def test_a_database_of_a_newer_version_is_left_alone_and_the_error_says_what_to_do(
+    tmp_path: Path, version: int
+) -> None:
     path = tmp_path / "x.db"
     with closing(sqlite3.connect(path)) as database:
         database.executescript(OF_0_2)
-        database.execute("pragma user_version = 99")
+        database.execute(f"pragma user_version = {version}")
         before = list(database.iterdump())
     with recording(path) as output:
         output.offer(cycle(1, 1.0))
-        until(lambda: "has the layout 99" in output.statistics().error)
+        until(lambda: f"has the layout {version}" in output.statistics().error)
         assert "upgrade if it is of a newer version, or use another path" in output.statistics().error
     with closing(sqlite3.connect(path)) as database:
         assert list(database.iterdump()) == before
@@ -541,13 +544,30 @@ def test_a_database_that_is_closed_leaves_no_file_open(tmp_path: Path) -> None:
     assert len(os.listdir("/proc/self/fd")) == before
 
 
+def named(number: int, label: str) -> Snapshot:
+    """A cycle with one value that has a label."""
+    found, means = cycle(number, 2), Meaning(labels={2: label})
+    return replace(found, samples={of: sample._replace(value=means.named(2)) for of, sample in found.samples.items()})
+
+
+def test_a_new_file_has_the_labels_and_the_times_of_its_values(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with recording(path) as output:
+        for number in (1, 2):
+            found = named(number, "on")
+            samples = {point: sample._replace(wall=5.0 + number) for point, sample in found.samples.items()}
+            output.offer(replace(found, samples=samples))
+            until(lambda: settled(output))
+            if number == 1:
+                for file in tmp_path.glob("x.db*"):
+                    file.unlink()
+    assert query(path, "select time, value, label from history") == [(7.0, 2, "on")]
+
+
 def test_a_label_that_is_changed_is_kept_as_it_was_last(tmp_path: Path) -> None:
     path = tmp_path / "x.db"
     with recording(path) as output:
         for label in ("on", "running"):
-            means = Meaning(labels={2: label})
-            found = cycle(1, 2)
-            samples = {point: sample._replace(value=means.named(2)) for point, sample in found.samples.items()}
-            output.offer(replace(found, samples=samples))
+            output.offer(named(1, label))
             until(lambda: settled(output))
     assert query(path, "select value, label from labels") == [(2, "running")]
