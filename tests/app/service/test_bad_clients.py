@@ -27,13 +27,13 @@ from busmaster.app.service.messages import encode_request
 from busmaster.app.service.outbox import Outbox
 from busmaster.app.service.owner_messages import TouchedParams
 from busmaster.app.service.record import WriteRecord
-from busmaster.app.service.typed import Raw
+from busmaster.app.service.typed import Raw as Encoded
 from busmaster.bus.node import Node
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import make_device
-from tests.app.service.lines import ABSENT, PATIENT, Served, SlowWay, on_a_line, on_a_served_line, raw, until
+from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, SlowWay, on_a_line, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 
 ENORMOUS = 10**310
@@ -83,6 +83,26 @@ def test_the_owner_knows_the_value_before_of_each_place_that_a_program_changes(t
                     await anext(aiter(group))
                     await ModbusUnit(remote, 5).write(item, *values)
             assert [record.before for record in records] == [12, (11, 1)]
+
+    asyncio.run(run())
+
+
+def test_a_block_write_is_not_on_record_as_a_write_to_the_point_of_one_of_its_places(tmp_path: Path) -> None:
+    async def run() -> None:
+        line = Line(ModbusUnit.profile.line, [make_device("modbus", 5)], paced=False)
+        async with asyncio.timeout(PATIENCE), Bus(MemoryPort(line)) as bus:
+            authorisation, records, unit = Authorisation(bus), list[WriteRecord](), ModbusUnit(bus, 5)
+            authorisation.record = records.append
+            bus.poll_group("all", period=60.0, points=[unit.point("holding:10"), unit.point("holding:12")])
+            path = tmp_path / "line.sock"
+            async with (
+                Service(bus, authorisation=authorisation, path=path) as service,
+                connect(service.address) as remote,
+            ):
+                await ModbusUnit(remote, 5).write("holding:10", 2)
+                await ModbusUnit(remote, 5).write("holding:10", 2, 3)
+                await ModbusUnit(remote, 5).write("holding:11", 4, 5)
+            assert [record.point for record in records] == ["5/holding:10", "5/raw command", "5/raw command"]
 
     asyncio.run(run())
 
@@ -328,6 +348,19 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     assert way.sent[-2:] == [b"an answer", b"stops 2"]
     assert len(way.sent) == bounds.MOST_UNREAD + 3
     assert dropped == [7, 7]
+
+
+def test_messages_of_streams_count_towards_the_unsent_messages_of_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.outbox.MOST_WAITING", 4)
+    way = SlowWay()
+    outbox = Outbox(way, lambda _: None)
+    way.full = True
+    outbox.put_droppable(7, b"a cycle")
+    outbox.put_latest("stops", b"stops 1")
+    outbox.put(b"a reply")
+    assert not outbox.crowded
+    outbox.put_droppable(7, b"a cycle")
+    assert outbox.crowded
 
 
 def test_a_program_that_does_not_read_its_answers_is_not_read_either(
@@ -589,12 +622,40 @@ def test_a_program_learns_how_many_messages_of_a_stream_it_was_too_slow_for(tmp_
             connection = line.service._clients[visitor].websocket
             connection.full = True
             for _ in range(bounds.MOST_UNREAD + 3):
-                visitor.notify(7, "exchanges", Raw(b'{"now": 0, "left_out": 0, "exchanges": []}'))
+                visitor.notify(7, "exchanges", Encoded(b'{"now": 0, "left_out": 0, "exchanges": []}'))
             assert visitor.dropped == {7: 3}
             connection.full = False
             line.service._clients[visitor].writable()
             heard = [await client.hear() for _ in range(bounds.MOST_UNREAD)]
             assert {message["params"]["stream"] for message in heard} == {7}
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_stream_that_begins_again_under_its_number_counts_its_dropped_messages_from_0(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        line.bus.poll_group("axes", period=60.0, points=[Hcp2Controller(line.bus, 5).point("1")])
+
+        async def dropped(client: Raw) -> list[int]:
+            await client.say(id=1, method="subscribe", params={"group": "axes", "stream": 7})
+            counts: list[int] = []
+            while "result" not in (message := await client.hear()):
+                if message["method"] == "points":
+                    counts.append(message["params"]["dropped"])
+            return counts
+
+        async with raw(line) as client:
+            assert await dropped(client) == [0]
+            [program] = line.service.clients
+            connection = line.service._clients[program]
+            connection.websocket.full = True
+            for _ in range(bounds.MOST_UNREAD + 3):
+                program.notify(7, "exchanges", Encoded(b'{"now": 0, "left_out": 0, "exchanges": []}'))
+            assert program.dropped[7]
+            connection.websocket.full = False
+            connection.writable()
+            await client.say(method="end", params={"stream": 7})
+            assert await dropped(client) == [0]
 
     on_a_line(tmp_path, story)
 
@@ -616,12 +677,12 @@ def test_messages_that_wait_replace_only_earlier_ones_of_the_same_subject(
             connection = line.service._clients[program]
             connection.websocket.full = True
             for _ in range(most + 3):
-                program.notify(7, "exchanges", Raw(b'{"now": 0, "left_out": 0, "exchanges": []}'))
+                program.notify(7, "exchanges", Encoded(b'{"now": 0, "left_out": 0, "exchanges": []}'))
             for set_ in (1, 2):
-                program.notify_surely(7, "rows", Raw(b'{"set": %d, "first": 0, "rows": []}' % set_), 0)
-                program.notify_surely(7, "rows", Raw(b'{"set": %d, "first": 50, "rows": []}' % set_), 1)
-                program.notify_surely(7, "values", Raw(b'{"set": %d, "first": 0, "values": []}' % set_), 0)
-                program.notify_surely(8, "rows", Raw(b'{"set": %d, "first": 0, "rows": []}' % set_), 0)
+                program.notify_surely(7, "rows", Encoded(b'{"set": %d, "first": 0, "rows": []}' % set_), 0)
+                program.notify_surely(7, "rows", Encoded(b'{"set": %d, "first": 50, "rows": []}' % set_), 1)
+                program.notify_surely(7, "values", Encoded(b'{"set": %d, "first": 0, "values": []}' % set_), 0)
+                program.notify_surely(8, "rows", Encoded(b'{"set": %d, "first": 0, "rows": []}' % set_), 0)
                 for address in (5, 6):
                     program.notify_touched(TouchedParams("hcp2", address, float(set_), True, None), address)
                 for node in nodes:

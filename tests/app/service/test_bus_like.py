@@ -124,6 +124,8 @@ def test_the_groups_of_the_owner_are_known_when_a_program_comes_and_when_they_ch
             fast.close()
             assert [snapshot async for snapshot in theirs][16:] == []
             assert theirs.over
+            # the number of the stream is free again at the owner
+            await until(lambda: len(line.service.clients[0]._streams) == 0)
 
     on_a_line(tmp_path, story)
 

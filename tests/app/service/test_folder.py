@@ -164,6 +164,12 @@ def test_a_line_is_found_by_its_name_before_one_that_has_this_port(folder: Path)
 def test_the_socket_of_an_unknown_line_is_not_found(folder: Path) -> None:
     with pytest.raises(LineDown, match=r"no running line named 'slitter' \(running: none\)"):
         socket_path("slitter")
+    with (
+        served(folder / "a.sock", "/dev/ttyUSB0", "press"),
+        served(folder / "b.sock", "/dev/ttyUSB1", "winder"),
+        pytest.raises(LineDown, match=r"no running line named 'slitter' \(running: press, winder\)"),
+    ):
+        socket_path("slitter")
     assert socket_path("unix:///run/a.sock") == socket_path("unix:/run/a.sock") == "/run/a.sock"
 
 

@@ -523,6 +523,33 @@ def test_a_program_names_so_many_nodes_and_known_ones_again(tmp_path: Path, monk
     on_a_line(tmp_path, story)
 
 
+def test_a_program_that_names_a_node_again_keeps_its_count_of_stops(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            naming: dict[str, Any] = {"protocol": "hcp2", "address": 5, "retries": 2}
+            assert "result" in await client.ask("node", **naming)
+            assert (await client.ask("request", **write(1.0), stops_seen=0))["result"] is None
+            Node.of(Hcp2Controller(line.bus, 5)).note_stop()
+            assert (await client.hear())["params"]["stops"] == 1
+            assert "result" in await client.ask("node", **naming)
+            assert error_of(await client.ask("request", **write(2.0), stops_seen=0)) == "Superseded"
+            assert (await client.ask("request", **write(3.0), stops_seen=1))["result"] is None
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_node_that_its_program_names_twice_leaves_the_line_with_it(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for _ in range(2):
+                assert "result" in await client.ask("node", protocol="hcp2", address=5, retries=2)
+            assert [node.address for node in line.bus.nodes] == [5]
+        await line.alone()
+        assert line.bus.nodes == ()
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_sequence_that_has_begun_is_not_begun_again_under_its_number(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line) as client:

@@ -16,6 +16,7 @@ from websockets.asyncio.client import connect as connect_websocket
 
 from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect, ext
 from busmaster.app import bounds
+from busmaster.app.service import service as service_module
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.picture import Picture
@@ -80,6 +81,40 @@ def test_it_reports_the_line_and_what_was_refused_to_each_program(tmp_path: Path
         await until(lambda: len(line.service.clients) == 1)
 
     on_a_served_line(tmp_path, story)
+
+
+def test_a_connection_without_a_first_message_is_not_counted_as_a_program(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        _, stranger = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
+        await until(lambda: line.service.strangers)
+        async with connect(line.address) as remote:
+            assert remote.about["clients"] == 1
+        stranger.close()
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_that_does_not_read_gets_the_last_list_of_groups_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service_module, "GROUPS_EVERY", 0.0)
+
+    async def story(line: Served) -> None:
+        point = Hcp2Controller(line.bus, 5).point("1")
+        async with raw(line) as client:
+            [program] = line.service.clients
+            connection = line.service._clients[program]
+            connection.websocket.full = True
+            for number in range(3):
+                line.bus.poll_group(f"group {number}", period=60.0, points=[point])
+                await until(lambda: line.service._groups_timer is None)
+            assert program.outbox.waiting == 1
+            connection.websocket.full = False
+            connection.writable()
+            listed = (await client.hear())["params"]["groups"]
+            assert [group["name"] for group in listed] == ["group 0", "group 1", "group 2"]
+
+    on_a_line(tmp_path, story)
 
 
 def test_every_program_is_informed_of_stops_writes_groups_and_its_permission(tmp_path: Path) -> None:
