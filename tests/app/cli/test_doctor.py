@@ -143,6 +143,13 @@ def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
     assert str(find(protocol).profile.probe) in findings.on(label).what
 
 
+def test_a_node_that_refuses_the_read_is_in_order_and_the_reason_is_named() -> None:
+    findings = examined(line_of("modbus", [make_device("modbus", 4, size=0)]), (4,), "modbus")
+    finding = findings.on(find("modbus").profile.label(4))
+    assert finding.ok
+    assert finding.what.endswith("; the device does not have this item")
+
+
 def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_fix() -> None:
     line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
     findings = examined(line, (3,), "msc")
@@ -305,7 +312,7 @@ def test_the_reply_window_of_the_options_is_that_of_the_requests() -> None:
     patient = Patient(MemoryPort(line), "hcp2", timings, addresses=(5,), named=True)
     run_in_virtual_time(examine(patient, findings.append))
     assert findings.on("node 5").ok
-    assert findings.on("windows").what.endswith("set are 150 / 300 / 450 ms (late_after / window / max_reply_delay)")
+    assert findings.on("windows").what.endswith("set are 50 / 300 / 300 ms (late_after / window / max_reply_delay)")
 
 
 def test_where_all_nodes_are_garbled_the_line_is_suspected() -> None:
