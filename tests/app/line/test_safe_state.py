@@ -167,6 +167,18 @@ def test_a_line_that_is_left_takes_no_other_write_and_one_that_is_not_left_does(
     on_a_line(story, "winder/speed")
 
 
+@pytest.mark.parametrize(
+    ("allowed", "may_send"), [("*/speed", False), ("winder/speed,force", True), ("winder/force", False)]
+)
+def test_a_client_may_send_the_safe_state_if_it_may_write_each_of_its_points(allowed: str, may_send: bool) -> None:
+    points = '"winder/speed", "winder/force"'
+    safe = f'[safe]\nrepeatable = [{points}]\nwrites = {{ "winder/speed" = 0, "winder/force" = 0 }}\n'
+    user = f'[service.users.root]\nrole = "write"\nallow_writes = "{allowed}"\n'
+    line = ConfiguredLine(read(Source("line.toml", TEXT + safe + user)), outputs=False)
+    refusal = line.safe_state.refusal(line.authorisation.access.users[0])
+    assert (refusal == "") is may_send, refusal
+
+
 LIMITED = """
 port = "/dev/ttyUSB0?baudrate=57600"
 [nodes.winder]
@@ -203,3 +215,10 @@ def test_a_safe_value_beyond_the_limits_of_its_point_is_rejected_when_the_file_i
         ConfiguredLine(file, outputs=False)
     assert str(rejected.value).startswith("line.toml:9: ")
     assert problem in str(rejected.value)
+
+
+@pytest.mark.parametrize("value", ["0", "20"])
+def test_a_safe_value_whose_write_may_not_be_repeated_is_rejected_also_for_a_stop(value: str) -> None:
+    text = LIMITED.replace('repeatable = ["winder/POINT"]\n', "").replace("POINT", "force").replace("VALUE", value)
+    with pytest.raises(FileError, match=r'is not repeatable by its protocol; .* add repeatable = \["winder/force"\]'):
+        ConfiguredLine(read(Source("line.toml", text)), outputs=False)
