@@ -53,7 +53,7 @@ def test_problems_are_a_line_each_and_end_with_1(busmaster: Command, path: Path)
     [
         ("title = 'x'\n", ["'port' is missing", "the file has no nodes"]),
         (GOOD.replace("0.1", "-1").replace('points = ["winder/1"]\n', ""), ["8: groups.axes.period: "]),
-        (f"{GOOD}[service]\nshare = 'x'\n", ["11: service.share: "]),
+        (f"{GOOD}[service]\nshare = 'x'\n[emulator]\nseed = 'x'\n", ["11: service.share: ", "13: emulator.seed: "]),
     ],
 )
 def test_each_problem_is_reported_once_and_none_that_only_follows_from_another(

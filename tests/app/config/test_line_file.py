@@ -190,6 +190,14 @@ def test_the_reply_times_of_one_step_do_not_change_those_of_another(step: str) -
     assert getattr(timings, step).window == 3.5
 
 
+def test_a_node_keeps_the_reply_times_of_writes_that_its_protocol_has_in_the_file() -> None:
+    common = "[protocols.hcp2]\ntiming = { write = { window = 0.3 } }\n"
+    timings = documented(parse(f"{HEAD}{common}{NODE}timing = {{ late_after = 0.01 }}\n").nodes["winder"].timings)
+    assert timings is not None
+    assert (timings.read.window < timings.write.window, timings.write.window) == (True, 0.3)
+    assert (timings.read.late_after, timings.write.late_after) == (0.01, 0.01)
+
+
 def test_a_line_has_the_name_of_its_file_unless_the_file_has_a_title() -> None:
     assert read(Source("/etc/lines/slitter.toml", HEAD + NODE)).title == "slitter.toml"
     assert read(Source("/etc/lines/slitter.toml", f'title = "Slitter 2"\n{HEAD}{NODE}')).title == "Slitter 2"

@@ -223,6 +223,31 @@ async def test_a_broker_that_is_down_for_a_while_costs_nothing(broker: Broker) -
 
 
 @pytest.mark.asyncio
+async def test_a_broker_that_has_lost_its_messages_gets_the_state_of_the_line_its_nodes_and_alarms_again(
+    broker: Broker,
+) -> None:
+    async with emulated(Hcp2Controller, 5) as bus:
+        point = replace(Hcp2Controller(bus, 5).point("1"), meaning=Meaning(high=1000))
+        async for _ in bus.poll_group("axes", period=0.02, points=[point]):
+            break
+        async with publishing(broker, bus) as output:
+            output.offer(cycle(1, 1.0))
+            await settled(output)
+            await asyncio.to_thread(broker.stop)
+            broker.forget()
+            broker.start()
+            output.offer(cycle(2, 1.0))
+            await settled(output)
+            async with listening(broker, "line/line", "line/health/#", "line/alarms/#") as client:
+                found = await heard(client, 3)
+    assert {(topic, retained) for topic, _, retained in found} == {
+        ("line/line", True),
+        ("line/health/5", True),
+        ("line/alarms/5/1", True),
+    }
+
+
+@pytest.mark.asyncio
 async def test_without_a_broker_the_oldest_are_dropped_and_counted() -> None:
     output = MqttOutput("mqtt", MqttSettings(port=free_port(), buffer=10), BUS)
     output.start()

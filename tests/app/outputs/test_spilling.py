@@ -198,6 +198,7 @@ def test_a_spool_with_older_values_in_it_that_another_process_holds_keeps_the_ou
     output.offer(cycle(1, 1))
     output.start()
     until(lambda: bool(said))
+    assert said[0].startswith("csv is down: ")
     assert "does another process use it?" in said[0]
     assert output.written == 0
     other.close()
