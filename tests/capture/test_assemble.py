@@ -15,6 +15,7 @@ from busmaster.contract.frames import Direction
 from busmaster.contract.profile import Profile
 from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.ct_ansi import codec as ct_ansi
+from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
@@ -371,6 +372,24 @@ def test_a_line_that_is_only_listened_to_is_recorded_the_same() -> None:
         untold.overheard(now + 0.01, reply[1:])
     assert [line[1:3] for line in untold.lines()] == [line[1:3] for line in told.lines()]
     assert {packet.transaction for packet in untold.packets} == {0}
+
+
+def test_a_damaged_request_on_a_line_that_is_only_listened_to_has_its_fault_as_a_comment() -> None:
+    tape = Tape("hcp2")
+    tape.overheard(1.0, READ[:-1] + b"\x07")
+    tape.overheard(1.01, NAK)
+    assert [line[2:] for line in tape.lines()] == [(NONE, "bad checksum 07, not 04"), (REFUSED, "")]
+
+
+def test_a_protocol_without_addresses_has_no_node_in_its_packets() -> None:
+    tape = Tape()
+    tape.asked(1.0, dc104.PROFILE, dc104.Read(1), dc104.PROFILE.addresses[0])
+    tape.heard(1.01, bytes.fromhex("02 01 04 D2 D7"))
+    tape.over(1.02, Verdict.OK, 1234)
+    tape.asked(2.0, dc104.PROFILE, dc104.Read(1), dc104.PROFILE.addresses[0])
+    tape.over(2.1, Verdict.NO_REPLY, "no reply")
+    assert [line[2] for line in tape.lines()] == [NONE, OK, NONE, NO_REPLY]
+    assert {packet.node for packet in tape.packets} == {None}
 
 
 def test_an_echo_that_never_came_does_not_use_up_the_next_one() -> None:

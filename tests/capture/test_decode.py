@@ -347,6 +347,21 @@ def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply(
     assert reply.delay == pytest.approx(0.02)
 
 
+def test_the_delay_of_a_later_step_is_from_the_end_of_the_step_before() -> None:
+    decoder = Decoder(find("msc").protocol.dialect())
+    frames_of = {name: raw for protocol, name, raw in vectors() if protocol == "msc"}
+    request, packet = frames_of["DREAD unit 1 addr 2008"], frames_of["DREAD reply 1234"]
+    frames = decoder.feed(request, 1.0) + decoder.feed(b"\x06", 1.01) + decoder.feed(packet, 1.03)
+    assert [frame.delay for frame in frames] == [None, pytest.approx(0.01), pytest.approx(0.02)]
+
+
+def test_a_frame_that_is_cut_short_has_the_time_of_its_first_byte() -> None:
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    assert decoder.feed(bytes.fromhex("07 30"), 1.0) + decoder.feed(bytes.fromhex("32"), 1.01) == []
+    (cut,) = decoder.quiet()
+    assert (cut.time, cut.ended) == (1.0, 1.01)
+
+
 def test_a_silence_of_the_gap_continues_a_frame_and_a_longer_one_ends_it() -> None:
     def pieces(pause: float) -> list[str]:
         decoder = Decoder(find("hcp2").protocol.dialect(), gap=0.5)
