@@ -133,6 +133,23 @@ async def test_the_last_values_are_retained_and_a_cycle_may_be_one_message(broke
         [(topic, payload, retained)] = await heard(client, 1)
     assert (topic, retained, payload["cycle"]) == ("line/cycles/axes", True, 2)
     assert payload["samples"]["5/2"]["value"] == 4
+    assert abs(payload["due"] - BUS.wall_time()) < 600
+
+
+@pytest.mark.asyncio
+async def test_a_value_that_a_write_made_stale_is_published_if_its_group_is(broker: Broker) -> None:
+    async with emulated(Hcp2Controller, 5) as bus, listening(broker, "line/values/#") as client:
+        controller = Hcp2Controller(bus, 5)
+        for name, item in (("other", "2"), ("axes", "1")):
+            group = bus.poll_group(name, period=0.02, points=[controller.point(item)])
+            async for _ in group:
+                break
+            group.pause()
+        async with publishing(broker, bus, groups=("axes",)):
+            await controller.write(2, 5.0)
+            await controller.write(1, 5.0)
+            [(topic, payload, _)] = await heard(client, 1)
+    assert (topic, payload["quality"]) == ("line/values/5/1", "stale")
 
 
 @pytest.mark.asyncio

@@ -86,7 +86,8 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
     controller = Hcp2Controller(bus, 5)
     controller.element(1).limit(maximum=500)
     settings = MqttSettings(port=broker.port, prefix="line")
-    output = MqttOutput("mqtt", settings, bus, commands={"5/1": controller.point("1")}, authorisation=interface)
+    commands = {"5/1": controller.point("1"), "5/a+b": controller.point("3")}
+    output = MqttOutput("mqtt", settings, bus, commands=commands, authorisation=interface)
     async with bus, aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
         await client.subscribe("line/status", qos=1)
         output.start()
@@ -232,6 +233,22 @@ async def test_a_command_to_what_the_file_does_not_allow_is_told_with_its_value_
         assert answer["id"] == "a7"
         await there.ask("on", "5/2")
     assert [(record.value, record.id) for record in there.records] == [(80, "a7"), ("'on'", "")]
+
+
+@pytest.mark.asyncio
+async def test_a_command_to_a_name_that_no_topic_can_have_has_its_characters_replaced(broker: Broker) -> None:
+    async with plant(broker) as there:
+        await there.send("7", "5/a%2Bb")
+        assert await there.answers() == [("line/result/5/a%2Bb", {"ok": True})]
+        assert await there.controller.read(3) == 7
+
+
+@pytest.mark.asyncio
+async def test_a_command_whose_name_is_too_long_for_a_reply_is_answered_without_it(broker: Broker) -> None:
+    async with plant(broker) as there:
+        await there.send("7", "x" * 1000)
+        [(topic, answer)] = await there.answers()
+    assert (topic, answer["ok"]) == ("line/result", False)
 
 
 @pytest.mark.asyncio
