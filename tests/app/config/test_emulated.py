@@ -362,6 +362,11 @@ def test_what_an_emulated_device_cannot_be_is_said_with_its_place_and_nearest_na
     assert str(caught.value).count("line.toml") == 1
 
 
+@pytest.mark.parametrize("ripple", [0, 1])
+def test_a_number_can_be_each_end_of_its_range(ripple: float) -> None:
+    assert device_of(node("mentor", 14, emulated=f"ripple = {ripple}")).ripple == ripple
+
+
 def test_parameter_0_can_be_read_only_too() -> None:
     drive = device_of(node("dc104", None, "allow_zero = true", "read_only = [0, 3]"))
     assert isinstance(drive, EmulatedDc104)

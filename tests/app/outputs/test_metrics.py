@@ -33,6 +33,7 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.health import Health
 from busmaster.bus.bus import Bus
 from busmaster.bus.meaning import Meaning
+from busmaster.bus.node import Node
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.errors import LineDown, NoReply
@@ -99,6 +100,11 @@ async def count_and_scrape() -> None:
         line, achieved = ext.line_statistics(bus), group.statistics().achieved
         await asyncio.to_thread(output.close, PATIENCE)
     assert of(metrics, "node_attempts_total", node="node 5") == 3
+    for name in ("attempts", "late", "overdue", "retries", "unheard", "failed", "probes"):
+        assert of(metrics, f"node_{name}_total", node="node 6") == getattr(Node.of(absent).statistics(), name)
+    names = "exchanges cancelled unexpected_bytes tainted collisions sync_reads ambiguous resyncs noisy losses"
+    for name in (*names.split(), "damaged", "breaks"):
+        assert of(metrics, f"line_{name}_total") == getattr(line, name)
     assert of(metrics, "node_exchanges_total", node="node 5", outcome="ok") == 3
     assert of(metrics, "node_exchanges_total", node="node 6", outcome="no_reply") == 1
     assert of(metrics, "node_latency_seconds_count", node="node 5") == 3
