@@ -419,6 +419,29 @@ def test_a_program_pauses_a_group_only_if_it_may_write_to_each_of_its_nodes(tmp_
     on_a_line(tmp_path, story)
 
 
+def test_a_program_holds_the_line_and_suspends_only_for_a_node_to_which_it_may_write(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        for address in (5, 6):
+            Hcp2Controller(line.bus, address)
+        some = Hcp2Controller(line.bus, 6).point("1").command.places  # type: ignore[attr-defined]  # of a read of hcp2
+        line.authorisation.access = Access(
+            users={os.getuid(): Permission("user me", Role.WRITE, {("hcp2", 6): frozenset(some)})}
+        )
+        async with raw(line) as client:
+            for sequence, address in enumerate((5, 6)):
+                hold = {"sequence": sequence, "protocol": "hcp2", "address": address, "max_hold": 1.0}
+                await client.say(method="hold", params=hold)
+            refused = await client.ask("request", **READ, sequence=0)
+            assert "node 5: user me may not hold the line" in refused["error"]["message"]
+            assert (await client.ask("request", **{**READ, "address": 6}, sequence=1))["result"] == 0
+            await client.say(method="release", params={"sequence": 1})
+            refused = await client.ask("suspend", protocol="hcp2", address=5, **{"for": 60.0})
+            assert "user me may not pause or suspend this" in refused["error"]["message"]
+            assert (await client.ask("suspend", protocol="hcp2", address=6, **{"for": 60.0}))["result"] is None
+
+    on_a_line(tmp_path, story)
+
+
 # limits of one program
 
 
