@@ -476,7 +476,7 @@ def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: p
         busy = [await connect() for _ in range(2)]
         for _, writer in busy:
             writer.write(frame(READ))
-        while echo.counts[1] < 2:  # noqa: ASYNC110
+        while echo.counts[1] < 2:  # noqa: ASYNC110  nothing reports it
             await asyncio.sleep(0.001)
         beyond, _ = await connect()
         assert await is_closed(beyond)
@@ -584,7 +584,7 @@ def test_replaced_connections_no_longer_count_when_their_requests_are_over(monke
         many = [await connect("127.0.0.1") for _ in range(2)]
         for _, writer in many:
             writer.write(frame(READ, unit=1))
-        while echo.counts[1] < 2:  # noqa: ASYNC110
+        while echo.counts[1] < 2:  # noqa: ASYNC110  nothing reports it
             await asyncio.sleep(0.001)
         reader, writer = await connect("127.0.0.2")  # replaces one of 127.0.0.1
         writer.write(frame(READ, unit=2))
