@@ -7,8 +7,8 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from busmaster import BusError, NoReply
-from busmaster.app.service.failures import DEEPEST, encode_error, error_of, refusal_of
+from busmaster import BusError, NoReply, errors
+from busmaster.app.service.failures import DEEPEST, KNOWN, encode_error, error_of, refusal_of
 from busmaster.app.service.fields import shortened
 from busmaster.app.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS, NO_METHOD, InvalidParams, Malformed
 from busmaster.app.service.owner_messages import ErrorForm
@@ -120,3 +120,9 @@ def test_shorter_options_are_a_copy() -> None:
     given: CommandOptions = {"start_within": 0.0, "finish_within": 1.0}
     assert shortened(given, 2.0) == {"start_within": 0.0, "finish_within": 0.0}
     assert given == {"start_within": 0.0, "finish_within": 1.0}
+
+
+def test_each_error_of_the_library_keeps_its_class_on_the_way_to_a_client() -> None:
+    classes = {name for name in errors.__all__ if name not in ("Addressed", "InvalidCommand")}
+    assert set(KNOWN) == classes
+    assert all(KNOWN[name] is getattr(errors, name) for name in classes)
