@@ -10,7 +10,7 @@ from typing import Any
 
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
-from busmaster.transport.clock import clock_of
+from busmaster.transport.clock import clock_of, is_virtual
 from busmaster.transport.identity import Identity
 
 
@@ -61,12 +61,13 @@ class MemoryPort:
 
 
 class MemoryTransport(asyncio.Transport):
-    """Sends to the line immediately, and passes the line's bytes to the protocol when they are due."""
+    """Sends to the line, and passes the line's bytes to the protocol when they are due."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, line: Line) -> None:
         super().__init__()
         self._loop = loop
         self._clock = clock_of(loop)
+        self._real_time = not is_virtual(loop)
         self._protocol = protocol
         self._line = line
         self._closing = False
@@ -83,15 +84,18 @@ class MemoryTransport(asyncio.Transport):
         return self._line if name == "line" else default
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Pass `data` to the line immediately, unless writes are held. The line sends it byte by byte."""
+        """Pass `data` to the line, unless writes are held. The line sends it byte by byte."""
         if self._closing:
             return
-        if self._held is None:
-            self._line.send(bytes(data), self._clock())
-            self._arm(self._line.next_event())
-            return
-        self._held += bytes(data)
-        self._protocol.pause_writing()
+        if self._held is not None:
+            self._held += bytes(data)
+            self._protocol.pause_writing()
+        elif self._real_time:
+            # Not before the sender has read its clock: if the process stands still in between, a reply could come
+            # earlier than the sender believes its request to have left.
+            self._loop.call_soon(self._send, bytes(data))
+        else:
+            self._send(bytes(data))
 
     def get_write_buffer_size(self) -> int:
         """Return the number of held bytes."""
@@ -130,6 +134,10 @@ class MemoryTransport(asyncio.Transport):
         if self._timer is not None:
             self._timer.cancel()
         self._loop.call_soon(self._protocol.connection_lost, cause)
+
+    def _send(self, data: bytes) -> None:
+        self._line.send(data, self._clock())
+        self._arm(self._line.next_event())
 
     def _arm(self, due: float) -> None:
         """Set the one timer, which is left alone if it comes sooner."""

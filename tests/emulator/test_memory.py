@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 
 import pytest
 
@@ -65,6 +66,28 @@ def test_in_virtual_time_a_reply_comes_exactly_when_its_last_byte_has_left() -> 
         assert recorder.losses == [None]
 
     run_in_virtual_time(ask())
+
+
+def test_in_real_time_no_reply_comes_before_the_sender_has_read_its_clock_and_its_request_has_left() -> None:
+    class Timed(Recorder):
+        first = 0.0
+
+        def data_received(self, data: bytes) -> None:
+            self.first = self.first or time.monotonic()
+            super().data_received(data)
+
+    async def ask() -> None:
+        recorder = Timed()
+        transport = await MemoryPort(line()).open(lambda: recorder)
+        transport.write(b"ping\x05")
+        time.sleep(0.03)  # noqa: ASYNC251  as if the process stood still for longer than the exchange takes
+        written = time.monotonic()
+        await recorder.heard(b"pong")
+        assert recorder.first - written > 5 * TAU
+        transport.close()
+        await recorder.lost()
+
+    asyncio.run(ask())
 
 
 def test_a_long_reply_comes_in_pieces_with_no_gap_that_would_end_it() -> None:
