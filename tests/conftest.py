@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
+import importlib
 import os
 import shutil
 import signal
 import tempfile
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -41,6 +44,12 @@ for number, handler in (
         signal.signal(number, handler)
 
 
+SLOW = "slow and not exhaustive"
+NOT_BY_DEFAULT = ("slow", "exhaustive")
+MAKES_SLOW_CASES = "_by_default("
+"""Tests use functions of tests/tiers.py with such names."""
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return how many workers `-n auto` starts: two for each core, because many tests wait for processes."""
@@ -51,11 +60,54 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_configure(config: pytest.Config) -> None:
     """Leave the slow tests out where neither `-m` nor a path selects tests; CONTRIBUTING.md describes the tiers.
 
-    A path selects what is below it, but for the exhaustive tests, and the name of a test selects that test.
+    A path selects what is below it, but for the exhaustive tests, and the name of a test selects that test. A slow test
+    can have exhaustive cases.
     """
+    if config.option.markexpr == "slow":
+        config.option.markexpr = SLOW
     if config.option.markexpr:
         return
     if config.args_source is not pytest.Config.ArgsSource.ARGS:
         config.option.markexpr = "not slow and not exhaustive"
     elif not any("::" in argument for argument in config.args):
         config.option.markexpr = "not exhaustive"
+
+
+def has_tier(path: Path, tier: str) -> bool:
+    """Return True if the file can have tests of this tier: it names the tier, or has `tests/tiers.py` mark them."""
+    text = path.read_text()
+    return tier in text or MAKES_SLOW_CASES in text
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out the files without a test of the one tier that is run: of 365 files, two thirds have no slow test."""
+    tier = "slow" if config.option.markexpr == SLOW else config.option.markexpr
+    if tier in NOT_BY_DEFAULT and collection_path.match("test_*.py") and not has_tier(collection_path, tier):
+        return True
+    return None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse a test whose tier its file does not name: `-m slow` would leave it out."""
+    files = {(item.path, mark.name) for item in items for mark in item.iter_markers() if mark.name in NOT_BY_DEFAULT}
+    if wrong := sorted(f"{path}: {tier}" for path, tier in files if not has_tier(path, tier)):
+        raise pytest.UsageError(f"the tier of a test is not named in its file: {', '.join(wrong)}")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Have each worker import another part of the test files first.
+
+    Each worker imports all of them. In a new clone, all would compile the same file at the same time, which is a third
+    of the processor time of the default tier.
+    """
+    worker = getattr(session.config, "workerinput", None)
+    if worker is None or session.config.args_source is pytest.Config.ArgsSource.ARGS:
+        return
+    files = sorted(path for path in Path(__file__).parent.rglob("test_*.py"))
+    files = [path for path in files if not pytest_ignore_collect(path, session.config)]
+    first = len(files) * int(worker["workerid"].removeprefix("gw")) // worker["workercount"]
+    for path in files[first:] + files[:first]:
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # reported when the file is collected
+            importlib.import_module(".".join(path.relative_to(session.config.rootpath).with_suffix("").parts))

@@ -6,7 +6,8 @@ A package that is drawn apart so that it can be read apart is so for its types t
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -144,10 +145,10 @@ SEEDED = {"emulator": {"random"}}
 """The emulator is handed a seeded `random.Random`: it may name the type, and never call the shared generator."""
 
 
-def modules() -> Iterator[str]:
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        yield ".".join(parts if parts == ("__init__",) or parts[-1] != "__init__" else parts[:-1])
+@cache
+def modules() -> tuple[str, ...]:
+    found = (path.relative_to(PACKAGE).with_suffix("").parts for path in sorted(PACKAGE.rglob("*.py")))
+    return tuple(".".join(one if one == ("__init__",) or one[-1] != "__init__" else one[:-1]) for one in found)
 
 
 def source_of(module: str) -> Path:
@@ -172,10 +173,16 @@ USERS = {"testing.bench"}
 """Modules of the library that use the bus as an application does, by the root's names."""
 
 
-def imports(module: str, *, types: bool = False) -> Iterator[str]:
+@cache
+def imports(module: str, *, types: bool = False) -> tuple[str, ...]:
     """Absolute dotted names that the module imports when it runs, in functions too; with `types` for them as well."""
     tree = ast.parse(source_of(module).read_text())
-    for node in ast.walk(tree) if types else run_time_nodes(tree):
+    return tuple(imported(module, ast.walk(tree) if types else run_time_nodes(tree)))
+
+
+def imported(module: str, nodes: Iterable[ast.AST]) -> Iterator[str]:
+    """What these nodes of the module import."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -31,7 +31,10 @@ def cited_in(text: str) -> set[int]:
 
 def explanations(path: Path) -> Iterator[str]:
     """Names of tests, and docstrings of tests, classes and modules: what pytest prints, and what explains it."""
-    tree = ast.parse(path.read_text())
+    text = path.read_text()
+    if not cited_in(text):  # parsing every file takes seconds
+        return
+    tree = ast.parse(text)
     yield ast.get_docstring(tree) or ""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -53,7 +56,7 @@ def cited_by_tests() -> dict[int, set[str]]:
 def comments(path: Path) -> Iterator[tuple[int, str]]:
     """Lines that may cite a rule: of Python what is not code, and names of tests; of anything else all."""
     text = path.read_text()
-    if cited_in(text) <= SECTIONS.keys():  # parsing every file takes seconds
+    if cited_in(text) <= SECTIONS.keys():
         return
     if path.suffix != ".py":
         yield from enumerate(text.splitlines(), 1)

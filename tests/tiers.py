@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 
-def one_by_default(values: Iterable[Any]) -> list[Any]:
-    """Return parameters of which the first runs by default; the others are slow."""
-    first, *others = values
-    return [first, *(pytest.param(value, marks=pytest.mark.slow) for value in others)]
+def one_by_default(values: Iterable[Any], others: pytest.MarkDecorator = pytest.mark.slow) -> list[Any]:
+    """Return parameters of which the first runs by default; the others are slow, or have another mark."""
+    first, *rest = values
+    return [first, *(pytest.param(value, marks=others) for value in rest)]
 
 
 def in_turn_by_default(firsts: Iterable[Any], seconds: Iterable[Any]) -> list[Any]:

@@ -92,7 +92,7 @@ class MemoryTransport(asyncio.Transport):
             self._protocol.pause_writing()
         elif self._real_time:
             # Not before the sender has read its clock: if the process stands still in between, a reply could come
-            # earlier than the sender believes its request to have left.
+            # earlier than the time from which the sender counts its request as sent.
             self._loop.call_soon(self._send, bytes(data))
         else:
             self._send(bytes(data))

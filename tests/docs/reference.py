@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from itertools import pairwise
 
@@ -114,26 +114,29 @@ def _bounds_of(module: str) -> Iterator[str]:
         yield f"| `{name}` | {shown} | {' '.join(str(about.value.value).split())} |"
 
 
-def files() -> dict[str, str]:
-    """Every file that is made, by its path, with its text."""
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    return {
-        "docs/reference/line-toml.md": line_toml(),
-        "docs/line.schema.json": json.dumps(json_schema(), indent=1) + "\n",
-        "docs/service.schema.json": json.dumps(service_schema(), indent=1) + "\n",
-        "docs/reference/command-line.md": page(),
-        "docs/reference/bounds.md": bounds() + "\n",
-        "docs/reference/api.md": api(),
-        "share/man/man1/busmaster.1": manual(version),
-    }
+def our_manual() -> str:
+    """The manual page of this version."""
+    return manual(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])
+
+
+FILES: dict[str, Callable[[], str]] = {
+    "docs/reference/line-toml.md": line_toml,
+    "docs/line.schema.json": lambda: json.dumps(json_schema(), indent=1) + "\n",
+    "docs/service.schema.json": lambda: json.dumps(service_schema(), indent=1) + "\n",
+    "docs/reference/command-line.md": page,
+    "docs/reference/bounds.md": lambda: bounds() + "\n",
+    "docs/reference/api.md": api,
+    "share/man/man1/busmaster.1": our_manual,
+}
+"""Every file that is made, by its path, with what makes its text."""
 
 
 def main() -> None:
     """Write them."""
-    for name, text in files().items():
+    for name, text in FILES.items():
         path = ROOT / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        path.write_text(text())
 
 
 if __name__ == "__main__":

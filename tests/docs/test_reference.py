@@ -17,7 +17,7 @@ import pytest
 from busmaster.app.cli.app import COMMANDS
 from tests.docs.command_line import ENVIRONMENT, EXAMPLES, commands
 from tests.docs.pages import ROOT
-from tests.docs.reference import files
+from tests.docs.reference import FILES
 from tests.patience import PATIENCE
 
 MANUAL = ROOT / "share" / "man" / "man1" / "busmaster.1"
@@ -28,9 +28,9 @@ COMPLETIONS = {
 }
 
 
-@pytest.mark.parametrize("name", files())
+@pytest.mark.parametrize("name", FILES)
 def test_a_file_that_is_made_of_the_program_is_that_of_today(name: str) -> None:
-    assert (ROOT / name).read_text() == files()[name], "write it: python -m tests.docs.reference"
+    assert (ROOT / name).read_text() == FILES[name](), "write it: python -m tests.docs.reference"
 
 
 def test_every_command_has_an_example() -> None:

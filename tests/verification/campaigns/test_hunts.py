@@ -26,6 +26,8 @@ EACH = 700
 LONG = 150
 """Likewise, of one with standstills of seconds."""
 EVERY_PROTOCOL = pytest.mark.parametrize("protocol", one_by_default(KINDS))
+OF_THE_HUNT = pytest.mark.parametrize("protocol", one_by_default(KINDS, pytest.mark.exhaustive))
+"""For tests of the hunt itself, which one protocol shows as well as all."""
 
 
 def check(totals: Totals, hunt: Hunt) -> None:
@@ -42,7 +44,7 @@ def test_r1_to_r13_inside_the_assumption_nothing_is_wrong_or_lost_and_everything
     assert totals.transactions >= EACH
 
 
-@EVERY_PROTOCOL
+@OF_THE_HUNT
 def test_what_the_faults_do_shows(protocol: str) -> None:
     """Else the hunts would prove nothing."""
     found, late = {}, {}
@@ -58,7 +60,7 @@ def test_what_the_faults_do_shows(protocol: str) -> None:
     assert found["cancelled"].cancelled > found["late"].cancelled
 
 
-@EVERY_PROTOCOL
+@OF_THE_HUNT
 def test_beyond_the_assumption_the_oracle_sees_what_is_wrong(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def wrong(mix: str) -> Totals:
         total = Totals()
@@ -273,10 +275,10 @@ def test_a_reply_to_a_request_of_one_byte_was_requested() -> None:
 @pytest.mark.parametrize(
     ("protocol", "mix", "seed"),
     [
-        ("ei-bisynch", "wrong", 60200),
         ("dc104", "wrong", 92000),
         ("ei-bisynch", "wrong", 91000),
-        ("ei-bisynch", "shared, everything", 93000),
+        pytest.param("ei-bisynch", "wrong", 60200, marks=pytest.mark.exhaustive),
+        pytest.param("ei-bisynch", "shared, everything", 93000, marks=pytest.mark.exhaustive),
     ],
 )
 def test_a_hunt_in_which_noise_makes_such_a_reply_breaks_no_rule(

@@ -45,14 +45,14 @@ SHARED = replace(QUEUES, clients=1, adversary=(URGENT, CANCELS, LOST))
 SEQUENCES = replace(HCP2, clients=1, longest_hold=0.3, adversary=(URGENT, CANCELS, LOST), retries=1)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
 EVERY |= {"shared": SHARED, "sequences": SEQUENCES, "dies": DIES}
-WALKS = 40
 pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("walks", [15, pytest.param(40, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("setup", [*EVERY.values(), OVERDUE_FROM, LEARNS], ids=[*EVERY, "owes", "learns"])
-def test_a_world_that_was_restored_from_its_key_has_the_same_fate(setup: Setup) -> None:
-    assert sum(walk(setup, seed) for seed in range(WALKS)) > WALKS
+def test_a_world_that_was_restored_from_its_key_has_the_same_fate(setup: Setup, walks: int) -> None:
+    assert sum(walk(setup, seed) for seed in range(walks)) > walks
 
 
 def without_quarantine(view: View) -> None:
@@ -170,7 +170,7 @@ def without_when_it_began(view: View) -> None:
     ids=lambda value: value.__name__ if callable(value) else "",
 )
 def test_a_wrong_omission_is_noticed(forget: Callable[[View], None], setup: Setup) -> None:
-    for seed in range(12 * WALKS):
+    for seed in range(480):
         try:
             walk(setup, seed, [*FORGOTTEN, forget])
         except Differs:
