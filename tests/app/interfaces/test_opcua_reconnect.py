@@ -146,31 +146,32 @@ def asyncua_client(url: str, name: str) -> Iterator[Received]:
             if data.monitored_item.Value.StatusCode.is_good():
                 received.add(value)
 
-    async def use(ready: threading.Event) -> None:
+    async def use() -> None:
         client = asyncua.Client(url, timeout=2, auto_reconnect=True, reconnect_max_delay=0.5)
         await client.connect()
         subscription = await client.create_subscription(100, Handler())
         await subscription.subscribe_data_change(client.get_node(f"ns=2;s={name}"))
+        loops.append(asyncio.get_running_loop())
         ready.set()
         try:
-            await asyncio.Event().wait()
+            await end.wait()
         finally:
             with contextlib.suppress(Exception):
                 await client.disconnect()
 
-    loop, ready = asyncio.new_event_loop(), threading.Event()
+    loops: list[asyncio.AbstractEventLoop] = []
+    ready, end = threading.Event(), asyncio.Event()
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs each lost connection as an exception
-    thread = threading.Thread(target=loop.run_forever)
+    # `asyncio.run` waits for the tasks of the client: one that is left would fail the test in which it is collected.
+    thread = threading.Thread(target=lambda: asyncio.run(use()), daemon=True)
     thread.start()
-    task = asyncio.run_coroutine_threadsafe(use(ready), loop)
     try:
         assert ready.wait(PATIENCE)
         yield received
     finally:
-        task.cancel()
-        loop.call_soon_threadsafe(loop.call_later, 0.2, loop.stop)
+        for loop in loops:
+            loop.call_soon_threadsafe(end.set)
         thread.join(PATIENCE)
-        loop.close()
         logging.getLogger("asyncua").setLevel(logging.NOTSET)
 
 
