@@ -97,6 +97,7 @@ def test_flags_are_set_cleared_and_read() -> None:
     assert answer(line, request(1, "CFLAG", 5), 60.0) == ACK  # it is off already
     assert answer(line, request(1, "RFLAG", 5), 80.0).endswith("00 00 01 A1")
     assert answer(line, request(1, "SFLAG", 7), 100.0) == NAK  # an input
+    assert answer(line, request(1, "CFLAG", 7), 120.0) == NAK
     assert controller.flags == set()
 
 

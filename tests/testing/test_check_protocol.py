@@ -22,6 +22,7 @@ from tests.testing.modbus import (
     REPLY,
     Asking,
     ReadRegister,
+    ReadsPlaces,
     Registers,
     WriteRegister,
     checked,
@@ -377,6 +378,34 @@ def test_a_write_that_says_wrongly_what_it_changes_is_found(write: type[_Changin
 
     check_protocol(MODBUS, CASES, names=named, round_trips=trips(_Changing), device=answers_of(Registers(17)))
     assert finding in find(round_trips=trips(write), device=answers_of(Registers(17)))
+
+
+class WritingThreeTimes(ReadsPlaces):
+    """A write in three steps: the host sends twice more."""
+
+    again = 2
+
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        step = super().feed(data)
+        if isinstance(step, Done) and self.again:
+            self.again -= 1
+            self.buffer = b""
+            return Expect(self.timing, self.sizes, self.request)
+        return step
+
+
+def test_the_device_hears_each_further_step_of_the_host() -> None:
+    heard: list[bytes] = []
+    answers = answers_of(Registers(17))
+
+    def device(sent: bytes) -> bytes:
+        heard.append(sent)
+        return answers(sent)
+
+    trip = RoundTrip(17, lambda value: WriteRegister(7, value, WritingThreeTimes), ReadRegister(7), [3])
+    check_protocol(MODBUS, CASES, names=named, round_trips=[trip], device=device)
+    write, read = checked(17, 6, 0, 7, 0, 3), checked(17, 3, 0, 7, 0, 1)
+    assert heard == [write, write, write, read]
 
 
 def test_a_device_that_does_not_answer_is_found() -> None:

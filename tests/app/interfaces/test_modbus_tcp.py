@@ -234,9 +234,18 @@ def test_a_map_file_is_read(tmp_path: Path) -> None:
     assert shown.whole("holding", 0, 3) == [(shown.entries[0], False), (shown.entries[0], True)]
 
 
+STATUS_AT_0 = MAP.replace("address = 0", "address = 5", 1).replace("status = 2", "status = 0")
+
+
+def test_a_status_can_have_the_address_0(tmp_path: Path) -> None:
+    shown = read_map(written(tmp_path, STATUS_AT_0))
+    assert shown.whole("holding", 0, 1) == [(shown.entries[0], True)]
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
+        (STATUS_AT_0 + "[[registers]]\npoint = 'a/y'\naddress = 0", "a/y: holding 0 is in use by a/x"),
         ("registers = [", "map.toml: "),
         ("", "there is no [[registers]]"),
         ("registers = 3", "there is no [[registers]]"),
@@ -460,6 +469,14 @@ def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest
         assert "idle for the longest time" in reports[0]
 
     assert with_server(total) == [("connections", "127.0.0.1")]
+
+    async def of_others(connect: Connect, _echo: Echo, _reports: list[str]) -> None:
+        (first, _), _ = await connect("127.0.0.2"), await connect("127.0.0.3")
+        await connect("127.0.0.4")
+        assert await is_closed(first)
+
+    # The address is that of the connection that is closed.
+    assert with_server(of_others) == [("connections", "127.0.0.2")]
 
 
 def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.asyncio
 NUMBER, OTHER, TEXT, UNKNOWN = (ua.NodeId(name, 2) for name in ("number", "other", "text", "unknown"))
 KINDS = {NUMBER: ua.ObjectIds.Double, OTHER: ua.ObjectIds.Int64, TEXT: ua.ObjectIds.String}
 VALUES = {NUMBER: 1.0, OTHER: 7, TEXT: "x"}
+READ = ua.AccessLevel.CurrentRead.mask
 READ_WRITE = ua.AccessLevel.CurrentRead.mask | ua.AccessLevel.CurrentWrite.mask
 
 
@@ -248,13 +249,22 @@ async def test_a_read_that_is_not_supported_is_refused_beside_others_that_are(cl
         assert await code_of(session.read(ua.ReadParameters(age, NodesToRead=reads))) == code
 
 
-@pytest.mark.parametrize(("why", "access"), [("", READ_WRITE), ("log in", ua.AccessLevel.CurrentRead.mask)])
-async def test_the_access_of_a_user_is_without_writing_for_one_that_may_not_write(why: str, access: int) -> None:
-    session = Clients(lambda _: why).session()
+@pytest.mark.parametrize(
+    ("of_a_point", "why", "access"),
+    [(READ_WRITE, "", READ_WRITE), (READ_WRITE, "log in", READ), (READ, "", READ), (READ, "log in", READ)],
+)
+async def test_the_access_of_a_user_is_without_writing_for_one_that_may_not_write(
+    of_a_point: int, why: str, access: int
+) -> None:
+    clients = Clients(lambda _: why)
+    for attribute in (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel):
+        value = ua.DataValue(ua.Variant(of_a_point, ua.VariantType.Byte))
+        clients.space[NUMBER].attributes[attribute] = AttributeValue(value)
+    session = clients.session()
     attributes = (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel, ua.AttributeIds.Value)
     reads = [ua.ReadValueId(NUMBER, attribute) for attribute in attributes]
     of_point, of_user, value = await session.read(ua.ReadParameters(NodesToRead=reads))
-    assert (of_point.Value.Value, of_user.Value.Value, value.Value.Value) == (READ_WRITE, access, 1.0)
+    assert (of_point.Value.Value, of_user.Value.Value, value.Value.Value) == (of_a_point, access, 1.0)
 
 
 async def test_items_are_bounded_in_all_subscriptions_of_a_session_and_in_all_sessions(
