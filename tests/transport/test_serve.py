@@ -6,6 +6,7 @@ import os
 import select
 import socket
 import termios
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -278,6 +279,19 @@ def test_a_fault_in_a_device_ends_the_server_and_is_told_at_its_close() -> None:
     with connected(server) as client:
         client.sendall(READ)
         assert client.recv(1) == b""
+    server._thread.join(PATIENCE)
+    refused: list[str] = []
+
+    def call() -> None:
+        try:
+            server.call(lambda line, now: None)
+        except RuntimeError as error:
+            refused.append(str(error))
+
+    caller = threading.Thread(target=call, daemon=True)
+    caller.start()
+    caller.join(PATIENCE)
+    assert refused == [f"{server.path} is no longer served"]
     with pytest.raises(ZeroDivisionError):
         server.close()
 
