@@ -58,6 +58,13 @@ class TakesWritesForReads(HcpDialect):
         return frame
 
 
+class FindsFaultWithRequests(HcpDialect):
+    def _request(self, raw: bytes) -> Frame:
+        frame = super()._request(raw)
+        frame.fault = "bad checksum"
+        return frame
+
+
 class ReadsTheNextNode(HcpDialect):
     def node(self, field: bytes) -> int | None:
         return (super().node(field) or 0) + 1
@@ -98,6 +105,7 @@ def test_a_dialect_that_reads_rightly_passes() -> None:
         (CutsTooSoon, "one byte at a time it is"),
         (SwallowsWhatFollowsNoise, "after noise it is"),
         (TakesWritesForReads, "not a write of the host"),
+        (FindsFaultWithRequests, "[bad checksum], not a read of the host"),
         (ReadsTheNextNode, "its request is decoded as one to 3"),
         (SpeaksOfTheNextElement, "is decoded as read element 2, which sends"),
         (SpeaksOfNothing, "gives no command"),

@@ -104,6 +104,6 @@ async def test_a_failed_login_is_reported_here_and_to_the_owner(monkeypatch: pyt
     owner = Owner()
     owner.is_connected = True
     reports: list[str] = []
-    FailedLogins("web", cast("Following", cast("Any", owner)), reports.append).note("10.0.0.1")
-    assert reports == ["1 failed login at web: 1 from 10.0.0.1"]
-    assert await until_reported(owner) == [("web", "logins", {"10.0.0.1": 1})]
+    FailedLogins("opcua", cast("Following", cast("Any", owner)), reports.append).note("10.0.0.1")
+    assert reports == ["1 failed login at opcua: 1 from 10.0.0.1"]
+    assert await until_reported(owner) == [("opcua", "logins", {"10.0.0.1": 1})]

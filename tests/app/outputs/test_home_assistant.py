@@ -184,6 +184,8 @@ def test_names_in_topics_have_the_characters_that_are_allowed_and_stay_different
 def test_messages_of_cycles_have_no_topics_that_could_be_discovered() -> None:
     with pytest.raises(InvalidCommand, match='home_assistant needs messages = "point"'):
         MqttSettings(home_assistant="homeassistant", messages="cycle")
+    with pytest.raises(InvalidCommand, match='home_assistant needs messages = "point"'):
+        MqttSettings(enabled=False, home_assistant="homeassistant", messages="cycle")
 
 
 @needs_mosquitto
