@@ -51,6 +51,8 @@ def test_faults_are_read_from_text() -> None:
     faults = Faults.parse(["lost=0.1", " late = 0.5", "late_by=0.05"])
     assert (faults.lost, faults.late, faults.late_by) == (0.1, 0.5, 0.05)
     assert str(faults) == "late=0.5 late_by=0.05 lost=0.1"
+    at_once = Faults.parse(["late_by=0", "away_for=0"])
+    assert (at_once.late_by, at_once.away_for) == (0, 0)
 
 
 @pytest.mark.parametrize(

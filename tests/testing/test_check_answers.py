@@ -11,6 +11,7 @@ import pytest
 from busmaster.contract.exchange import Done
 from busmaster.contract.timing import ReplyTiming
 from busmaster.testing import Case
+from busmaster.testing.protocol import check_good_reply
 from tests.testing.modbus import (
     CASES,
     MODBUS,
@@ -79,6 +80,19 @@ class AnsweredWhole(Asking):
 )
 def test_what_a_reader_says_wrongly_of_its_answers_is_found(exchange: type[Asking], finding: str) -> None:
     assert re.search(finding, find(reading_with(exchange), CASES[1]))
+
+
+def test_each_step_that_can_come_before_a_byte_of_the_host_must_be_overdue() -> None:
+    class Acknowledged(Asking):
+        overdue = (b"\x06",)
+
+        def __init__(self) -> None:
+            self.answers = (b"\x06", b"\x02\x05")
+
+    found = list(check_good_reply(Acknowledged(), [[b"\x06", b"\x02\x05\x07"]]))
+    assert found == ["before the first byte, 02 05 07 can arrive and is not in `overdue`: 06"]
+    # The packet follows a byte of the host: it comes in an exchange, and is not overdue before.
+    assert list(check_good_reply(Acknowledged(), [[b"\x06"], [b"\x02\x05\x07"]])) == []
 
 
 def test_commands_whose_replies_could_be_exchanged_and_that_share_no_answer_are_found() -> None:

@@ -17,7 +17,7 @@ import termios
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -703,6 +703,8 @@ def test_without_a_protocol_the_port_has_the_usual_settings_or_those_of_the_opti
     assert plain.endpoint == SerialPort("/dev/ttyS0", baudrate=9600)
     assert given.endpoint == SerialPort("/dev/ttyS0", baudrate=4800, echo=True)
     assert plain.progress is given.progress is Bar
+    of_port = patient_of(replace(connection(""), port="/dev/ttyS0?echo=1"), None)
+    assert of_port.endpoint == SerialPort("/dev/ttyS0", baudrate=9600, echo=True)
 
 
 @pytest.fixture

@@ -421,6 +421,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             f'{HEAD}{NODE}[nodes.other]\nprotocol = "microflex"\naddress = 5',
             "line.toml:7: nodes.other.address: node 'winder' already has address 5",
         ),
+        (f"{HEAD}{NODE}retries = \n", "line.toml:5: not valid TOML: "),
         (f"{HEAD}[emulator]\nreply_delay = true", "line.toml:3: emulator.reply_delay: must be a number of seconds"),
         (
             f"{HEAD}[emulator.nodes.winder]\nreply_delay = [0.001, true]\n{NODE}",

@@ -272,6 +272,19 @@ def test_a_clock_that_was_set_back_is_reported_once_and_not_trusted_for_a_day(mo
     assert left_in(database) == 0
 
 
+def test_a_limit_in_megabytes_applies_while_the_clock_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks, told = Clocks(monkeypatch), list[str]()
+    database = database_of(*(clocks.wall - 100 + number for number in range(100)))
+    keeping = Retention(1, 0.5, told.append)
+    monkeypatch.setattr(retention, "used", lambda _: 1_000_000)
+    keeping.apply(database, DATED)
+    assert left_in(database) == 90
+    clocks.wall += 365 * DAY
+    keeping.apply(database, DATED)
+    assert told == ["the clock was set by +31536000 s; nothing is deleted for a day"]
+    assert left_in(database) == 81
+
+
 def test_the_clock_is_right_if_any_table_has_new_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     clocks, told = Clocks(monkeypatch), list[str]()
     database = database_of(clocks.wall - 365 * DAY)

@@ -202,6 +202,7 @@ def test_a_host_is_ours_by_an_address_by_where_we_listen_and_by_the_name_of_the_
 ) -> None:
     monkeypatch.setattr(socket, "gethostname", lambda: "This-Machine")
     assert is_our_name(host, ("gateway.example", 7420)) is ours
+    assert is_our_name(host, ("Gateway.Example", 7420)) is ours
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
