@@ -91,6 +91,16 @@ def test_another_protocol_may_be_lent_once_the_line_has_no_node_of_the_first() -
     run_in_virtual_time(run())
 
 
+def test_another_protocol_may_be_lent_once_the_nodes_of_two_have_left() -> None:
+    async def run() -> None:
+        async with bus_with(5) as bus:
+            for lent in [bus._lend_node(find(name).profile, 5) for name in ("hcp", "hcp2")]:
+                bus._give_back(lent)
+            assert [bus._lend_node(find("modbus").profile, 5)] == list(bus.nodes)
+
+    run_in_virtual_time(run())
+
+
 def test_no_queue_is_kept_of_nodes_that_were_given_back() -> None:
     async def run() -> None:
         async with bus_with(5) as bus:
