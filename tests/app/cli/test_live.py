@@ -598,6 +598,43 @@ async def test_details_follow_the_value_and_say_that_a_point_is_gone(
         assert "limits" not in shown
 
 
+@pytest.mark.asyncio
+async def test_details_longer_than_the_terminal_stay_where_they_were_scrolled_to(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(live, "ASKED_EVERY", 0.0)
+    asked, ahead = asyncio.Queue[str](), asyncio.Queue[int]()
+    async with drawn(tell(Picture(), row(value=3)), (80, 8)) as (screen, line, pilot):
+        known = line.details
+
+        async def details(group: str, key: str, /) -> Mapping[str, Any]:
+            asked.put_nowait(key)
+            told = await known(group, key)
+            return {**told, "timeline": {**told["timeline"], "exchanges_ahead": await ahead.get()}}
+
+        async def refreshed(exchanges: int) -> str:
+            """The screen after details with so many exchanges ahead, when they are requested again."""
+            ahead.put_nowait(exchanges)
+            await asyncio.wait_for(asked.get(), PATIENCE)
+            await pilot.pause()
+            return "\n".join(lines(screen))
+
+        monkeypatch.setattr(line, "details", details)
+        screen.animation_level = "none"
+        await pilot.press("enter")
+        await asyncio.wait_for(asked.get(), PATIENCE)
+        shown = await refreshed(3)
+        assert "(5/outputs)" in shown
+        assert "behind 3" not in shown
+        await pilot.press("end")
+        async with asyncio.timeout(PATIENCE):
+            while "1 values" not in "\n".join(lines(screen)):
+                await pilot.pause()
+        shown = await refreshed(4)
+        assert "behind 4" in shown
+        assert "(5/outputs)" not in shown
+
+
 @sizes
 @pytest.mark.asyncio
 async def test_details_show_limits_and_the_last_exchange_of_a_point(size: tuple[int, int]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua import serving
 from busmaster.app.interfaces.opcua_access import Rules
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
+from busmaster.app.service import overview
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.owner_messages import StreamMessage
 from busmaster.app.service.record import WriteRecord
@@ -194,6 +195,19 @@ async def test_a_point_is_an_analog_item_only_with_what_that_type_requires(
         assert await asyncio.to_thread(opened.client.type_of, "5/10") == (type_, type_)
 
 
+async def test_a_browse_of_a_point_shows_the_names_of_the_type_that_it_has_now(opened: Opened) -> None:
+    """A point is a DataItemType until its unit and its first number are known."""
+
+    def names() -> tuple[str, str]:
+        [reference] = opened.client.node("5/10").get_references(ua.ObjectIds.HasTypeDefinition)
+        return reference.BrowseName.Name, reference.DisplayName.Text
+
+    async with opened.owned() as line:
+        line.poll("10", unit="mm")
+        await opened.is_("5/10", "Good")
+        assert await asyncio.to_thread(names) == ("AnalogUnitType", "AnalogUnitType")
+
+
 @pytest.mark.parametrize(
     ("item", "value", "kind", "status", "stored"),
     [
@@ -349,6 +363,39 @@ async def test_a_point_that_the_line_has_no_longer_says_so(opened: Opened) -> No
         assert (await opened.is_("5/10", "Good")).value == 0.0
         group.add(Hcp2Controller(line.bus, 5).point("11"))
         await opened.is_("5/11", "Good")
+
+
+async def test_a_point_that_is_added_while_the_others_are_taken_over_is_shown(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on = asyncio.Event(), asyncio.Event()
+    details = opened.line.details
+
+    async def held(*point: str) -> Mapping[str, Any]:
+        begun.set()
+        await go_on.wait()
+        return await details(*point)
+
+    def are_told() -> bool:
+        picture = opened.line.picture
+        return picture.frame is not None and picture.frame.points == len(picture.rows) == 2
+
+    async def another_look() -> None:
+        before = (await opened.is_("Groups/axes Cycles", "Good")).value
+        await opened.shows("Groups/axes Cycles", lambda told: told.value != before)
+
+    monkeypatch.setattr(opened.line, "details", held)
+    monkeypatch.setattr(overview, "COUNTED_EVERY", 0.0)
+    async with opened.owned() as line:
+        group = line.poll("10")
+        await begun.wait()
+        group.add(Hcp2Controller(line.bus, 5).point("12"))
+        await until(are_told)
+        go_on.set()
+        await another_look()  # it may end the one that has been held
+        await another_look()
+        assert (await asyncio.to_thread(opened.client.read, "5/12")).status != "BadNodeIdUnknown"
+        assert (await opened.is_("5/12", "Good")).value == 0.0
 
 
 @pytest.mark.slow

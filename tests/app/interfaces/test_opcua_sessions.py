@@ -10,15 +10,18 @@ from typing import Any
 
 import pytest
 from asyncua import ua
+from asyncua.common.connection import TransportLimits
 from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.server.address_space import AddressSpace, AttributeService, AttributeValue, NodeData
+from asyncua.server.internal_session import SessionState
 from asyncua.server.subscription_service import SubscriptionService
 from asyncua.ua.uaprotocol_auto import DataChangeFilter, EventFilter  # those of `ua` are subclasses
 
 from busmaster.app import bounds
 from busmaster.app.interfaces import opcua_sessions
 from busmaster.app.interfaces.opcua_access import Rules, Writes, guard
+from busmaster.app.interfaces.opcua_connections import Requests
 from busmaster.app.interfaces.opcua_sessions import Session, use_sessions
 from busmaster.app.interfaces.opcua_terms import CODES
 
@@ -141,6 +144,17 @@ async def test_a_session_has_a_bounded_number_of_subscriptions_whatever_others_h
     await one.delete_subscriptions([first.SubscriptionId])
     assert await code_of(clients.subscribe(one)) == ""
     await clients.end()
+
+
+async def test_a_session_that_was_not_activated_ends_with_its_connection(clients: Clients) -> None:
+    transport = SimpleNamespace(get_extra_info=lambda _: ("127.0.0.1", 50_000), close=lambda: None)
+    requests = Requests(clients.server, transport, TransportLimits())
+    requests.session = session = clients.session()
+    await clients.subscribe(session)
+    assert not requests.has_session
+    await requests.close()
+    assert session.state is SessionState.Closed
+    assert not clients.service.subscriptions
 
 
 @pytest.mark.parametrize(
