@@ -25,7 +25,7 @@ sizes = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{siz
 
 
 class Wishes:
-    """A line that does nothing but remember what was wished, and fails where it is told to."""
+    """A line that only records the commands, and fails if it has an error."""
 
     def __init__(self) -> None:
         self.said: list[tuple[Any, ...]] = []
@@ -479,7 +479,7 @@ async def test_no_closes_a_question(keys: tuple[str, ...]) -> None:
 
 
 async def pressed(*keys: str, point: Any, read_only: bool = False) -> list[tuple[Any, ...]]:
-    """What is wished of the line when these keys are pressed on that row."""
+    """The commands to the line when these keys are pressed on that row."""
     async with drawn(tell(Picture(), point), read_only=read_only) as (_, line, pilot):
         await pilot.press(*keys)
         await pilot.pause()

@@ -81,7 +81,7 @@ class Opened:
                 yield owned
 
     async def shows(self, name: str, fact: Callable[[Told], object]) -> Told:
-        """Wait until a client that asks for it is told this."""
+        """Wait until a client reads a value for which `fact` holds."""
         while True:
             told = await asyncio.to_thread(self.client.read, name)
             if fact(told):
@@ -96,7 +96,7 @@ class Opened:
 
 @contextlib.asynccontextmanager
 async def subscribed(client: OtherClient, names: Sequence[str]) -> AsyncIterator[Callable[[str, Any], Awaitable[None]]]:
-    """A subscription to these, and what waits until it has been told something of one of them."""
+    """A subscription to these, and a function that waits until a fact holds for the last news of one of them."""
     entered = client.subscribed(names)
     heard = await asyncio.to_thread(entered.__enter__)
     try:
