@@ -192,6 +192,11 @@ def test_numbers_are_written_short(number: float, text: bytes) -> None:
     assert number_text(number) == text
 
 
+@pytest.mark.parametrize(("number", "text"), [(12.5, b"12.5000"), (-0.00001, b"0.0000"), (-0.0, b"0.0000")])
+def test_numbers_with_fixed_decimals_have_four_and_no_zero_has_a_sign(number: float, text: bytes) -> None:
+    assert number_text(number, fixed_decimals=True) == text
+
+
 @given(st.floats(-1e9, 1e9))
 @settings(max_examples=200)
 def test_a_number_written_and_read_again_is_the_same_to_four_decimals(number: float) -> None:
