@@ -80,7 +80,7 @@ def has_tier(path: Path, tier: str) -> bool:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out the files without a test of the one tier that is run: of 365 files, two thirds have no slow test."""
+    """Leave out the files without a test of the one tier that is run: more than half have no slow test."""
     tier = "slow" if config.option.markexpr == SLOW else config.option.markexpr
     if tier in NOT_BY_DEFAULT and collection_path.match("test_*.py") and not has_tier(collection_path, tier):
         return True
