@@ -98,9 +98,40 @@ async def timed(bus: Bus, work: Awaitable[None]) -> float:
     return bus.now()
 
 
-def test_a_write_that_was_given_up_makes_older_samples_stale() -> None:
+ON_ANY_LINE = pytest.mark.parametrize("limited", [False, True])
+"""On a line where a node has a limit, each write is checked before it is sent."""
+
+
+def with_limit(bus: Bus, limited: bool) -> Hcp2Controller:
+    axis = Hcp2Controller(bus, 1)
+    if limited:
+        axis.element(9).limit(maximum=1.0)
+    return axis
+
+
+@ON_ANY_LINE
+def test_a_request_whose_caller_has_gone_is_not_sent(limited: bool) -> None:
     async def story(bus: Bus) -> None:
-        axis = Hcp2Controller(bus, 1)
+        node = with_limit(bus, limited).node
+        reading = asyncio.ensure_future(node.request(hcp2.Read(1)))
+        await asyncio.sleep(0.01)
+        writing = asyncio.ensure_future(node.request(hcp2.Write(1, (5.0,))))
+        await asyncio.sleep(0.01)
+        writing.cancel()
+        await reading
+        assert await node.request(hcp2.Read(2)) == 0.0
+        assert writing.cancelled()
+        assert device.comms[1] == 0.0
+        assert Node.of(Hcp2Controller(bus, 1)).statistics().attempts == 2
+
+    device = slow()
+    on_a_bus(story, device)
+
+
+@ON_ANY_LINE
+def test_a_write_that_was_given_up_makes_older_samples_stale(limited: bool) -> None:
+    async def story(bus: Bus) -> None:
+        axis = with_limit(bus, limited)
         point, other = axis.element(1), axis.element(2)
         group = bus.poll_group("g", period=10.0, phase=0.0, points=[point, other])
         async for _ in group:
@@ -216,9 +247,10 @@ def test_cancelled_in_the_very_turn_in_which_its_time_is_over_it_is_cancelled_an
     on_a_bus(story, slow())
 
 
-def test_a_request_decided_before_the_node_was_told_to_stop_is_not_sent() -> None:
+@ON_ANY_LINE
+def test_a_request_decided_before_the_node_was_told_to_stop_is_not_sent(limited: bool) -> None:
     async def story(bus: Bus) -> None:
-        node, other = Hcp2Controller(bus, 1).node, Hcp2Controller(bus, 2).node
+        node, other = with_limit(bus, limited).node, Hcp2Controller(bus, 2).node
         seen = node.stops
         await node.request(hcp2.Write(1, (1.0,)), stops_seen=seen)
         Hcp2Controller(bus, 1).node.note_stop()
@@ -256,3 +288,31 @@ def test_equal_writes_of_the_safe_state_that_wait_for_the_line_are_sent_once() -
 
     device = slow()
     on_a_bus(story, device)
+
+
+@ON_ANY_LINE
+def test_equal_stops_that_wait_for_the_line_are_sent_once(limited: bool) -> None:
+    async def story(bus: Bus) -> None:
+        node = with_limit(bus, limited).node
+        stop = hcp2.Write(2, (5.0,))
+        reading = asyncio.ensure_future(node.request(hcp2.Read(1)))
+        await asyncio.sleep(0.01)
+        await asyncio.gather(*(node.request(stop, stop=True, priority=Priority.URGENT) for _ in range(3)))
+        await reading
+        assert Node.of(Hcp2Controller(bus, 1)).statistics().attempts == 2
+        assert device.comms[2] == 5.0
+
+    device = slow()
+    on_a_bus(story, device)
+
+
+def test_a_probe_of_a_dead_node_is_sent_each_time() -> None:
+    """Its caller wants it now: the budget for requests to dead nodes does not apply."""
+
+    async def story(bus: Bus) -> None:
+        node = Node.of(Hcp2Controller(bus, 9))
+        assert [await node.probe() for _ in range(40)] == [False] * 40
+        counts = node.statistics()
+        assert counts.attempts - counts.probes == 40
+
+    on_a_bus(story, slow())
