@@ -170,20 +170,24 @@ def test_where_somebody_talks_nothing_is_sent_and_it_is_said_what_is_spoken() ->
     assert talkers.heard == b""
 
 
-def test_talk_that_nobody_knows_is_left_alone_too() -> None:
-    class Babbler(Device):
-        def __init__(self) -> None:
-            super().__init__(0)
-            self.wakeup = 0.1
+class Talker(Device):
+    """Transmits the same bytes again and again, and must not receive any."""
 
-        def hear_byte(self, byte: int, now: float) -> None:
-            raise AssertionError("something was sent")
+    def __init__(self, talk: bytes) -> None:
+        super().__init__(0)
+        self.wakeup = 0.1
+        self._talk = talk
 
-        def wake(self, now: float) -> None:
-            self.reply(b"\x81\x82\x83", now, 0.0)
-            self.wakeup = now + 0.5
+    def hear_byte(self, byte: int, now: float) -> None:
+        raise AssertionError("something was sent")
 
-    babbler = Babbler()
+    def wake(self, now: float) -> None:
+        self.reply(self._talk, now, 0.0)
+        self.wakeup = now + 0.3
+
+
+def test_talk_in_an_unknown_protocol_is_left_alone_too() -> None:
+    babbler = Talker(b"\x81\x82\x83")
     babbler.attentive = True
     discovery = looked(line_of(LineSettings(9600), babbler), steps(usual_kinds(), None, None))
     assert "with an unknown protocol" in discovery.talk
@@ -192,23 +196,11 @@ def test_talk_that_nobody_knows_is_left_alone_too() -> None:
 def test_a_protocol_is_recognised_only_at_settings_at_which_it_is_tried() -> None:
     request = bytes.fromhex("07 30 35 02 30 31 05 03")  # HCP2: read element 1 of node 5
 
-    class Master(Device):
-        def __init__(self) -> None:
-            super().__init__(0)
-            self.wakeup = 0.1
-
-        def hear_byte(self, byte: int, now: float) -> None:
-            raise AssertionError("something was sent")
-
-        def wake(self, now: float) -> None:
-            self.reply(request, now, 0.0)
-            self.wakeup = now + 0.3
-
     for tried, talk in (
         (LineSettings(9600), "another master is active, with Host Comms Protocol 2 at 9600 8N1: "),
         (LineSettings(57600), "another master is active, with an unknown protocol: "),
     ):
-        master = Master()
+        master = Talker(request)
         master.attentive = True
         asked = [*steps([find("hcp2")], None, tried), *steps([find("modbus")], None, LineSettings(9600))]
         assert looked(line_of(LineSettings(9600), master), asked).talk.startswith(talk)

@@ -540,17 +540,24 @@ def test_an_address_with_many_requests_on_the_line_makes_room_for_another_addres
     with_server(story, Slow())
 
 
+class SlowUnit(Echo):
+    """Unit 1 replies when it may go on."""
+
+    def __init__(self, go_on: asyncio.Event) -> None:
+        super().__init__()
+        self._go_on = go_on
+
+    async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
+        reply = await super().reply(peer, unit, pdu)
+        if unit == 1:
+            await self._go_on.wait()
+        return reply
+
+
 def test_requests_of_replaced_connections_count_as_those_of_their_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 3)
     monkeypatch.setattr(modbus_tcp, "MOST_PER_PEER", 2)
     go_on = asyncio.Event()
-
-    class SlowUnit(Echo):
-        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
-            reply = await super().reply(peer, unit, pdu)
-            if unit == 1:
-                await go_on.wait()
-            return reply
 
     async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
         for source in ("127.0.0.1", "127.0.0.1", "127.0.0.2"):
@@ -567,7 +574,7 @@ def test_requests_of_replaced_connections_count_as_those_of_their_address(monkey
         assert await is_closed(beyond)
         go_on.set()
 
-    with_server(story, SlowUnit())
+    with_server(story, SlowUnit(go_on))
 
 
 def test_a_connection_whose_request_was_replied_to_makes_room_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -589,13 +596,6 @@ def test_replaced_connections_no_longer_count_when_their_requests_are_over(monke
     monkeypatch.setattr(modbus_tcp, "MOST_CONNECTIONS", 2)
     monkeypatch.setattr(modbus_tcp, "MOST_PER_PEER", 2)
     go_on = asyncio.Event()
-
-    class SlowUnit(Echo):
-        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
-            reply = await super().reply(peer, unit, pdu)
-            if unit == 1:
-                await go_on.wait()
-            return reply
 
     async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
         many = [await connect("127.0.0.1") for _ in range(2)]
@@ -622,7 +622,7 @@ def test_replaced_connections_no_longer_count_when_their_requests_are_over(monke
             writer.write(frame(READ, unit=2))
             assert await reader.readexactly(len(frame(READ)))
 
-    with_server(story, SlowUnit())
+    with_server(story, SlowUnit(go_on))
 
 
 # the command, beside an owner, by real clients
