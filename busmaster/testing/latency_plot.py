@@ -35,20 +35,22 @@ def check_plot(path: str) -> None:
 def plot(report: BenchReport, path: str) -> None:
     """Draw the histogram and the latency over time into a file, of the kind that its suffix names (.png, .svg).
 
-    A report that was read from JSON has no latencies over time: there that panel is empty. Raises InvalidCommand
-    without matplotlib, for an unknown suffix and for a folder that does not exist; OSError if it cannot be written.
+    A report that was read from JSON has only the counts of its histogram: its bars are of all classes, and no panel
+    shows values over time. Raises InvalidCommand without matplotlib, for an unknown suffix and for a folder that does
+    not exist; OSError if it cannot be written.
     """
     check_plot(path)
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=SIZE, layout="constrained")
-    shape, course = figure.subplots(1, 2)
     classes: dict[str, list[tuple[float, float]]] = {}
     for moment, latency, name in report.samples:
         classes.setdefault(name, []).append((moment, latency * 1000))
+    panels = figure.subplots(1, 2 if classes else 1, squeeze=False)[0]
     if report.histogram:
-        _histogram(shape, report, classes)
-        _course(course, classes)
+        _histogram(panels[0], report, classes)
+    if classes:
+        _course(panels[1], classes)
     figure.suptitle(_title(report))
     figure.savefig(path)
 
@@ -65,7 +67,10 @@ def _histogram(panel: Any, report: BenchReport, classes: dict[str, list[tuple[fl
     """Draw the buckets of the report, with the classes stacked, and lines at some percentiles."""
     ratio = report.histogram[-1][0] / report.histogram[-2][0] if len(report.histogram) > 1 else 1.1
     edges = [1000 * report.histogram[0][0] / ratio, *(1000 * edge for edge, _ in report.histogram)]
-    panel.hist([[ms for _, ms in dots] for dots in classes.values()], bins=edges, stacked=True, label=list(classes))
+    if classes:
+        panel.hist([[ms for _, ms in dots] for dots in classes.values()], bins=edges, stacked=True, label=list(classes))
+    else:
+        panel.hist(edges[:-1], bins=edges, weights=[values for _, values in report.histogram])
     for name, style in zip(MARKED, (":", "--", "-"), strict=True):
         value = report.total.figures[name]
         panel.axvline(

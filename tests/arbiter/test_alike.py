@@ -12,6 +12,7 @@ from busmaster.arbiter.choice import LONGEST_STEADY, Alike
 from busmaster.arbiter.transaction import Transaction
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import TAU, Bench, reply_of, up
+from tests.tiers import one_by_default
 
 REQUEST = 8 * TAU
 MOST_ALIKE = 32
@@ -139,7 +140,7 @@ def test_a_port_whose_bytes_do_not_leave_at_the_baud_rate_is_checked_after_32() 
 
 
 @PATIENCE
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", one_by_default(KINDS))
 def test_r15_of_one_doubled_reply_on_a_line_of_equal_reads_at_most_32_values_are_wrong(
     kind: str, patient: bool
 ) -> None:

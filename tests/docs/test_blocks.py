@@ -11,6 +11,7 @@ import shutil
 import sys
 import tomllib
 import zlib
+from functools import cache
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -91,7 +92,13 @@ class Page:
             self._whole = data
         source.data = merged(self._whole, data)
         ConfiguredLine(read(source), outputs=False)
-        Draft202012Validator(json_schema()).validate(source.data)
+        whole_file().validate(source.data)
+
+
+@cache
+def whole_file() -> Draft202012Validator:
+    """The schema of a LINE.toml, which takes as long to make as a page to read."""
+    return Draft202012Validator(json_schema())
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ BLOCK = re.compile(r"^ *```(?:py|text)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 FIRST = re.compile(r"# (?P<file>\S+?)(?:, before: (?P<anchor>.*))?\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_the_example_works_as_the_page_shows_it(page: str, tmp_path: Path) -> None:
     shutil.copytree(ROOT / "busmaster", tmp_path / "busmaster", ignore=shutil.ignore_patterns("__pycache__"))

@@ -37,6 +37,7 @@ from busmaster.protocols.modbus.device import EmulatedModbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.wire.checks import bcc, sum8, sum16, xor
+from tests.tiers import one_by_default
 
 Commands = Sequence[Command[Any]]
 TAU = 1e-3
@@ -214,7 +215,7 @@ def test_a_device_never_raises_and_says_the_same_whatever_pieces_it_hears(name: 
             assert device.attentive == bytewise.attentive
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", one_by_default(KINDS))
 @given(st.data())
 @settings(max_examples=20)
 def test_a_line_bears_any_bytes_in_any_pieces(name: str, data: st.DataObject) -> None:

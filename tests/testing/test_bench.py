@@ -318,6 +318,32 @@ def test_a_report_is_the_same_after_json() -> None:
     assert again.samples == ()
 
 
+def test_a_report_from_json_is_plotted_with_the_counts_of_its_histogram(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figure = pytest.importorskip("matplotlib.figure").Figure
+    drawn: list[Any] = []
+    really = figure.savefig
+
+    def savefig(this: Any, path: str) -> None:
+        drawn.append(this)
+        really(this, path)
+
+    monkeypatch.setattr(figure, "savefig", savefig)
+    report = bench("hcp2", [1, 2], virtual=True, seconds=1, period=0.1, faults=["lost=0.1"])
+    for one in (report, BenchReport.from_json(report.to_json())):
+        plot(one, str(tmp_path / "bench.png"))
+    whole, counts = drawn
+    assert [len(whole.axes), len(counts.axes)] == [2, 1]
+    bars = [(bar.get_x(), bar.get_height()) for bar in counts.axes[0].patches]
+    assert [height for _, height in bars] == [values for _, values in report.histogram]
+    assert len(report.histogram) > 1
+    tops: dict[float, float] = {}
+    for bar in whole.axes[0].patches:
+        tops[bar.get_x()] = max(tops.get(bar.get_x(), 0), bar.get_y() + bar.get_height())
+    assert dict(bars) == tops
+
+
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"layout": 2}', '{"layout": 1}', "\xff"])
 def test_a_text_that_is_no_report_is_refused(text: str) -> None:
     with pytest.raises(InvalidCommand, match="report"):

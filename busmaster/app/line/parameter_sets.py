@@ -308,6 +308,8 @@ class PartFile:
         if (begun.protocol, begun.address, begun.identity) != (empty.protocol, empty.address, empty.identity):
             raise InvalidCommand(f"{self._part} was started with another node ({begun.label}); {other}")
         own = {one.item: one for one in self._wanted}
+        if unknown := sorted((begun.entries.keys() | gaps.keys()) - own.keys()):
+            raise InvalidCommand(f"{self._part} has a parameter that is not in its list, {unknown[0]}; {other}")
         self._found = {item: Entry(own[item], entry.value) for item, entry in begun.entries.items()}
         for item, entry in gaps.items():
             self.gaps[item] = Found(own[item], why=str(entry["why"]), gap=entry.get("gap") is True)

@@ -34,7 +34,7 @@ Page = tuple[str, bytes]
 def listening(host: str, port: int) -> socket.socket:
     """Open a socket that listens on the port. Raises OSError where the port is taken."""
     family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    return socket.create_server(address[:2], family=family, backlog=BACKLOG)
+    return socket.create_server(address, family=family, backlog=BACKLOG)
 
 
 def page(registry: CollectorRegistry, accept: str) -> Page:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster import InvalidCommand, Node, NotStarted, Point, WriteUnconfirmed, ext
-from busmaster.app.bounds import LONGEST_WAIT
+from busmaster.app.bounds import FARTHEST_REQUESTED, LONGEST_WAIT
 from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
 from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.encoding import protocol_of
@@ -338,12 +338,23 @@ def client_request_of(params: RequestParams | WriteParams, sender: RequestSender
         return Reading(node, command, client, stops_seen, sender.reads)
     given = _options_of(params.options, node)
     now = line.bus.now()
-    asked = now if params.requested is None else min(now, seconds(params.requested, "requested"))
+    asked = now if params.requested is None else min(now, _requested(params.requested, now))
     if not command.writes:
         options = RequestOptions.of(shortened(given, now - asked), node.label)
         options = replace(options, priority=max(options.priority, sender.rights.reads))
         return Reading(node, command, client, stops_seen, options)
     return Writing(task, given, line=line, sender=sender, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+
+
+def _requested(requested: float, now: float) -> float:
+    """Return the time of a request. Raises InvalidCommand for one that cannot be of the owner's clock: it would not
+    protect from a late write."""
+    if seconds(requested, "requested") > now + FARTHEST_REQUESTED:
+        raise InvalidCommand(
+            f"requested is {requested:.0f} s, and the clock of the line's owner shows {now:.0f} s; use the time that "
+            "`now` returns"
+        )
+    return requested
 
 
 def _options_of(form: OptionsForm | None, node: Node) -> CommandOptions:

@@ -83,8 +83,11 @@ RequestGroup: TypeAlias = Callable[[RemoteGroup, int], Awaitable[None]]
 """Requests the cycles of a group as a stream of this number."""
 EVENT_BUFFER = 256
 POINTS_IN_A_MESSAGE = 50
-CLOCK_IS_RECEIVED = 3
-"""Number of clock readings. If this program is busy during one, the offset is wrong, and its writes seem old."""
+CLOCK_READINGS = 3
+"""Number of readings of the owner's clock before the first request: this program may be busy during one."""
+CLOCK_PERIOD = 60.0
+"""Seconds between two further readings. Two clocks drift apart by some seconds a day, and one stops while its machine
+is suspended. A write would seem to be old."""
 
 
 class RemoteLine(HoldsLine, Protocol):
@@ -305,7 +308,8 @@ class RemoteBus:
         """Called before a write is confirmed, with the values that it makes stale: `touched` in docs/service.md."""
         self._link: Link | None = None
         self._ahead = 0.0
-        """Seconds by which the clock of the owner's machine is ahead, less the time of the message."""
+        """Seconds by which the clock of the owner's machine is ahead."""
+        self._clock_task: asyncio.Task[None] | None = None
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._reported: set[RemoteNode] = set()
@@ -347,7 +351,9 @@ class RemoteBus:
         try:
             if self.address.startswith(TCP) and not self._safe_only:
                 # another machine, perhaps: its clock began at another moment
-                self._ahead = max([await self._receive_clock() for _ in range(CLOCK_IS_RECEIVED)])
+                for _ in range(CLOCK_READINGS):
+                    await self._read_clock()
+                self._clock_task = asyncio.create_task(self._follow_clock())
             for node, commands, stop in self._prepared:
                 for first in range(0, len(commands), MOST_CHECKED):
                     await self._ask("check", node.check_params(commands[first : first + MOST_CHECKED], stop))
@@ -582,10 +588,18 @@ class RemoteBus:
 
     # inside
 
-    async def _receive_clock(self) -> float:
-        """Return the offset of the owner's clock, less the time of the message: never more than the real offset."""
+    async def _read_clock(self) -> None:
+        """Read the owner's clock and correct the offset, if it is not possible: a slow reply permits many offsets."""
+        asked = time.monotonic()
         now: float = await self._ask("now", NoParams())
-        return now - time.monotonic()
+        lowest, highest = now - time.monotonic(), now - asked
+        self._ahead = min(max(self._ahead, lowest), highest)
+
+    async def _follow_clock(self) -> None:
+        """Read the owner's clock until the connection ends."""
+        while True:
+            await asyncio.sleep(CLOCK_PERIOD)
+            await self._read_clock()
 
     async def _ask(self, method: str, params: Struct, *, writes: bool = False) -> Any:
         asked = self.link.ask(method, params, writes=writes)
@@ -653,6 +667,8 @@ class RemoteBus:
                     listener.receive(method, params)
 
     def _lost(self) -> None:
+        if self._clock_task is not None:
+            self._clock_task.cancel()
         for listener in list(self._streams.values()):
             # One that is not accepted yet ends with the error of that.
             if not (isinstance(listener, RemoteGroup) and listener.is_opening):

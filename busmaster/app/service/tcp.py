@@ -52,7 +52,7 @@ def listening(listen: HostPort) -> socket.socket:
     host, port = listen
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        opened = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+        opened = socket.create_server(address, family=family, backlog=BACKLOG)
     except OSError as error:
         raise InvalidCommand(listening_error(host, port, error)) from None
     opened.setblocking(False)

@@ -257,11 +257,20 @@ async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
 
 
 async def test_a_unit_that_its_owner_has_changed_is_told(opened: Opened) -> None:
+    async def unit() -> str | None:
+        told = await asyncio.to_thread(opened.client.property, "5/10", "EngineeringUnits")
+        text: str | None = told.DisplayName.Text
+        return text
+
+    async with opened.owned() as line:
+        line.poll("10", unit="mm").points[0].limit(minimum=0, maximum=100)
+        await opened.is_("5/10 EURange", "Good")
+        assert await unit() == "mm"
+    await opened.shows("5/10", lambda told: told.status != "Good")
     async with opened.owned() as line:
         line.poll("10", unit="m")
         await opened.is_("5/10", "Good")
-        unit = await asyncio.to_thread(opened.client.property, "5/10", "EngineeringUnits")
-        assert unit.DisplayName.Text == "m"
+        assert await unit() == "m"
         assert (await asyncio.to_thread(opened.client.read, "5/10 EURange")).status == "BadConfigurationError"
 
 

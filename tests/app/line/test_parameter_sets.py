@@ -189,6 +189,17 @@ def test_a_save_of_another_node_is_not_continued(tmp_path: Path) -> None:
             PartFile(path, other, WANTED, KIND)
 
 
+@pytest.mark.parametrize("line", ['"9.99" = { value = 1 }', '"9.99" = { why = "no reply", gap = true }'])
+def test_a_save_with_a_parameter_that_is_not_in_its_list_is_not_continued(tmp_path: Path, line: str) -> None:
+    path = str(tmp_path / "a.toml")
+    with PartFile(path, EMPTY, WANTED, KIND) as part:
+        part.add(Found(WANTED[0], 5))
+    with (tmp_path / "a.toml.part").open("a") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(InvalidCommand, match=r"a parameter that is not in its list, 9.99; remove .*a.toml.part"):
+        PartFile(path, EMPTY, WANTED, KIND)
+
+
 def test_a_save_that_was_interrupted_before_its_first_parameter_starts_again(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     with PartFile(str(path), EMPTY, WANTED, KIND):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import gzip
 import importlib
 import os
@@ -444,6 +445,12 @@ def test_metrics_can_listen_on_addresses_of_both_families(host: str) -> None:
         socket.create_connection(listener.getsockname()[:2], PATIENCE) as scraper,
     ):
         assert scraper.getpeername()[0] == host
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="no IPv6")
+def test_metrics_listen_at_the_interface_of_a_link_local_address() -> None:
+    with pytest.raises(OSError, match=os.strerror(errno.EADDRNOTAVAIL)):  # without the interface it is no valid address
+        scrapes.listening("fe80::1%lo", 0)
 
 
 def test_a_histogram_adds_what_fine_buckets_have_up_to_each_edge() -> None:

@@ -239,6 +239,12 @@ def test_a_line_is_served_by_ipv6_too(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+def test_a_link_local_address_is_one_of_its_interface() -> None:
+    with pytest.raises(InvalidCommand, match=os.strerror(errno.EADDRNOTAVAIL)):  # without it, an invalid argument
+        listening(("fe80::1%lo", 0))
+
+
 def test_without_tokens_whoever_is_on_this_machine_reads_and_writes_nothing(tmp_path: Path) -> None:
     async def story(line: Served, address: str) -> None:
         async with connect(address) as remote:

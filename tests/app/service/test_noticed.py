@@ -8,11 +8,13 @@ import hashlib
 import time
 from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, Service, connect
+from busmaster.app.service import remote as remote_module
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.rights import Role
 from busmaster.emulator.line import Line
@@ -94,6 +96,35 @@ def test_the_owners_clock_is_known_as_well_as_the_quickest_answer_tells_it(tmp_p
             assert not way.slow_once
             assert time.monotonic() - remote.now() < 0.5
             await remote.__aexit__(None, None, None)
+
+    asyncio.run(run())
+
+
+def test_the_owners_clock_is_read_again_because_two_clocks_drift_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drift = 0.0
+    monkeypatch.setattr(remote_module, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + drift))
+    monkeypatch.setattr(remote_module, "CLOCK_PERIOD", 0.02)
+
+    async def run() -> None:
+        nonlocal drift
+        async with (
+            asyncio.timeout(PATIENCE),
+            served(tmp_path, listen=("127.0.0.1", 0)) as line,
+            by_way(line) as (way, address),
+        ):
+            async with connect(address) as remote:
+                controller = Hcp2Controller(remote, 5)
+                for drift in (3.0, -3.0, 500.0, 0.0):
+                    await until(lambda: abs(remote.now() - time.monotonic()) < 0.2)
+                    assert await controller.read(1, start_within=2) == 0
+                way.slow_once = 0.5
+                await until(lambda: not way.slow_once)
+                for _ in range(3):  # a slow reply permits many offsets, and changes nothing
+                    assert await controller.read(1, start_within=2) == 0
+                    assert abs(remote.now() - time.monotonic()) < 0.2
+            await until(lambda: not any("_follow_clock" in str(task) for task in asyncio.all_tasks()))
 
     asyncio.run(run())
 

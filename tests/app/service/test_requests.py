@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, ext
 from busmaster.app import bounds
+from busmaster.app.bounds import FARTHEST_REQUESTED
 from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.client import MOST_FAILED, Requests
 from busmaster.app.service.client_messages import RequestParams, WriteParams
@@ -109,9 +111,26 @@ def test_a_request_of_the_future_has_no_more_time_than_one_of_now(request_: dict
     async def story(line: Served) -> None:
         async with raw(line) as client, busy(line):
             said = await client.ask(
-                "request", **request_, requested=line.bus.now() + PATIENCE, options={"finish_within": 0.01}
+                "request",
+                **request_,
+                requested=line.bus.now() + FARTHEST_REQUESTED / 2,
+                options={"finish_within": 0.01},
             )
             assert error_of(said) == "NotStarted"
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("request_", [READ, write(1.0)], ids=["read", "write"])
+def test_a_time_that_is_not_of_the_owners_clock_is_refused(request_: dict[str, Any], tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for requested in (time.time(), line.bus.now() + FARTHEST_REQUESTED + 5):
+                said = await client.ask("request", **request_, requested=requested)
+                assert (said["error"]["code"], error_of(said)) == (INVALID_PARAMS, "InvalidCommand")
+                assert "use the time that `now` returns" in said["error"]["message"]
+            nearly = line.bus.now() + FARTHEST_REQUESTED - 5
+            assert "result" in await client.ask("request", **request_, requested=nearly)
 
     on_a_line(tmp_path, story)
 

@@ -1,8 +1,8 @@
 """`python -m tests.verification.mutation.planted`: do the tests notice the bugs that were planted by hand?
 
-    python -m tests.verification.mutation.planted                  # all of them, some minutes python -m
-    tests.verification.mutation.planted --only authorisation/ safe  # those with one of these words in file or text
-    python -m tests.verification.mutation.planted --page           # write the tables of docs/planted-bugs.md
+    python -m tests.verification.mutation.planted                    # all of them, some minutes
+    python -m tests.verification.mutation.planted --only config/ safe  # those with one of these words in file or text
+    python -m tests.verification.mutation.planted --page             # write the tables of docs/planted-bugs.md
 
 Each file `planted_*.json` beside this one has the bugs of some rooms: the `file`, the `old` text, which must occur
 exactly once in it, the `new` text, what the `bug` is in words, the `tests` that must notice it, how it was `chosen`,
