@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ast
 import inspect
-import textwrap
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -97,14 +98,19 @@ def _described(keys: Iterable[Key], *sections: type) -> tuple[Key, ...]:
 
 def attribute_docs(kind: type) -> dict[str, str]:
     """Return the docstring of each attribute of a class, by name."""
-    [definition] = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    assert isinstance(definition, ast.ClassDef)
     docs = {}
-    for statement, text in pairwise(definition.body):
+    for statement, text in pairwise(_definitions(kind.__module__)[kind.__qualname__].body):
         match statement, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(about))):
                 docs[name] = " ".join(about.split())
     return docs
+
+
+@cache
+def _definitions(module: str) -> dict[str, ast.ClassDef]:
+    """Return the classes of a module by name. `inspect.getsource` of a class would parse the module each time."""
+    parsed = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: node for node in parsed.body if isinstance(node, ast.ClassDef)}
 
 
 def _options(header: str, nodes: str, options_of: Callable[[NodeKind], Sequence[Option]]) -> Iterator[TableKeys]:
