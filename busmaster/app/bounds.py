@@ -171,6 +171,19 @@ MOST_SILENT = 256
 MOST_ASKING = 400
 """Requests that are answered at a time: more are answered with 503."""
 
+# `busmaster modbus-tcp`
+
+MOST_MODBUS_CONNECTIONS = 128
+"""Connections at a time. One more closes another one, or is refused."""
+MOST_MODBUS_PER_PEER = 32
+"""Connections of one address: one more is refused."""
+MOST_MODBUS_ON_LINE = 4
+"""Pass-through requests of one address on the line at a time: further ones wait."""
+MOST_MODBUS_UNREAD = 4096
+"""Bytes of requests, and of replies, that are held for one connection: TCP makes the client wait for the rest."""
+MODBUS_SEND_WITHIN = 10.0
+"""Seconds in which a client must read its replies: otherwise its connection is closed."""
+
 # `busmaster opcua`
 
 MOST_CONNECTIONS = 100

@@ -21,8 +21,8 @@ LONGEST_NUMBER = 20
 class Between(NamedTuple):
     """The least and the most that a number may be, bounds included, and its unit: beside its type, in `Annotated`.
 
-    The reader of a file rejects other numbers. If `self_checked`, the class that has the number does so itself, with a
-    more specific message.
+    Of a text, `most` is the largest number of characters. The reader of a file rejects other values. If `self_checked`,
+    the class that has the number does so itself, with a more specific message.
     """
 
     least: float = -inf

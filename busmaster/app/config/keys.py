@@ -164,6 +164,8 @@ def _plain(hint: Any, between: Between) -> Form:
         return whole(between)
     if float in members:
         return number(between)
+    if str in members and between.most < math.inf:
+        return text(int(between.most))
     return next(form for kind, form in FORMS.items() if kind in members)
 
 
@@ -222,6 +224,18 @@ def number(between: Between) -> Form:
     if self_checked:
         return Form(ranged("number", between), schema, Table.number)
     return Form(ranged("number", between), schema, read_seconds if unit == "s" and most < math.inf else read)
+
+
+def text(most: int) -> Form:
+    """Return the form of a text with at most so many characters."""
+
+    def read(table: Table, key: str) -> str:
+        value = table.text(key)
+        if len(value) > most:
+            raise table.error(f"must have at most {most} characters, not {len(value)}", key)
+        return value
+
+    return Form(f"text, at most {most} characters", {**TEXT_SCHEMA, "maxLength": most}, read)
 
 
 def ranged(name: str, between: Between) -> str:

@@ -59,12 +59,6 @@ PROTOCOL = Form("text", {"$ref": "#/$defs/protocol_name"}, lambda table, key: ta
 ADDRESS = Form("whole number, or range as text", {"anyOf": [{"type": "integer", "minimum": 0}, {"type": "string"}]})
 
 
-def _check_title(title: str) -> str:
-    if len(title) > LONGEST_TITLE:
-        raise InvalidCommand(f"a title must have at most {LONGEST_TITLE} characters, not {len(title)}")
-    return title
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProtocolSection:
     """Defaults for all nodes of one protocol."""
@@ -150,7 +144,7 @@ class LineFile:
     """The contents of one file. `table` is the whole file, for messages."""
 
     path: Internal[str]
-    title: Annotated[str, Parsed(_check_title)] = ""
+    title: Annotated[str, Between(most=LONGEST_TITLE)] = ""
     """The name of the line in lists, views and pages. By default the file's name."""
     port: Annotated[SerialPort | TcpPort, PORT]
     """The PORT, as on the command line: a device path, `usb:SERIAL`, or `socket://HOST:PORT`; or a table: `[port]`."""

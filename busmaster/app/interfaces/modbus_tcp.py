@@ -35,7 +35,14 @@ from busmaster import (
     Refused,
     Superseded,
 )
-from busmaster.app.bounds import REQUEST_WITHIN
+from busmaster.app.bounds import (
+    MODBUS_SEND_WITHIN,
+    MOST_MODBUS_CONNECTIONS,
+    MOST_MODBUS_ON_LINE,
+    MOST_MODBUS_PER_PEER,
+    MOST_MODBUS_UNREAD,
+    REQUEST_WITHIN,
+)
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.reported_refusals import ReportedRefusals
 from busmaster.app.service.picture import Row
@@ -48,21 +55,10 @@ from busmaster.ext import meant, protocols, read_file
 
 OWN_UNITS = (0, 255)
 """Unit ids of the server itself, by the Modbus TCP guide: with --pass-through only these have the points."""
-MOST_CONNECTIONS = 128
-"""One more closes another one, or is refused: see `ModbusTcpServer._make_room`."""
-MOST_PER_PEER = 32
-"""Connections of one address: one more is refused."""
 IDLE = 120.0
 """Seconds without a request, by default: then the connection is closed."""
-SEND_WITHIN = 10.0
-"""Seconds in which a client must read its replies."""
-UNREAD = 4096
-"""Bytes of requests, and of replies, that are held for one connection: TCP makes the client wait for the rest."""
 FINISH_WITHIN = 3.0
 """Seconds in which a unit of the line must have replied. Many Modbus TCP clients wait no longer."""
-MOST_ON_LINE = 4
-"""Pass-through requests of one address on the line at once; the others wait. With 128 at once, a further client got no
-reply within FINISH_WITHIN. A line carries one at a time, so more would not make it faster."""
 LOOK_EVERY = 0.25
 """Seconds between two looks for other points of the line."""
 ASK_AGAIN = 1.0
@@ -748,7 +744,9 @@ class Answers:
         if ("modbus", unit) not in line.picture.nodes:
             raise ExceptionReply(NO_PATH, f"the line has no Modbus RTU unit {unit}")
         finish_by = time.monotonic() + FINISH_WITHIN
-        turns = self._turns.setdefault(peer_of(peer), asyncio.Semaphore(MOST_ON_LINE))
+        # With 128 at a time on the line, a further client got no reply within FINISH_WITHIN. A line carries one at a
+        # time, so more than MOST_MODBUS_ON_LINE would not make it faster.
+        turns = self._turns.setdefault(peer_of(peer), asyncio.Semaphore(MOST_MODBUS_ON_LINE))
         try:
             async with asyncio.timeout(FINISH_WITHIN):
                 await turns.acquire()
@@ -825,14 +823,14 @@ class ModbusTcpServer:
         host = str((writer.get_extra_info("peername") or ("unknown",))[0])
         peer = peer_of(host)
         # A replaced connection still counts: its request is still on the line.
-        if sum(other == peer for other in (*self._open.values(), *self._replaced.values())) >= MOST_PER_PEER:
-            self._refuse(writer, peer, f"beyond {MOST_PER_PEER} of one address")
+        if sum(other == peer for other in (*self._open.values(), *self._replaced.values())) >= MOST_MODBUS_PER_PEER:
+            self._refuse(writer, peer, f"beyond {MOST_MODBUS_PER_PEER} of one address")
             return
-        if len(self._open) >= MOST_CONNECTIONS and not self._make_room(peer):
-            self._refuse(writer, peer, f"beyond {MOST_CONNECTIONS}: all have a request on the line")
+        if len(self._open) >= MOST_MODBUS_CONNECTIONS and not self._make_room(peer):
+            self._refuse(writer, peer, f"beyond {MOST_MODBUS_CONNECTIONS}: all have a request on the line")
             return
         self._open[writer] = peer
-        writer.transport.set_write_buffer_limits(high=UNREAD)
+        writer.transport.set_write_buffer_limits(high=MOST_MODBUS_UNREAD)
         try:
             await self._serve(reader, writer, host)
         except BadFrame as bad:
@@ -854,7 +852,8 @@ class ModbusTcpServer:
         """
         idle = next((one for one in self._open if one not in self._busy), None)
         if idle is not None:
-            self._refuse(idle, self._open.pop(idle), f"beyond {MOST_CONNECTIONS}: the one idle for the longest time")
+            why = f"beyond {MOST_MODBUS_CONNECTIONS}: the one idle for the longest time"
+            self._refuse(idle, self._open.pop(idle), why)
             return True
         counts = Counter(self._open.values())
         [(most, count)] = counts.most_common(1)
@@ -862,7 +861,7 @@ class ModbusTcpServer:
             return False
         oldest = next(one for one, other in self._open.items() if other == most)
         self._replaced[oldest] = self._open.pop(oldest)
-        self._refuse(oldest, most, f"beyond {MOST_CONNECTIONS}: one of the address with the most")
+        self._refuse(oldest, most, f"beyond {MOST_MODBUS_CONNECTIONS}: one of the address with the most")
         return True
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str) -> None:
@@ -886,10 +885,10 @@ class ModbusTcpServer:
                 self._busy.discard(writer)
             writer.write(HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply)
             try:
-                async with asyncio.timeout(SEND_WITHIN):
+                async with asyncio.timeout(MODBUS_SEND_WITHIN):
                     await writer.drain()
             except TimeoutError:
-                raise BadFrame(f"replies not read for {SEND_WITHIN:g} s") from None
+                raise BadFrame(f"replies not read for {MODBUS_SEND_WITHIN:g} s") from None
             await asyncio.sleep(0)  # a client that sends without pause is served in turn with the others
 
     def _refuse(self, writer: asyncio.StreamWriter, peer: str, why: str) -> None:
@@ -919,7 +918,7 @@ async def serve(
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(values.run())
         tasks.create_task(values.line.follow())
-        async with await asyncio.start_server(server.accept, sock=socket, limit=UNREAD) as accepting:
+        async with await asyncio.start_server(server.accept, sock=socket, limit=MOST_MODBUS_UNREAD) as accepting:
             opened(address_text(*accepting.sockets[0].getsockname()[:2]))
             await accepting.serve_forever()
 

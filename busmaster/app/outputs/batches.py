@@ -23,7 +23,7 @@ SPILLED_AT_ONCE = 200
 
 
 class BatchOutput(SpillingOutput, Generic[Formatted]):
-    """An output that writes batch by batch: all of a batch, or nothing of it."""
+    """An output that writes batch by batch. A batch whose `commit` fails is written again as a whole."""
 
     def __init__(
         self,
@@ -44,7 +44,11 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
 
     @abstractmethod
     def commit(self, batch: list[Formatted]) -> None:
-        """Write the batch whole. It raises, having written nothing, where that fails."""
+        """Write the whole batch. Raises an error if that fails; the same items are then in the next batch.
+
+        A file or a database must undo a part that it has written. A connection cannot undo the part that it has sent:
+        the receiver can get these values twice, so it must accept repeated values.
+        """
 
     @abstractmethod
     def pack(self, formatted: Formatted) -> str:

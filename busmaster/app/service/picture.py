@@ -117,7 +117,10 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The line itself. `now` by the bus's clock, `elapsed` since its start, in seconds; `utilisation` from 0 to 1."""
+    """The line itself. Times are in seconds: `now` by the bus's clock, `elapsed` since the last reset of the counts.
+
+    `utilisation` is from 0 to 1.
+    """
 
     title: str
     line: str

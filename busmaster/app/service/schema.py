@@ -29,6 +29,10 @@ def service_schema() -> dict[str, Any]:
     for component in components.values():
         _close(component)
     components["ReplyTimesForm"] |= REPLY_TIMES_SCHEMA
+    # the point of a client, which can omit the names
+    components["PolledPoint"] = {**components["PointForm"], "title": "PolledPoint"}
+    for name in ("GatherParams", "PollParams"):
+        components[name]["properties"]["points"]["items"] = {"$ref": f"{REFERENCE}PolledPoint"}
     components["PointForm"]["required"] = list(components["PointForm"]["properties"])
     error = schemas[len(named)]
     definitions = {

@@ -108,7 +108,7 @@ def test_ranges_multiply_and_stand_for_a_thousand_names_at_most() -> None:
         ("period = 1\n", "period = 86401\n", "groups.g.period: must be a number of seconds, 0 to 86400"),
         ("period = 1\n", "period = 1\nphase = 1e308\n", "groups.g.phase: must be a number of seconds, 0 to 86400"),
         ("[nodes.d1-9]\n", "[nodes.d1-9]\nreply_time = 1e308\n", "reply_time: must be a number of seconds, 0 to 10"),
-        ("port", f'title = "{"x" * 201}"\nport', "title: a title must have at most 200 characters, not 201"),
+        ("port", f'title = "{"x" * 201}"\nport', "title: must have at most 200 characters, not 201"),
     ],
 )
 def test_times_and_titles_are_bounded(old: str, new: str, complaint: str) -> None:

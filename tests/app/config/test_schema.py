@@ -144,7 +144,7 @@ def test_json_schema_allows_what_the_program_reads_and_rejects_other_types() -> 
 
 
 def test_a_value_beyond_its_bounds_is_rejected_by_the_program_and_by_the_json_schema() -> None:
-    bounded = 0
+    bounded = limited_texts = 0
     for table, key in KEYS:
         data, place = placed(table)
         schema = key.form.schema
@@ -156,10 +156,17 @@ def test_a_value_beyond_its_bounds_is_rejected_by_the_program_and_by_the_json_sc
             assert allows(key, bound), key
             assert not allows(key, bound + beyond), key
             assert problem_of(data, place, key.name, bound + beyond), f"{table.header} {key.name} = {bound + beyond}"
+        if (longest := schema.get("maxLength")) is not None:
+            limited_texts += 1
+            assert allows(key, "x" * longest), key
+            assert not problem_of(data, place, key.name, "x" * longest), key
+            assert not allows(key, "x" * (longest + 1)), key
+            assert f"at most {longest} characters" in problem_of(data, place, key.name, "x" * (longest + 1)), key
         if key.form.shown.startswith('`"'):  # one of several texts
             assert not allows(key, "none-of-them"), key
             assert str(schema["enum"][0]) in problem_of(data, place, key.name, "none-of-them"), key
     assert bounded > 100
+    assert limited_texts > 0
 
 
 def test_a_key_that_is_left_out_has_its_default() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import os
 import re
 import signal
@@ -18,6 +19,7 @@ import pytest
 
 from busmaster import connect
 from tests.app.cli.conftest import ENVIRONMENT, owner, serve
+from tests.app.interfaces.test_following import Remote, connected, row, shown_frame
 from tests.docs.pages import ROOT
 from tests.patience import PATIENCE
 
@@ -80,6 +82,20 @@ def requested(port: int, *requests: str) -> list[str]:
 def test_the_page_shows_the_module_that_is_tested() -> None:
     module = (INSTALLED / "busmaster_lines.py").read_text()
     assert f"```python\n{module}```" in (ROOT / "docs" / "adding-an-interface.md").read_text()
+
+
+@pytest.mark.asyncio
+async def test_no_point_is_unknown_before_the_first_picture_is_complete(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(INSTALLED))
+    reply = importlib.import_module("busmaster_lines").reply
+    line = connected(Remote())
+    assert await reply(line, "winder/10") == "error: the points are not known yet"
+    line.picture.frame = shown_frame(points=1)
+    assert await reply(line, "winder/10") == "error: the points are not known yet"
+    line.picture._rows[0] = [row(value=1.5)]
+    assert await reply(line, "winder/10") == "1.5"
+    assert await reply(line, "winder/11") == "error: no point 'winder/11'"
+    sys.modules.pop("busmaster_lines")
 
 
 @pytest.fixture

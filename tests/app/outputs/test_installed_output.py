@@ -7,11 +7,12 @@ import importlib
 import socket
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from busmaster import MemoryPort
+from busmaster import MemoryPort, Quality
 from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.schema import tables
 from busmaster.app.config.sections import read
@@ -133,6 +134,16 @@ async def test_it_is_not_down_when_nobody_receives_and_sends_numbers_only() -> N
         await until(lambda: line.outputs.statistics()[0].written >= 5)
         assert line.outputs.statistics()[0].error == ""
     assert [text for text in reported if "down" in text] == []
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_value_that_a_write_has_made_stale_is_not_sent() -> None:
+    influx = importlib.import_module("busmaster_influx")
+    read = cycle(1, 1.0, 2.0)
+    qualities = zip(read.samples.items(), (Quality.LATE, Quality.STALE), strict=True)
+    samples = {point: sample._replace(quality=quality) for (point, sample), quality in qualities}
+    [line] = influx.lines(replace(read, samples=samples))
+    assert " value=1.0 " in line
 
 
 @pytest.mark.usefixtures("_installed")

@@ -290,8 +290,11 @@ def test_a_version_that_is_not_spoken_is_said(tmp_path: Path) -> None:
             assert said["error"]["message"] == (
                 "the service protocol has version 3 here, not [0, 99]; update the older of the two programs"
             )
+            assert (said["id"], said["error"]["code"], "data" in said["error"]) == (None, -32602, False)
         async with raw(line, hello=False) as client:
-            assert "the first message must be hello" in (await client.ask("groups"))["error"]["message"]
+            said = await client.ask("groups")
+            assert "the first message must be hello" in said["error"]["message"]
+            assert (said["id"], said["error"]["code"], "data" in said["error"]) == (None, -32600, False)
 
     on_a_line(tmp_path, story)
 

@@ -52,6 +52,8 @@ def test_it_has_the_messages_that_the_page_tells_of() -> None:
         ({"id": 1, "method": "request", "params": REQUEST}, False),
         ({"jsonrpc": "2.0", "method": "request", "params": REQUEST}, False),
         ({"jsonrpc": "2.0", "method": "cancel", "params": {"id": 1}}, True),
+        ({"jsonrpc": "2.0", "id": 1, "method": "gather", "params": {"stream": 1, "points": [REQUEST]}}, True),
+        ({"jsonrpc": "2.0", "id": 1, "method": "gather", "params": {"stream": 1, "points": [{"key": "5/1"}]}}, False),
         ({"jsonrpc": "2.0", "id": 1, "method": "shutdown", "params": {}}, False),
         ({"jsonrpc": "2.0", "id": 1, "method": "statistics", "params": {}}, True),
         ({"jsonrpc": "2.0", "id": 1, "method": "statistics", "params": {"all": True}}, False),

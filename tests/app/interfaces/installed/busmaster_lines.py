@@ -45,7 +45,10 @@ async def serve(line: Following, host: str, port: int) -> None:
 async def reply(line: Following, request: str) -> str:
     """Return a value, "ok" for a write, or why there is none."""
     key, is_write, number = request.partition("=")
-    row = next((row for row in line.picture.rows if row.key == key), None)
+    frame, rows = line.picture.frame, line.picture.rows
+    if frame is None or len(rows) < frame.points:  # the first picture is not complete
+        return "error: the points are not known yet"
+    row = next((row for row in rows if row.key == key), None)
     if row is None:
         return f"error: no point {key!r}"
     try:

@@ -49,11 +49,11 @@ def send(out: socket.socket, address: Any, item: Item) -> None:
 
 
 def lines(cycle: Snapshot) -> list[str]:
-    """Return a line for each good value that is a number."""
+    """Return a line for each current value that is a number. A stale value was sent before the write."""
     return [
         f"busmaster,point={point.key} value={float(sample.value)} {int(sample.wall * 1e9)}"
         for point, sample in cycle.samples.items()
-        if sample.error is None and isinstance(sample.value, int | float)
+        if sample.quality.is_current and isinstance(sample.value, int | float)
     ]
 
 
