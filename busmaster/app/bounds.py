@@ -106,7 +106,7 @@ LONGEST_REPLY = 5.0
 LONGEST_WAIT = 86_400.0
 """Seconds of `start_within` and `finish_within` of a client's request: a day."""
 FARTHEST_REQUESTED = 60.0
-"""Seconds by which the `requested` of a client may be ahead of the owner's clock: more is no time of that clock."""
+"""Seconds by which the `requested` of a client may be ahead of the owner's clock. More is from another clock."""
 
 # Logins by token or password, at whatever interface
 

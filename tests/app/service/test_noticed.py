@@ -103,12 +103,11 @@ def test_the_owners_clock_is_known_as_well_as_the_quickest_answer_tells_it(tmp_p
 def test_the_owners_clock_is_read_again_because_two_clocks_drift_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drift = 0.0
-    monkeypatch.setattr(remote_module, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + drift))
+    clock = SimpleNamespace(ahead=0.0, monotonic=lambda: time.monotonic() + clock.ahead)
+    monkeypatch.setattr(remote_module, "time", clock)
     monkeypatch.setattr(remote_module, "CLOCK_PERIOD", 0.02)
 
     async def run() -> None:
-        nonlocal drift
         async with (
             asyncio.timeout(PATIENCE),
             served(tmp_path, listen=("127.0.0.1", 0)) as line,
@@ -116,7 +115,7 @@ def test_the_owners_clock_is_read_again_because_two_clocks_drift_apart(
         ):
             async with connect(address) as remote:
                 controller = Hcp2Controller(remote, 5)
-                for drift in (3.0, -3.0, 500.0, 0.0):
+                for clock.ahead in (3.0, -3.0, 500.0, 0.0):
                     await until(lambda: abs(remote.now() - time.monotonic()) < 0.2)
                     assert await controller.read(1, start_within=2) == 0
                 way.slow_once = 0.5
