@@ -91,6 +91,11 @@ def parameters_of(target: Target, items: Sequence[str] | None = None) -> tuple[P
     return line_parameters(target.line, target.name, target.handle, items or ())
 
 
+def parameter_count(count: int) -> str:
+    """Return a number of parameters in words."""
+    return f"{count} parameter{'' if count == 1 else 's'}"
+
+
 def known_parameters(target: Target) -> tuple[Parameter, ...]:
     """Return the parameters of a node, none if there is no list."""
     try:
@@ -197,7 +202,7 @@ async def save(target: Target, parameters: Sequence[Parameter], path: str) -> in
         raise
     done = part.finish()
     gaps = sum(one.gap for one in part.gaps.values())
-    note(f"{path}: {len(done.entries)} parameters of {target.label}; without {gaps} that the node does not have")
+    note(f"{path}: {parameter_count(len(done.entries))} of {target.label}; without {gaps} that the node does not have")
     unread = [one for one in part.gaps.values() if not one.gap]
     for one in unread:
         note(f"{called(one.parameter)} could not be read: {one.why}", Level.WARNING)
@@ -390,7 +395,7 @@ async def write(target: Target, wanted: SetFile, dry_run: bool, yes: bool, enabl
             if dry_run or not plan.changes:
                 return status
             if not yes:
-                if not await agreed(f"Write {len(plan.changes)} parameters to {target.label}?"):
+                if not await agreed(f"Write {parameter_count(len(plan.changes))} to {target.label}?"):
                     note("nothing was written")
                     return FAILED
                 if not await may_be_written(target, enabled, again=True):

@@ -136,6 +136,7 @@ class SqliteSettings(SpillingSettings):
         return self.path
 
     def __post_init__(self) -> None:
+        Settings.__post_init__(self)
         for name in ("keep_days", "keep_mb"):
             value = getattr(self, name)
             if value is not None and not 0 < value < inf:

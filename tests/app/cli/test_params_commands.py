@@ -430,7 +430,7 @@ def test_a_load_is_written_after_a_yes(
     requested(f"{answer}\n".encode())
     ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", *HCP2)
     assert ran.status == 0, ran.err
-    assert "Write 1 parameters to node 1? [y/N]: " in ran.err
+    assert "Write 1 parameter to node 1? [y/N]: " in ran.err
     assert ran.err.count("make sure that it is not") == 1
     assert held(three_controllers, 10) == [1]
 

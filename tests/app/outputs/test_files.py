@@ -13,11 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.app.config.keys import keys_of
 from busmaster.app.outputs import growing_file
-from busmaster.app.outputs.base import Happening
+from busmaster.app.outputs.base import Happening, OutputKind
 from busmaster.app.outputs.cells import csv_lines, no_formula, text_cell, text_of
 from busmaster.app.outputs.files import COLUMNS, CsvOutput, JsonlOutput
 from busmaster.app.outputs.growing_file import GrowingFile
+from busmaster.app.outputs.kinds import kinds
 from busmaster.app.outputs.settings import DATE_FIELDS, FileSettings, file_mode
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.msc.status import ProgramStatus
@@ -398,7 +400,9 @@ def test_a_mode_of_something_else_is_refused(text: str) -> None:
         file_mode(text)
 
 
-def test_a_buffer_holds_one_value_at_least() -> None:
-    assert FileSettings(path="x", buffer=1).buffer == 1
+@pytest.mark.parametrize("kind", kinds(), ids=lambda kind: str(kind.name))
+def test_a_buffer_holds_one_value_at_least(kind: OutputKind) -> None:
+    required = {key.field: "x" for key in keys_of(kind.settings) if key.required}
+    assert kind.settings(**required, buffer=1).buffer == 1
     with pytest.raises(InvalidCommand, match="at least one value, not 0"):
-        FileSettings(path="x", buffer=0)
+        kind.settings(**required, buffer=0)
