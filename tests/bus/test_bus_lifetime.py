@@ -19,7 +19,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.polling import PollGroup
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
-from busmaster.emulator.line import Line
+from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, LineDown
 from busmaster.protocols._comms.mint import EmulatedMint
@@ -288,6 +288,22 @@ def test_a_bus_queues_as_many_requests_of_a_class_as_its_capacity() -> None:
             found = await asyncio.gather(*(axis.read(1) for _ in range(10)), return_exceptions=True)
             assert sorted({type(one) for one in found}, key=str) == [BacklogFull, float]
             assert 3 <= sum(isinstance(one, float) for one in found) <= 4  # one of them on the wire
+
+    run_in_virtual_time(story())
+
+
+@pytest.mark.parametrize("echo", [Echo(), Echo(0.004)])
+def test_a_bus_on_a_line_with_an_echo_does_not_take_its_own_bytes_for_a_reply(echo: Echo) -> None:
+    async def story() -> None:
+        line = Line(LineSettings(57600), [EmulatedMint(1)], chance=random.Random(1), echo=echo)
+        async with Bus(MemoryPort(line)) as bus:
+            axis = Hcp2Controller(bus, 1)
+            for value in range(5):
+                await axis.write(1, value)
+                assert await axis.read(1) == value
+            counts = Node.of(axis).statistics()
+            assert counts.ok == counts.attempts >= 10
+            assert (counts.retries, counts.late) == (0, 0)
 
     run_in_virtual_time(story())
 

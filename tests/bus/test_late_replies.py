@@ -19,9 +19,9 @@ from busmaster.testing.virtual_time import run_in_virtual_time
 READS = 20
 
 
-def line(delay: float) -> Line:
+def line(delay: float, latency: float = 0.0) -> Line:
     devices = [make_device("hcp2", 1, delay=Delay(delay))]
-    return Line(hcp2.PROFILE.line, devices, paced=True, chance=random.Random(1))
+    return Line(hcp2.PROFILE.line, devices, paced=True, chance=random.Random(1), latency=latency)
 
 
 @pytest.mark.parametrize("delay", [0.105, 0.120, 0.149])
@@ -52,6 +52,39 @@ def test_r2_what_begins_after_the_max_reply_delay_is_no_reply() -> None:
         async with Bus(MemoryPort(line(0.152))) as bus:
             with pytest.raises(NoReply, match="no reply within 150 ms"):
                 await Hcp2Controller(bus, 1).read(1, retries=0)
+
+    run_in_virtual_time(main())
+
+
+@pytest.mark.parametrize("latency", [0.016, 0.2])
+@pytest.mark.parametrize(("delay", "late"), [(0.045, False), (0.052, True), (0.105, True), (0.149, True)])
+def test_bytes_that_the_adapter_holds_back_are_as_late_as_they_were_on_the_wire(
+    delay: float, late: bool, latency: float
+) -> None:
+    async def main() -> None:
+        async with Bus(MemoryPort(line(delay, latency))) as bus:
+            node = bus.node(hcp2.PROFILE, 1)
+            drive = Hcp2Controller(bus, 1)
+            for value in range(3):
+                await drive.write(1, value)
+                assert await drive.read(1) == value
+            counts = node.statistics()
+            assert counts.ok == counts.attempts >= 6
+            assert (counts.late, counts.failed, counts.retries) == (counts.ok * late, 0, 0)
+
+    run_in_virtual_time(main())
+
+
+@pytest.mark.parametrize("latency", [0.016, 0.2])
+def test_a_reply_that_begins_after_the_max_reply_delay_is_none_for_an_adapter_that_holds_bytes_back(
+    latency: float,
+) -> None:
+    async def main() -> None:
+        async with Bus(MemoryPort(line(0.152, latency))) as bus:
+            began = bus.now()
+            with pytest.raises(NoReply):
+                await Hcp2Controller(bus, 1).read(1, retries=0)
+            assert bus.now() - began >= 0.15 + latency
 
     run_in_virtual_time(main())
 

@@ -192,6 +192,27 @@ def test_two_equal_replies_at_the_same_moment_look_like_one() -> None:
     assert line.collisions == 1
 
 
+@pytest.mark.parametrize("number", [3, 4])
+def test_several_equal_replies_at_the_same_moment_look_like_one_and_the_line_goes_on(number: int) -> None:
+    line = line_of(*(mint(2) for _ in range(number)), mint(3))
+    assert ask(line, hexed(READ_2)) == REPLY
+    assert line.collisions == number - 1
+    assert ask(line, hexed(READ_3), 1.0) == REPLY
+
+
+def test_transmissions_that_are_announced_in_any_order_begin_in_order_of_time() -> None:
+    """All but the first wait for it; two of them begin at the same moment."""
+    delays = (0.004, 0.006, 0.002, 0.008, 0.006)
+    line = line_of(*(mint(2, delay) for delay in delays))
+    line.send(READ_2, 0.0)
+    heard = arrivals(line, 0.5)
+    assert [when for when, data in heard if data.startswith("02")] == pytest.approx(
+        [8 * TAU + delay + TAU for delay in sorted(set(delays))]
+    )
+    assert " ".join(data for _, data in heard) == " ".join([REPLY] * 4)
+    assert line.collisions == 1
+
+
 def test_a_device_receives_what_is_left_of_a_collision() -> None:
     line = line_of(first := Ear(), mint(2), mint(2), last := Ear())
     ask(line, hexed(READ_2))  # two equal replies
@@ -344,6 +365,17 @@ def test_a_cut_may_spare_the_devices_before_it() -> None:
     line.cut(0.0, far)
     assert ask(line, hexed(READ_2)) == REPLY
     assert ask(line, hexed(READ_3), 1.0) == ""
+
+
+def test_a_device_that_is_cut_off_and_speaks_by_its_own_timer_is_not_heard() -> None:
+    device = Insister(1)
+    device.wakeup = 0.005
+    line = line_of(device, mint(3))
+    line.cut(0.0, device)
+    assert arrivals(line, 0.1) == []
+    assert ask(line, hexed(READ_3), 0.1) == REPLY
+    line.restore(1.0)
+    assert [data for _, data in arrivals(line, 1.03)][:2] == ["68", "65 72 65"]
 
 
 def test_each_cut_disconnects_further_devices_until_all_are_restored() -> None:

@@ -259,6 +259,25 @@ def test_inputs_outputs_and_analog_channels_can_be_read() -> None:
     ]
 
 
+def test_each_of_the_eight_analog_channels_has_its_own_element() -> None:
+    mint = EmulatedMint(1)
+    line = line_of(mint)
+    volts = (1.5, 2.5, -3.5, 4.5, 5.5, 6.5, 7.5, -8.5)
+    mint.preset("224", *volts)
+    assert [float(value(ask(line, read(1, element), element))) for element in range(223, 233)] == [0, *volts, 0]
+    assert {ask(line, write(1, element, "1"), element + 100) for element in (224, 231)} == {NAK}
+    with pytest.raises(InvalidCommand, match="element 232 cannot be given"):
+        mint.preset("231", 1, 2)
+
+
+def test_an_axis_of_several_that_has_an_error_is_named() -> None:
+    mint = EmulatedMint(1)
+    line = line_of(mint)
+    assert value(ask(line, read(1, 234))) == "0"
+    mint.axes[2].error, mint.axes[1].error = 5, 9
+    assert value(ask(line, read(1, 234), 1.0)) == "1", "the first of them"
+
+
 def test_reserved_elements_read_zero_or_are_refused_if_so_set() -> None:
     assert value(ask(line_of(EmulatedMint(1)), read(1, 221))) == "0"
     assert ask(line_of(EmulatedMint(1, refuse_reserved=True)), read(1, 221)) == NAK
@@ -324,6 +343,7 @@ def test_the_command_handshake_loses_a_command_that_comes_between_its_read_and_i
     mint.run(1.0)
     while mint.line_number != 4:  # Comms(1) has been read as 0
         mint.run(mint.now + mint.statement)
+    assert mint.read_element(237, mint.now) == 4
     assert mint.write_element(1, 1.0, mint.now)
     mint.comms[2:4] = [10.0, 5.0]
     mint.run(mint.now + 2.0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
 
 from busmaster import Bus, CtAnsiDrive, InvalidCommand, MemoryPort, NoSuchParameter, Refused, VerifyFailed
-from busmaster.contract.exchange import Done
+from busmaster.contract.exchange import Done, FrameError
 from busmaster.contract.frames import Kind
 from busmaster.emulator.line import Line
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
@@ -69,6 +70,15 @@ def test_ct_ansi_keeps_the_contract() -> None:
     )
 
 
+def reply_with(data: str) -> bytes:
+    """Return the reply of a drive that sends these characters as the value of 01.21."""
+    covered = b"0121" + data.encode() + b"\x03"
+    check = 0
+    for byte in covered:
+        check ^= byte
+    return b"\x02" + covered + bytes((check if check >= 0x20 else check + 0x20,))
+
+
 @pytest.mark.parametrize(
     ("data", "value"),
     [
@@ -84,15 +94,19 @@ def test_ct_ansi_keeps_the_contract() -> None:
     ],
 )
 def test_data_have_a_decimal_point_or_none(data: str, value: float) -> None:
-    covered = b"0121" + data.encode() + b"\x03"
-    check = 0
-    for byte in covered:
-        check ^= byte
-    reply = b"\x02" + covered + bytes((check if check >= 0x20 else check + 0x20,))
-    step = Read(1, 21).open(12, PROFILE.timings).feed(reply)
+    step = Read(1, 21).open(12, PROFILE.timings).feed(reply_with(data))
     assert step == Done(value)
     assert isinstance(step, Done)
     assert type(step.value) is type(value)
+
+
+@pytest.mark.parametrize(
+    "data", ["12.5.7", "1 2", "12 ", "-47.6-", "--5", "+ 5", "5A", ".", "-", "", " ", "X", "X1G", "X1F ", "-X1F"]
+)
+def test_data_of_which_only_a_part_is_a_number_are_no_value(data: str) -> None:
+    for command in (Read(1, 21), ReadRun(1, 21, 2)):
+        with pytest.raises(FrameError, match=re.escape(f"{data.encode()!r} is not a number")):
+            command.open(12, PROFILE.timings).feed(reply_with(data))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from busmaster.arbiter.transaction import Priority
 from busmaster.bus.node import Node
 from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay
-from busmaster.emulator.line import Line
+from busmaster.emulator.line import Echo, Line
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2.codec import Read, Write
@@ -77,6 +77,17 @@ def test_failed_attempts_and_retries_are_no_part_of_the_share() -> None:
     report = bench("hcp2", [1], virtual=True, seconds=5, faults=["lost=0.2"])
     assert 0 < report.share < 0.5
     assert report.values == report.total.count, "a sync read after a lost frame has no caller"
+
+
+@pytest.mark.parametrize("delay", [Delay(0.0), Delay(0.003), Delay(0.0, 0.006)])
+def test_the_limit_is_that_of_the_known_reply_delay_however_late_the_drive_replies(delay: Delay) -> None:
+    def once(*faults: str) -> BenchReport:
+        return bench("hcp2", [1], virtual=True, seconds=1, delay=delay, faults=faults)
+
+    on_time, late = once(), once("late=1", "late_by=0.05")
+    assert late.limit == pytest.approx(on_time.limit)
+    assert late.share < 0.5
+    assert on_time.share == pytest.approx(1, abs=0.1)
 
 
 def test_the_same_arguments_give_the_same_report_and_another_seed_another() -> None:
@@ -171,6 +182,20 @@ def test_an_open_bus_is_measured_by_its_own_handles() -> None:
     assert list(report.nodes) == ["3", "4"]
     assert report.share == pytest.approx(1, abs=0.02), "the reply delay is observed, not known"
     assert "virtual" not in report.line
+
+
+def test_the_bytes_of_the_echo_take_no_further_time_on_the_wire() -> None:
+    async def main(echo: Echo | None) -> BenchReport:
+        devices = [make_device("hcp2", 3, delay=Delay(0.004))]
+        async with Bus(MemoryPort(Line(find("hcp2").profile.line, devices, echo=echo))) as bus:
+            measurement = Measurement(bus, [Hcp2Controller(bus, 3)], Workload(seconds=1), reply_delay=0.004)
+            await measurement.run_open()
+            return measurement.report()
+
+    plain, echoed = (run_in_virtual_time(main(echo)) for echo in (None, Echo()))
+    assert plain.share == pytest.approx(1, abs=0.01)
+    assert echoed.share == pytest.approx(plain.share, abs=0.01)
+    assert echoed.limit == pytest.approx(plain.limit, rel=0.01)
 
 
 def test_the_fixture_measures(latency_bench: Callable[..., BenchReport]) -> None:

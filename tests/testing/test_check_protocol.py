@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import count
 from typing import Any, ClassVar
 
@@ -139,6 +139,10 @@ class SizedBackwards(Asking):
     sizes = Sizes(9, 8)
 
 
+class SizedBackwardsInALaterStep(Asking):
+    later = (LaterStep(MODBUS.timings.packet, Sizes(6, 5)),)
+
+
 class ClosingWithMoreThanItSays(Asking):
     def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
         progress = super().feed(data)
@@ -156,6 +160,12 @@ class Unanswered(Asking):
 class WithATimingOfItsOwn(Asking):
     def __init__(self, request: bytes, timing: ReplyTiming) -> None:
         super().__init__(request, ReplyTiming(0.1, 0.2, 0.3, 0.4))
+
+
+class SendingNothing(Asking):
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, timing)
+        self.request = b""
 
 
 class NumberingItsRequests(Asking):
@@ -182,11 +192,13 @@ class NumberingItsRequests(Asking):
         (BeginningElsewhere, "its reply begins with 11, which is not in starts"),
         (SmallerThanItSays, "a step of 7 bytes is longer than the 5 announced"),
         (SizedBackwards, "typically 9 and at most 8 bytes"),
+        (SizedBackwardsInALaterStep, "typically 6 and at most 5 bytes"),
         (ClosingWithMoreThanItSays, "closes with 1 bytes, not with the 0 announced"),
         (WithALegTooMany, "1 steps in place of the 2 announced"),
         (Unanswered, "a read without a reply"),
         (WithATimingOfItsOwn, "does not use the read or write timing"),
         (NumberingItsRequests, "sends .*, and then"),
+        (SendingNothing, r"ReadRegister\(.*\) sends '', and then ''"),
     ],
 )
 def test_a_bug_in_a_reader_is_found(exchange: type[Asking], finding: str) -> None:
@@ -256,6 +268,13 @@ class HashedByIdentity(Unhashable):
         return id(self)
 
 
+class Wordless(Loose):
+    idempotent = 1  # type: ignore[assignment]  # a bug that a type checker would see
+
+    def __str__(self) -> str:
+        return ""
+
+
 class Reopened(Loose):
     def open(self, address: int, timings: Timings, /) -> Asking:
         return ONE_EXCHANGE
@@ -274,6 +293,8 @@ ONE_EXCHANGE = ReadRegister(7).open(17, MODBUS.timings)
         (Unhashable(), "is not hashable"),
         (HashedByIdentity(), "has another hash than its copy"),
         (HashedByIdentity(), "writes and idempotent are True or False"),
+        (Wordless(), "has no text"),
+        (Wordless(), "writes and idempotent are True or False"),
         (Reopened(), "opens the same exchange twice"),
     ],
 )
@@ -296,6 +317,22 @@ def test_bugs_in_a_profile_are_found() -> None:
     assert "the probe WriteRegister" in find(profile=replace(MODBUS, probe=WriteRegister(0, 0)))
     deaf = type("Deaf", (Loose,), {"open": lambda self, address, timings: ReadRegister(7).open(1, timings)})
     assert "addresses 1 and 2 have the same request 01 03" in find(profile=replace(MODBUS, probe=deaf()))
+
+
+class TakingAnyAddress(Profile):
+    taken: ClassVar[int]
+
+    def check_address(self, address: int) -> None:
+        if address != self.taken:
+            super().check_address(address)
+
+
+@pytest.mark.parametrize("wrong", [0, 248])
+def test_an_address_before_the_first_or_after_the_last_that_is_accepted_is_found(wrong: int) -> None:
+    kind = type("Taking", (TakingAnyAddress,), {"taken": wrong})
+    taking = kind(**{one.name: getattr(MODBUS, one.name) for one in fields(MODBUS)})
+    assert re.search(r"invalid\[\d\] builds None", find(profile=taking))
+    check_protocol(replace(taking, broadcast=wrong), CASES, names=named)
 
 
 class DeafListener:

@@ -127,6 +127,11 @@ def test_the_printed_map_has_what_may_be_written(
         (("--type", "float16"), "--type"),
         (("--allow", "*", "--allow-from", "::1", "--allow-from", "here"), "--allow-from: 'here'"),
         (("--allow-unit", "3", "--allow-from", "::1"), "needs --pass-through"),
+        (("--bind", "0.0.0.0:0", "--allow", "*"), "needs --allow-from"),
+        (("--bind", "[::]:0", "--pass-through", "--allow-unit", "3"), "needs --allow-from"),
+        (("--bind", "192.0.2.1:502", "--pass-through", "--allow", "*", "--allow-unit", "3"), "needs --allow-from"),
+        (("--allow-from", "::1"), "needs points that may be written"),
+        (("--bind", "0.0.0.0:0", "--pass-through", "--allow-from", "::1"), "needs points that may be written"),
     ],
 )
 def test_what_would_open_more_than_is_meant_is_wrong_usage(

@@ -616,6 +616,22 @@ def test_the_owner_sends_its_safe_state_and_is_not_recorded(
         assert held(three_controllers, 10) == [15]
 
 
+def test_the_safe_state_goes_to_the_given_port_and_only_to_the_owner_of_that_port(
+    busmaster: Command, file: Path, three_controllers: TcpServer
+) -> None:
+    file.write_text(file.read_text() + SAFE)
+    with serve("hcp2", 1, 2, 3) as other, owner_here(file):
+        ran = busmaster("safe", str(file), "--port", other.path)
+        assert (ran.status, ran.out, ran.err) == (0, "winder/force ok\n", "")
+        assert (held(other, 10), held(three_controllers, 10)) == ([15], [0])
+        preset(other, 3)
+        moved = file.with_name("moved.toml")
+        moved.write_text(file.read_text().replace(three_controllers.path, other.path))
+        ran = busmaster("safe", str(moved), "--port", three_controllers.path)
+        assert (ran.status, ran.out, ran.err) == (0, "winder/force ok\n", used(file, three_controllers))
+        assert (held(other, 10), held(three_controllers, 10)) == ([3], [15])
+
+
 @pytest.mark.parametrize("command", ["run", "serve"])
 def test_a_second_master_is_refused(busmaster: Command, file: Path, command: str) -> None:
     with owner_here(file):

@@ -20,6 +20,8 @@ from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+from tests.transport.fakes import plugged
+from tests.transport.usb import UsbTree
 
 SETTINGS = LineSettings(19200)
 
@@ -179,3 +181,23 @@ def test_a_port_that_is_not_a_usb_adapter_keeps_its_name(tmp_path: Path) -> None
         TcpPort("h", 1),
     ):
         assert lasting(port) is port
+
+
+def test_a_usb_adapter_is_written_by_the_name_that_it_keeps(usb: UsbTree, tmp_path: Path) -> None:
+    with plugged() as numbered, plugged() as unnumbered, plugged() as other:
+        usb.plug(other.path, "A500XYZ", place="1-1")
+        usb.plug(numbered.path, "A500ABC", place="1-2")
+        usb.plug(unnumbered.path, place="1-3")
+        link = tmp_path / "ttyUSB0"
+        link.symlink_to(numbered.path)
+        for path in (numbered.path, str(link)):
+            said = SerialPort(path, baudrate=9600, echo=True)
+            kept = replace(said, path="usb:A500ABC")
+            assert lasting(said) == kept
+            found = Discovery(SETTINGS, found=[node_of(find("dc104").protocol)])
+            assert line_of(found, lasting(said), tmp_path).bus.endpoint == replace(kept, baudrate=SETTINGS.baudrate)
+        without = SerialPort(unnumbered.path, baudrate=9600)
+        assert lasting(without) is without, "there is no link to it that stays"
+        (tmp_path / "links/by-path").mkdir(parents=True)
+        (tmp_path / "links/by-path/it").symlink_to(unnumbered.path)
+        assert lasting(without).name == str(tmp_path / "links/by-path/it")
