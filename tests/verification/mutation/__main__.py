@@ -2,7 +2,8 @@
 
     python -m tests.verification.mutation --count 500 --seed 1 --jobs 2
 
-draws mutants of the arbiter, the contract, the wire, the codecs and the pump, or of other `--rooms`. It asks the tests
+draws mutants of the arbiter, the contract, the wire, the codecs and the pump, or of other `--rooms`. With `--slips`,
+they are what programmers forget: a case, an argument, a step. It asks the tests
 about each of them in a copy of what is committed, and writes each verdict into the session's file, from which the same
 command goes on after an interruption. `--report` only prints what the file holds. What is measured of the tests first,
 once for a commit, is kept beside it. It wants the extra `mutation`.
@@ -57,6 +58,9 @@ def main() -> None:
         metavar="SECONDS",
         help="of the tests that are not near, ask the quickest until so many seconds: a lower bound too (no limit)",
     )
+    parser.add_argument(
+        "--slips", action="store_true", help="draw slips of programmers (slips.py), not cosmic-ray's operators"
+    )
     parser.add_argument("--report", action="store_true", help="only print what the session's file holds")
     options = parser.parse_args()
     session = options.session or ROOT / f"mutation-{options.seed}.jsonl"
@@ -64,7 +68,7 @@ def main() -> None:
         rooms = frozenset(options.rooms.split(","))
         if unknown := rooms - set(ROOMS):
             parser.error(f"no such room: {', '.join(sorted(unknown))}; use {', '.join(ROOMS)}")
-        mutants = drawn(ROOT, options.count, options.seed, rooms)
+        mutants = drawn(ROOT, options.count, options.seed, rooms, options.slips)
         known = {key_of(verdict) for verdict in read(session)}
         left = [mutant for mutant in mutants if key_of(mutant.as_fields()) not in known]
         try_all(left, session, options, sorted(rooms))

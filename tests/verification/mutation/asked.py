@@ -20,6 +20,17 @@ NEAR: dict[str, tuple[str, ...]] = {
     "service": ("tests/app/service",),
     "outputs": ("tests/app/outputs",),
     "config": ("tests/app/config",),
+    "line": ("tests/app/line", "tests/app/config"),
+    "interfaces": ("tests/app/interfaces",),
+    "cli": ("tests/app/cli",),
+    "diagnostics": ("tests/app/diagnostics",),
+    "bus": ("tests/bus",),
+    "handles": ("tests/handles", "tests/protocols"),
+    "transport": ("tests/transport",),
+    "capture": ("tests/capture",),
+    "emulator": ("tests/emulator", "tests/protocols"),
+    "planning": ("tests/planning",),
+    "testing": ("tests/testing",),
 }
 """The tests of a room: `--near` asks no others."""
 FURTHER = (

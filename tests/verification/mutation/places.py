@@ -1,18 +1,20 @@
 """What may be mutated, room by room, and a seeded sample of it.
 
-The operators are cosmic-ray's. Left out is what no test can notice: annotations, which are never evaluated here,
-what only types are made of, and docstrings.
+The operators are cosmic-ray's, or the slips of `slips.py`. Left out is what no test can notice: annotations, which are
+never evaluated here, what only types are made of, and docstrings.
 """
 
 from __future__ import annotations
 
 import ast
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from random import Random
 from typing import Any, TypeAlias
+
+from tests.verification.mutation.slips import edits
 
 CORE: dict[str, tuple[str, ...]] = {
     "arbiter": ("busmaster/arbiter/*.py",),
@@ -30,6 +32,17 @@ OUTSIDE: dict[str, tuple[str, ...]] = {
     "service": ("busmaster/app/service/*.py",),
     "outputs": ("busmaster/app/outputs/*.py",),
     "config": ("busmaster/app/config/*.py",),
+    "line": ("busmaster/app/line/*.py",),
+    "interfaces": ("busmaster/app/interfaces/*.py",),
+    "cli": ("busmaster/app/cli/*.py",),
+    "diagnostics": ("busmaster/app/diagnostics/*.py",),
+    "bus": ("busmaster/bus/*.py",),
+    "handles": ("busmaster/protocols/*/handle.py",),
+    "transport": ("busmaster/transport/*.py",),
+    "capture": ("busmaster/capture/*.py", "busmaster/protocols/*/capture.py"),
+    "emulator": ("busmaster/emulator/*.py", "busmaster/protocols/*/device.py"),
+    "planning": ("busmaster/planning/*.py",),
+    "testing": ("busmaster/testing/*.py",),
 }
 """The rooms outside the core whose mutants can be drawn. The checks of rights are in the service."""
 ROOMS = {**CORE, **OUTSIDE}
@@ -58,11 +71,12 @@ class Mutant:
         return asdict(self)
 
 
-def places(root: Path) -> Iterator[Mutant]:
-    """All mutants of all rooms, in a fixed order."""
+def places(root: Path, rooms: Collection[str], slips: bool = False) -> Iterator[Mutant]:
+    """All mutants of these rooms, in a fixed order; with `slips`, those of `slips.py`."""
     for room in ROOMS:
-        for path in files_of(room, root):
-            yield from mutants_of(room, path, root)
+        if room in rooms:
+            for path in files_of(room, root):
+                yield from (slips_in if slips else mutants_of)(room, path, root)
 
 
 def files_of(room: str, root: Path) -> list[Path]:
@@ -99,6 +113,16 @@ def mutants_of(room: str, path: Path, root: Path) -> Iterator[Mutant]:
                 yield Mutant(room, str(path.relative_to(root)), name, occurrence, start[0])
 
 
+def slips_in(room: str, path: Path, root: Path) -> Iterator[Mutant]:
+    """All slips of one file."""
+    source = path.read_text()
+    inert = inert_spans(source)
+    for operator, those in edits(source).items():
+        for occurrence, edit in enumerate(those):
+            if not any(first <= edit.start and edit.end <= last for first, last in inert):
+                yield Mutant(room, str(path.relative_to(root)), operator, occurrence, edit.start[0])
+
+
 def inert_spans(source: str) -> list[Span]:
     """Where annotations, docstrings, protocols and imports for types are: (line, column) from the first to behind the
     last."""
@@ -127,16 +151,15 @@ def span_of(node: Any) -> Span:
     return (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)
 
 
-def drawn(root: Path, count: int, seed: int, rooms: frozenset[str]) -> list[Mutant]:
+def drawn(root: Path, count: int, seed: int, rooms: frozenset[str], slips: bool = False) -> list[Mutant]:
     """A sample of `count` places, each with one of the changes that could be made there.
 
     The same for the same seed and the same tree, in an order that is drawn too. A place counts once, however many
     operators would fit: an addition has eleven, and ten of them any test notices.
     """
     changes: dict[tuple[object, ...], list[Mutant]] = {}
-    for mutant in places(root):
-        if mutant.room in rooms:
-            changes.setdefault(place_of(mutant), []).append(mutant)
+    for mutant in places(root, rooms, slips):
+        changes.setdefault(place_of(mutant), []).append(mutant)
     chance = Random(seed)
     return [chance.choice(changes[place]) for place in chance.sample(list(changes), min(count, len(changes)))]
 

@@ -22,6 +22,7 @@ from cosmic_ray.plugins import get_operator
 
 from tests.verification.mutation.asked import NEAR, Measured, asked, changed_lines
 from tests.verification.mutation.places import WITHOUT_BYTECODE, Mutant
+from tests.verification.mutation.slips import PREFIX, slipped
 from tests.verification.mutation.warm import UNLIKE
 
 
@@ -73,7 +74,11 @@ class Copy:
         start = time.monotonic()
         path = self.folder / mutant.module
         source = path.read_text()
-        mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+        mutated: str | None
+        if mutant.operator.startswith(PREFIX):
+            mutated = slipped(source, mutant.operator, mutant.occurrence)
+        else:
+            mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
         if mutated is None or mutated == source or not is_python(mutated):
             return Verdict("impossible", 0.0, "", "")
         diff = "\n".join(difflib.unified_diff(source.splitlines(), mutated.splitlines(), lineterm=""))
