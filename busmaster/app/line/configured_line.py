@@ -421,6 +421,7 @@ class ConfiguredLine:
         for kind, wanted in self._wanted_outputs():
             table = self.file.table.table("outputs").table(kind)
             with table.part(), table.at():
+                wanted.settings.check_files(table.at)  # an error in a file has its key
                 self.outputs.add(kind, wanted.settings, commands=wanted.commands)
 
     def _wanted_outputs(self) -> Iterator[tuple[str, Wanted]]:

@@ -158,7 +158,8 @@ class Authorisation:
         """Connections and logins that were refused, at whatever interface."""
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
-        self._log.addHandler(logging.NullHandler())
+        if not self._log.handlers:  # all services of a process share it
+            self._log.addHandler(logging.NullHandler())
         self._user = this_user()
         self._running: dict[str, int] = {}
 

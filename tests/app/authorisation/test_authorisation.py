@@ -314,6 +314,44 @@ def test_the_log_says_how_a_write_ended_and_warns_of_one_that_is_unconfirmed(
     at_the_authorisation(story)
 
 
+class Kept(logging.Handler):
+    """A handler of an application, which keeps the texts of the audit log."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.name == "busmaster.audit":
+            self.texts.append(record.getMessage())
+
+
+def test_entries_reach_the_handlers_of_an_application_and_without_any_none_is_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, audit = logging.getLogger(), logging.getLogger("busmaster.audit")
+    kept, own = Kept(), Kept()
+    monkeypatch.setattr(root, "handlers", [])
+    monkeypatch.setattr(audit, "handlers", [])
+    monkeypatch.setattr(audit, "propagate", True)  # pytest leaves its own handlers at a logger that does not propagate
+
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        absent = request(Hcp2Controller(authorisation.bus, ABSENT), 1)
+        await authorisation.write(absent)  # unconfirmed: a warning
+        root.addHandler(kept)
+        await authorisation.write(absent)
+        audit.addHandler(own)
+        Authorisation(authorisation.bus)  # of another service in this process
+        await authorisation.write(absent)
+        assert [record.outcome for record in records] == [Outcome.UNCONFIRMED] * 3
+        texts = [record.text for record in records]
+        assert (kept.texts, own.texts) == (texts[1:], texts[2:])
+        assert len(audit.handlers) == 2, "what many services leave there is bounded"
+
+    at_the_authorisation(story)
+    assert "unconfirmed" not in capsys.readouterr().err
+
+
 def test_a_user_without_a_name_is_on_record_by_number(monkeypatch: pytest.MonkeyPatch) -> None:
     def nameless() -> str:
         raise KeyError("getpwuid(): uid not found: 12345")

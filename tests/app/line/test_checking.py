@@ -186,6 +186,7 @@ WRONG = {
     ),
     "a token file that is not there": f'{GOOD}[service]\nlisten = "127.0.0.1:0"\ntoken_file = "none"\n',
     "a role for points that are none": f'{GOOD}[service.users.root]\nrole = "write"\nallow_writes = ["winder/?"]\n',
+    "a password file that is not there": f'{GOOD}[outputs.mqtt]\npassword_file = "none"\n',
     "a learned file without learning": f'learned = "times"\n{GOOD}',
     "an emulated node that is none": f"{GOOD}[emulator.nodes.reel]\nlively = true\n",
 }
@@ -327,3 +328,57 @@ def test_tokens_are_read_unless_the_service_is_disabled(tmp_path: Path) -> None:
     [error] = problems(tmp_path, GOOD + service)
     assert error.key == "service.token_file"
     assert problems(tmp_path, f"{GOOD}{service}enabled = false\n") == []
+
+
+def test_every_value_of_the_safe_state_that_is_not_one_number_is_reported(tmp_path: Path) -> None:
+    values = ('"fast"', "[1, 2]", "0", "nan", "[]", "[1, inf]", "[true]")
+    writes = "".join(f'"winder/{number}" = {value}\n' for number, value in enumerate(values, 1))
+    found = problems(tmp_path, f'{GOOD}[safe]\nrepeatable = ["winder/3"]\n[safe.writes]\n{writes}')
+    several = "must be one value; write the others as points of their own"
+    number = "must be a number, true or false, or a list of them"
+    assert [(error.line, error.key, error.what) for error in found] == [
+        (11, "safe.writes.winder/1", f"{number}, not 'fast'"),
+        (12, "safe.writes.winder/2", several),
+        (14, "safe.writes.winder/4", f"{number}, not nan"),
+        (15, "safe.writes.winder/5", several),
+        (16, "safe.writes.winder/6[2]", f"{number}, not inf"),
+        (17, "safe.writes.winder/7", "True is not a number: write 1 if that is meant"),
+    ]
+
+
+def test_every_problem_of_an_output_is_reported_also_if_it_is_disabled(tmp_path: Path) -> None:
+    outputs = (
+        '[outputs.csv]\nenabled = ENABLED\npath = "a.csv"\ngroups = ["axes", "slow", "axes"]\n'
+        '[outputs.jsonl]\nenabled = ENABLED\npath = "%q.jsonl"\n'
+        '[outputs.sqlite]\nenabled = ENABLED\npath = "a.db"\nbuffer = 0\n'
+        '[outputs.mqtt]\nenabled = ENABLED\nhome_assistant = "homeassistant"\nmessages = "cycle"\n'
+    )
+    for enabled in ("true", "false"):
+        found = problems(tmp_path, GOOD + outputs.replace("ENABLED", enabled))
+        assert [error.key for error in found] == [
+            *("outputs.csv.groups[2]", "outputs.jsonl", "outputs.sqlite.buffer", "outputs.mqtt"),
+        ]
+
+
+def test_each_missing_file_of_an_output_is_reported_once_with_its_key_as_by_run_unless_the_output_is_disabled(
+    tmp_path: Path,
+) -> None:
+    missing = 'tls = true\npassword_file = "/no/such/password"\nca_file = "/no/such/ca"\n'
+    mqtt = f"{GOOD}[outputs.mqtt]\n{missing}"
+    path = written(tmp_path, mqtt)
+    password, certificates = check(path).problems
+    assert (password.key, certificates.key) == ("outputs.mqtt.password_file", "outputs.mqtt.ca_file")
+    with pytest.raises(FileError) as refused:
+        refuse(path)
+    assert str(refused.value) == str(password)
+    assert problems(tmp_path, f"{mqtt}enabled = false\n") == []
+
+
+def test_a_missing_token_file_hides_no_problem_of_another_table(tmp_path: Path) -> None:
+    safe = '[safe]\nwrites = { "winder/?" = 0 }\n'
+    mqtt = '[outputs.mqtt]\npassword_file = "/no/such/password"\n'
+    service = '[service]\nlisten = "127.0.0.1:7420"\ntoken_file = "/no/such/tokens"\n'
+    found = problems(tmp_path, f"{GOOD}{safe}{mqtt}{service}")
+    assert [error.key for error in found] == [
+        *("safe.writes.winder/?", "outputs.mqtt.password_file", "service.token_file"),
+    ]

@@ -127,6 +127,30 @@ def test_a_set_is_read_as_it_was_written_with_all_that_its_file_contains(tmp_pat
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize(("minimum", "maximum"), [(0, 0), (0.0, None), (None, 0.0), (-5.5, 0.0), (0.0, 40.0)])
+def test_a_range_that_ends_at_zero_is_kept_in_its_file(
+    tmp_path: Path, minimum: float | None, maximum: float | None
+) -> None:
+    path = str(tmp_path / "a.toml")
+    parameter = replace(WANTED[1], minimum=minimum, maximum=maximum)
+    outside = {0: "", -1: "minimum", 1: "maximum"}
+    for value, limit in outside.items():
+        Path(path).unlink(missing_ok=True)
+        write_set(path, replace(EMPTY, entries={"1.18": Entry(parameter, value)}), KIND)
+        file = read_set(path)
+        assert file.set.entries["1.18"].parameter == parameter
+        is_beyond = (value < 0 and minimum == 0) or (value > 0 and maximum == 0)
+        beyond = pytest.raises(FileError, match=f"{value} is beyond its {limit} of 0") if is_beyond else nullcontext()
+        with beyond:
+            file.check_range("1.18")
+
+
+def test_what_a_parameter_does_not_define_is_not_in_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    write_set(str(path), replace(EMPTY, entries={"1.18": Entry(replace(WANTED[1], access="write"), 0)}), KIND)
+    assert path.read_text().endswith('\n"1.18" = { value = 0 }\n')
+
+
 @pytest.mark.parametrize(
     ("value", "beyond"),
     [

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -142,6 +146,29 @@ def test_one_that_hangs_is_not_waited_for() -> None:
     assert output._thread.is_alive()
     assert output.dropped == 2
     output.let.set()
+    assert output._thread.daemon, "or it would keep the process from ending"
+
+
+HANGING = """
+import sys
+from busmaster.app.outputs.base import Happening
+from busmaster.app.outputs.files import JsonlOutput
+from busmaster.app.outputs.settings import FileSettings
+
+output = JsonlOutput("jsonl", FileSettings(path=sys.argv[1]))
+output.start()
+output.offer(Happening(0.0, "winder", "winder is down"))
+output.close(0.01)
+print(output.statistics().dropped, "dropped")
+"""
+"""A program whose output opens a pipe that nobody reads: that waits for a reader."""
+
+
+@pytest.mark.slow
+def test_one_that_hangs_does_not_keep_its_process_from_ending(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    program = [sys.executable, "-c", HANGING, str(tmp_path / "pipe")]
+    assert subprocess.run(program, check=True, capture_output=True, timeout=PATIENCE).stdout == b"1 dropped\n"
 
 
 def test_what_an_output_does_not_write_is_no_loss_and_what_was_lost_before_it_is() -> None:

@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -402,7 +403,7 @@ def test_a_mode_of_something_else_is_refused(text: str) -> None:
 
 @pytest.mark.parametrize("kind", kinds(), ids=lambda kind: str(kind.name))
 def test_a_buffer_holds_one_value_at_least(kind: OutputKind) -> None:
-    required = {key.field: "x" for key in keys_of(kind.settings) if key.required}
+    required: dict[str, Any] = {key.field: "x" for key in keys_of(kind.settings) if key.required}
     assert kind.settings(**required, buffer=1).buffer == 1
     with pytest.raises(InvalidCommand, match="at least one value, not 0"):
         kind.settings(**required, buffer=0)

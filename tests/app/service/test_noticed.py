@@ -6,9 +6,10 @@ import asyncio
 import contextlib
 import hashlib
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -77,6 +78,41 @@ def test_a_request_is_over_when_its_time_is_though_its_owner_says_nothing(tmp_pa
                 await controller.write(1, 5, finish_within=0.05)
             way.open.set()
             await until(lambda: line.records)
+
+    asyncio.run(run())
+
+
+def test_the_wait_for_a_place_counts_as_time_of_a_request_whose_owner_says_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", 1)
+    monkeypatch.setattr("busmaster.app.service.link.GRACE", 0.0)
+    never = 10 * PATIENCE
+
+    async def run() -> None:
+        async with (
+            asyncio.timeout(PATIENCE),
+            served(tmp_path, listen=("127.0.0.1", 0)) as line,
+            by_way(line) as (way, address),
+            connect(address) as remote,
+        ):
+            controller = Hcp2Controller(remote, 5)
+            assert await controller.read(1) == 0
+            way.open.clear()
+            asked: dict[type[Exception], Coroutine[Any, Any, object]] = {
+                NoReply: controller.read(1, finish_within=never),
+                WriteUnconfirmed: controller.write(1, 5, finish_within=never),
+            }
+            for error, request in asked.items():
+                first = asyncio.ensure_future(controller.read(1))
+                await asyncio.sleep(0)  # it has the place
+                second = asyncio.ensure_future(request)
+                await asyncio.sleep(0)
+                monkeypatch.setattr(remote, "_ahead", remote._ahead + never)  # the second has waited for that long
+                first.cancel()
+                with pytest.raises(error, match="the program that owns the line did not reply"):
+                    await second
+            way.open.set()
 
     asyncio.run(run())
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus, ext
+from busmaster import Hcp2Controller, NoReply, Point, Priority, RemoteBus, ext
 from busmaster.app import bounds
 from busmaster.app.bounds import FARTHEST_REQUESTED
 from busmaster.app.service.authorisation import FRESH
@@ -30,7 +30,7 @@ from busmaster.app.service.rights import RIGHTS, Role
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.errors import BacklogFull, BusError, InvalidCommand, WriteUnconfirmed
-from busmaster.ext import CommandOptions, Hold
+from busmaster.ext import Command, CommandOptions, Hold
 from tests.app.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw, until
 from tests.patience import PATIENCE
 
@@ -666,6 +666,36 @@ def test_a_value_for_a_point_is_a_label_or_a_number_and_is_on_record_if_it_is_re
             reply = await asked(client, 2, "write", group="axes", key="5/1", value="run")
             assert "user me may read this line, but not write" in reply["error"]["message"]
         assert await own.read(1) == 1
+
+    on_a_line(tmp_path, story)
+
+
+def test_of_several_points_of_one_place_the_written_one_is_on_record_with_its_own_value(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        point = own.point("1")
+
+        def in_unit(item: str, factor: float) -> Point[Any]:
+            def encode(value: Any) -> Command[None]:
+                assert point.encode is not None
+                return point.encode(value / factor)
+
+            return replace(point, item=item, decode=lambda raw: raw * factor, encode=encode, unit=item)
+
+        line.bus.poll_group("axes", period=60.0, points=[in_unit("%", 100.0), in_unit("m", 2.0)])
+        line.bus.poll_group("slow", period=60.0, points=[in_unit("mm", 2000.0)])
+        async with raw(line) as client:
+            for group, key, value in (
+                ("axes", "5/%", 50),
+                ("axes", "5/m", 4),
+                ("slow", "5/mm", 6000),
+                ("axes", "5/%", 0),
+            ):
+                assert (await client.ask("write", group=group, key=key, value=value))["result"] is None
+                assert (line.records[-1].point, line.records[-1].value) == (key, value)
+            assert (await client.ask("request", **write(2.0)))["result"] is None
+        known = [("5/%", 200.0), ("5/m", 4.0), ("5/mm", 4000.0)]
+        assert (line.records[-1].point, line.records[-1].value) in known, "a raw command has no point of its own"
 
     on_a_line(tmp_path, story)
 

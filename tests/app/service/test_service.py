@@ -8,6 +8,7 @@ import socket
 import stat
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,33 @@ def test_a_connection_without_a_first_message_is_not_counted_as_a_program(tmp_pa
         stranger.close()
 
     on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("socket_of", ["user", "network"])
+def test_programs_that_connect_in_one_moment_are_queued_and_accepted_one_in_a_turn(
+    socket_of: str, tmp_path: Path
+) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, listen=("127.0.0.1", 0)) as line:
+            comers: list[socket.socket] = []
+            for _ in range(bounds.MOST_STRANGERS):  # nothing is accepted in between: the loop does not run
+                if socket_of == "network":
+                    assert line.service.tcp_address is not None
+                    port = int(line.service.tcp_address.rpartition(":")[2])
+                    comers.append(socket.create_connection(("127.0.0.1", port), timeout=PATIENCE))
+                else:
+                    comers.append(socket.socket(socket.AF_UNIX))
+                    comers[-1].setblocking(False)
+                    comers[-1].connect(line.address.removeprefix("unix:"))
+            accepted = [0]
+            while accepted[-1] < len(comers):
+                await asyncio.sleep(0)
+                accepted.append(line.service.strangers)
+            assert {after - before for before, after in pairwise(accepted)} <= {0, 1}
+            for comer in comers:
+                comer.close()
+
+    asyncio.run(run())
 
 
 def test_a_program_that_does_not_read_gets_the_last_list_of_groups_alone(
