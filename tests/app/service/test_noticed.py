@@ -139,7 +139,7 @@ def test_the_owners_clock_is_known_as_well_as_the_quickest_answer_tells_it(tmp_p
 def test_the_owners_clock_is_read_again_because_two_clocks_drift_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = SimpleNamespace(ahead=0.0, monotonic=lambda: time.monotonic() + clock.ahead)
+    clock: Any = SimpleNamespace(ahead=0.0, monotonic=lambda: time.monotonic() + clock.ahead)
     monkeypatch.setattr(remote_module, "time", clock)
     monkeypatch.setattr(remote_module, "CLOCK_PERIOD", 0.02)
 
