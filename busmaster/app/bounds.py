@@ -173,15 +173,15 @@ MOST_ASKING = 400
 
 # `busmaster modbus-tcp`
 
-MOST_MODBUS_CONNECTIONS = 128
+MOST_GATEWAY_CONNECTIONS = 128
 """Connections at a time. One more closes another one, or is refused."""
-MOST_MODBUS_PER_PEER = 32
+MOST_GATEWAY_PER_PEER = 32
 """Connections of one address: one more is refused."""
-MOST_MODBUS_ON_LINE = 4
+MOST_GATEWAY_ON_LINE = 4
 """Pass-through requests of one address on the line at a time: further ones wait."""
-MOST_MODBUS_UNREAD = 4096
+MOST_GATEWAY_UNREAD = 4096
 """Bytes of requests, and of replies, that are held for one connection: TCP makes the client wait for the rest."""
-MODBUS_SEND_WITHIN = 10.0
+GATEWAY_SEND_WITHIN = 10.0
 """Seconds in which a client must read its replies: otherwise its connection is closed."""
 
 # `busmaster opcua`

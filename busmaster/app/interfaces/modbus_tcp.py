@@ -36,11 +36,11 @@ from busmaster import (
     Superseded,
 )
 from busmaster.app.bounds import (
-    MODBUS_SEND_WITHIN,
-    MOST_MODBUS_CONNECTIONS,
-    MOST_MODBUS_ON_LINE,
-    MOST_MODBUS_PER_PEER,
-    MOST_MODBUS_UNREAD,
+    GATEWAY_SEND_WITHIN,
+    MOST_GATEWAY_CONNECTIONS,
+    MOST_GATEWAY_ON_LINE,
+    MOST_GATEWAY_PER_PEER,
+    MOST_GATEWAY_UNREAD,
     REQUEST_WITHIN,
 )
 from busmaster.app.interfaces.following import Following
@@ -745,8 +745,8 @@ class Answers:
             raise ExceptionReply(NO_PATH, f"the line has no Modbus RTU unit {unit}")
         finish_by = time.monotonic() + FINISH_WITHIN
         # With 128 at a time on the line, a further client got no reply within FINISH_WITHIN. A line carries one at a
-        # time, so more than MOST_MODBUS_ON_LINE would not make it faster.
-        turns = self._turns.setdefault(peer_of(peer), asyncio.Semaphore(MOST_MODBUS_ON_LINE))
+        # time, so more than MOST_GATEWAY_ON_LINE would not make it faster.
+        turns = self._turns.setdefault(peer_of(peer), asyncio.Semaphore(MOST_GATEWAY_ON_LINE))
         try:
             async with asyncio.timeout(FINISH_WITHIN):
                 await turns.acquire()
@@ -823,14 +823,14 @@ class ModbusTcpServer:
         host = str((writer.get_extra_info("peername") or ("unknown",))[0])
         peer = peer_of(host)
         # A replaced connection still counts: its request is still on the line.
-        if sum(other == peer for other in (*self._open.values(), *self._replaced.values())) >= MOST_MODBUS_PER_PEER:
-            self._refuse(writer, peer, f"beyond {MOST_MODBUS_PER_PEER} of one address")
+        if sum(other == peer for other in (*self._open.values(), *self._replaced.values())) >= MOST_GATEWAY_PER_PEER:
+            self._refuse(writer, peer, f"beyond {MOST_GATEWAY_PER_PEER} of one address")
             return
-        if len(self._open) >= MOST_MODBUS_CONNECTIONS and not self._make_room(peer):
-            self._refuse(writer, peer, f"beyond {MOST_MODBUS_CONNECTIONS}: all have a request on the line")
+        if len(self._open) >= MOST_GATEWAY_CONNECTIONS and not self._make_room(peer):
+            self._refuse(writer, peer, f"beyond {MOST_GATEWAY_CONNECTIONS}: all have a request on the line")
             return
         self._open[writer] = peer
-        writer.transport.set_write_buffer_limits(high=MOST_MODBUS_UNREAD)
+        writer.transport.set_write_buffer_limits(high=MOST_GATEWAY_UNREAD)
         try:
             await self._serve(reader, writer, host)
         except BadFrame as bad:
@@ -852,7 +852,7 @@ class ModbusTcpServer:
         """
         idle = next((one for one in self._open if one not in self._busy), None)
         if idle is not None:
-            why = f"beyond {MOST_MODBUS_CONNECTIONS}: the one idle for the longest time"
+            why = f"beyond {MOST_GATEWAY_CONNECTIONS}: the one idle for the longest time"
             self._refuse(idle, self._open.pop(idle), why)
             return True
         counts = Counter(self._open.values())
@@ -861,7 +861,7 @@ class ModbusTcpServer:
             return False
         oldest = next(one for one, other in self._open.items() if other == most)
         self._replaced[oldest] = self._open.pop(oldest)
-        self._refuse(oldest, most, f"beyond {MOST_MODBUS_CONNECTIONS}: one of the address with the most")
+        self._refuse(oldest, most, f"beyond {MOST_GATEWAY_CONNECTIONS}: one of the address with the most")
         return True
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str) -> None:
@@ -885,10 +885,10 @@ class ModbusTcpServer:
                 self._busy.discard(writer)
             writer.write(HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply)
             try:
-                async with asyncio.timeout(MODBUS_SEND_WITHIN):
+                async with asyncio.timeout(GATEWAY_SEND_WITHIN):
                     await writer.drain()
             except TimeoutError:
-                raise BadFrame(f"replies not read for {MODBUS_SEND_WITHIN:g} s") from None
+                raise BadFrame(f"replies not read for {GATEWAY_SEND_WITHIN:g} s") from None
             await asyncio.sleep(0)  # a client that sends without pause is served in turn with the others
 
     def _refuse(self, writer: asyncio.StreamWriter, peer: str, why: str) -> None:
@@ -918,7 +918,7 @@ async def serve(
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(values.run())
         tasks.create_task(values.line.follow())
-        async with await asyncio.start_server(server.accept, sock=socket, limit=MOST_MODBUS_UNREAD) as accepting:
+        async with await asyncio.start_server(server.accept, sock=socket, limit=MOST_GATEWAY_UNREAD) as accepting:
             opened(address_text(*accepting.sockets[0].getsockname()[:2]))
             await accepting.serve_forever()
 

@@ -173,7 +173,7 @@ def test_who_guesses_passwords_of_opcua_is_slowed_down_counted_and_reported(
 def test_what_modbus_tcp_refuses_is_counted_and_reported_by_the_owner(
     busmaster: Command, file: Path, metrics: int
 ) -> None:
-    places = bounds.MOST_MODBUS_PER_PEER
+    places = bounds.MOST_GATEWAY_PER_PEER
     with (
         owner("serve", str(file)) as (process, address),
         started("modbus-tcp", "--bind", "127.0.0.1:0", address) as interface,

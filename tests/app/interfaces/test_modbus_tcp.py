@@ -343,7 +343,7 @@ def with_server(
 
         async with (
             asyncio.timeout(PATIENCE),
-            await asyncio.start_server(served.accept, "127.0.0.1", 0, limit=bounds.MOST_MODBUS_UNREAD) as server,
+            await asyncio.start_server(served.accept, "127.0.0.1", 0, limit=bounds.MOST_GATEWAY_UNREAD) as server,
         ):
             await story(connect, replies, reports)
             for writer in opened:
@@ -431,7 +431,7 @@ def test_half_a_request_is_closed_sooner_than_an_idle_client(monkeypatch: pytest
 
 @pytest.mark.slow
 def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_tcp, "MODBUS_SEND_WITHIN", 0.05)
+    monkeypatch.setattr(modbus_tcp, "GATEWAY_SEND_WITHIN", 0.05)
 
     class Long(Echo):
         async def reply(self, _peer: str, _unit: int, _pdu: bytes) -> bytes:
@@ -449,7 +449,7 @@ def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.M
 
 
 def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_PER_PEER", 3)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_PER_PEER", 3)
 
     async def per_peer(connect: Connect, _echo: Echo, reports: list[str]) -> None:
         opened = [await connect() for _ in range(4)]
@@ -459,7 +459,7 @@ def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest
         assert "beyond 3 of one address" in reports[0]
 
     with_server(per_peer)
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_CONNECTIONS", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 2)
 
     async def total(connect: Connect, _echo: Echo, reports: list[str]) -> None:
         (first, writer), (second, _) = await connect(), await connect()
@@ -481,7 +481,7 @@ def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest
 
 
 def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_CONNECTIONS", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 2)
     go_on = asyncio.Event()
 
     class Slow(Echo):
@@ -508,8 +508,8 @@ def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: p
 def test_an_address_with_many_requests_on_the_line_makes_room_for_another_address(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_CONNECTIONS", 4)
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_PER_PEER", 4)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 4)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_PER_PEER", 4)
     go_on = asyncio.Event()
 
     class Slow(Echo):
@@ -556,8 +556,8 @@ class SlowUnit(Echo):
 
 
 def test_requests_of_replaced_connections_count_as_those_of_their_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_CONNECTIONS", 3)
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_PER_PEER", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 3)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_PER_PEER", 2)
     go_on = asyncio.Event()
 
     async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
@@ -579,7 +579,7 @@ def test_requests_of_replaced_connections_count_as_those_of_their_address(monkey
 
 
 def test_a_connection_whose_request_was_replied_to_makes_room_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_CONNECTIONS", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 2)
 
     async def story(connect: Connect, _echo: Echo, _reports: list[str]) -> None:
         readers = []
@@ -594,8 +594,8 @@ def test_a_connection_whose_request_was_replied_to_makes_room_for_a_new_one(monk
 
 
 def test_replaced_connections_no_longer_count_when_their_requests_are_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_CONNECTIONS", 2)
-    monkeypatch.setattr(modbus_tcp, "MOST_MODBUS_PER_PEER", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 2)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_PER_PEER", 2)
     go_on = asyncio.Event()
 
     async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
@@ -983,7 +983,7 @@ def test_the_addresses_of_an_ipv6_network_have_few_requests_on_the_line_together
             for first, peer in enumerate([*peers, "2001:db8:0:1::1"])
         ]
         await asyncio.sleep(0)
-        assert on_line == [*range(bounds.MOST_MODBUS_ON_LINE), 8]
+        assert on_line == [*range(bounds.MOST_GATEWAY_ON_LINE), 8]
         go_on.set()
         await asyncio.gather(*replies)
 
@@ -1550,7 +1550,7 @@ def test_the_places_of_an_address_on_the_line_are_free_again_after_errors() -> N
     async def run() -> list[bytes]:
         answers = Answers(cast("Values", given), Rules(pass_through=True), lambda _: None)
         async with asyncio.timeout(PATIENCE):
-            waiting = (answers.reply("10.0.0.1", 3, READ) for _ in range(3 * bounds.MOST_MODBUS_ON_LINE))
+            waiting = (answers.reply("10.0.0.1", 3, READ) for _ in range(3 * bounds.MOST_GATEWAY_ON_LINE))
             return await asyncio.gather(*waiting)
 
     assert set(asyncio.run(run())) == {b"\x83\x0b"}
