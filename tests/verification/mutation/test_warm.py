@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import io
 import json
@@ -65,6 +66,13 @@ def change(module: ModuleType, old: str, new: str) -> bool:
     assert old in SOURCE
     file.write_text(SOURCE.replace(old, new))
     return replaced(functions_by_file()[str(file)], file)
+
+
+@pytest.mark.slow
+def test_functions_that_are_frozen_are_found_and_none_is_not_taken_for_all(module: ModuleType) -> None:
+    gc.freeze()
+    assert change(module, "value + 1", "value - 1")
+    assert not replaced([], Path(str(module.__file__)))
 
 
 @pytest.mark.slow

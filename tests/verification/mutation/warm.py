@@ -209,6 +209,7 @@ def run_until_one_fails(
 def functions_by_file() -> dict[str, list[FunctionType]]:
     """Return all functions that there are in this process, by the file that they are of."""
     found: dict[str, list[FunctionType]] = {}
+    gc.unfreeze()  # tests/conftest.py has frozen them: `get_objects` leaves out what is frozen
     for one in gc.get_objects():
         if type(one) is FunctionType:  # isinstance asks a weak proxy for its class, which raises if its object is gone
             found.setdefault(one.__code__.co_filename, []).append(one)
@@ -216,7 +217,10 @@ def functions_by_file() -> dict[str, list[FunctionType]]:
 
 
 def replaced(functions: Sequence[FunctionType], file: Path) -> bool:
-    """Give functions the code that the file has for them now. Returns False if it has none that would fit."""
+    """Give functions the code that the file has for them now. Returns False if it has none that would fit, or if there
+    are no functions: then nothing would be mutated."""
+    if not functions:
+        return False
     codes = dict(codes_in(compile(file.read_text(), str(file), "exec", dont_inherit=True)))
     try:
         for function in functions:
