@@ -45,7 +45,6 @@ for number, handler in (
         signal.signal(number, handler)
 
 
-gc.disable()  # until `pytest_collection_finish`
 SEEN_BY_GARBAGE_COLLECTION = 10_000
 """New objects after which Python looks for garbage."""
 
@@ -105,7 +104,6 @@ def pytest_collection_finish() -> None:
 
     What has been imported and collected remains to the end. To visit it took a tenth of the processor time.
     """
-    gc.enable()
     gc.collect()
     gc.freeze()
     gc.set_threshold(SEEN_BY_GARBAGE_COLLECTION, *gc.get_threshold()[1:])
