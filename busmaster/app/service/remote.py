@@ -589,7 +589,7 @@ class RemoteBus:
     # inside
 
     async def _read_clock(self) -> None:
-        """Read the owner's clock and correct the offset, if it is not possible: a slow reply permits many offsets."""
+        """Read the owner's clock. Correct the offset only if this reply excludes it: a slow reply permits many."""
         asked = time.monotonic()
         now: float = await self._ask("now", NoParams())
         lowest, highest = now - time.monotonic(), now - asked
