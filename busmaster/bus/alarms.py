@@ -93,18 +93,22 @@ class Alarms:
             if before is not None and _holds(before.limit, point, sample.value):
                 continue
             now = _begun(point, sample.value)
+            # First: a value can jump from one side to the other, which ends one alarm and begins another.
             if before is not None:
                 changes.append(replace(before, value=sample.value, active=False))
             if now is not None:
                 changes.append(now)
+            # Also once without an alarm: outputs list each watched point, with the state that it has.
             if before is not None or now is not None or point not in self.states:
                 changed[point] = now
+        # The same object if nothing has changed: MQTT compares by identity whether it has anything to publish.
         self._become({**self.states, **changed} if changed else self.states, changes)
 
     def forget(self, points: Iterable[Point[Any]]) -> None:
         """Stop watching these points for one poll group. Ends the alarms of points that no other group watches."""
         points = tuple(points)
         self._groups.subtract(points)
+        # Without zero counts, in which the test below would still find the point.
         self._groups = +self._groups
         gone = {point: self.states[point] for point in points if point in self.states and point not in self._groups}
         if gone:

@@ -69,6 +69,7 @@ class Outlook:
     def plan_steps(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge]) -> Generator[int, None, Plan]:
         """Calculate the load of the groups and of `more`, as `planning.plan_steps` does."""
         groups = []
+        # A copy: exchanges continue between two steps, and groups can be made and closed there.
         for group in tuple(self._groups.values()):
             groups.append(group.planned())
             yield len(groups[-1].reads)
@@ -205,6 +206,7 @@ class Bus:
                 f"the bus on {self.endpoint.name} needs asyncio's event loop, which does not run here: "
                 "run the program by asyncio.run, or by anyio.run with its asyncio backend, not by trio"
             )
+        # Before the port is opened: the pump uses this loop's clock and timers as soon as the port is there.
         self._line.bind(loop)
         # The time before the bus was entered does not count as time of the line.
         self._arbiter.reset_statistics(self.now())
@@ -213,6 +215,7 @@ class Bus:
         try:
             await (connection.try_open() if self._wait_for_port else connection.open())
         except BaseException as error:
+            # Also after a cancellation: `__aexit__` does not run if entering fails, so the port would stay open.
             # Everything is undone, so that the same bus can be entered again when the port is back.
             self._line.unbind()
             await connection.close()
@@ -220,6 +223,7 @@ class Bus:
             if isinstance(error, BusError):
                 error.line = self.endpoint.name
             raise
+        # Only after the first attempt: its error is raised here, while later ones are only reported as events.
         self._start(connection.run())
         return self
 
@@ -231,11 +235,14 @@ class Bus:
         self._check_loop()
         # First, so that callbacks of the closing groups cannot start a new request.
         self._line.closed = True
+        # `groups` is a copy: each group that closes removes itself from the dict.
         for group in self.groups:
             group.close()
         # Queued requests fail now; only the exchange on the wire is finished.
         self._arbiter.close(self.now())
         self._pump.turn()
+        # A bus is often left because a scope around it was cancelled, for example by a time limit. Without the shield,
+        # the first `await` here would be cancelled too, and the exchange on the wire abandoned.
         with anyio.CancelScope(shield=True):  # Task.cancel() comes through all the same
             try:
                 # R8: the reply that is still to come would reach the next master of this line.
@@ -250,8 +257,11 @@ class Bus:
         try:
             await self._connection.close()
         finally:
+            # Whatever happens to this task: consumers of events would wait for ever, and the reconnecting would
+            # continue.
             self._pump.turn()
             self._pump.stop()
+            # A copy: a stream that is closed removes itself from the list.
             for stream in list(self._streams):
                 stream.close()
             for task in self._tasks:
@@ -266,6 +276,7 @@ class Bus:
         By default only the device that the line was opened on is reopened. A port given by a serial number (usb:SERIAL)
         never accepts another one. An open connection is not affected.
         """
+        # Before the first opening there is no device to forget: any device is accepted then.
         if self._connection is not None:
             self._connection.accept_device()
 
@@ -336,6 +347,7 @@ class Bus:
         self, profile: Profile, address: int, timings: Timings | Learned | None, retries: int | None
     ) -> Node:
         self._check_loop()
+        # The arbiter checks the addresses of new nodes only. True and 5.0 would find the nodes 1 and 5 in the dict.
         profile.check_address(address)
         if timings is not None and not isinstance(timings, Timings | Learned):
             raise InvalidCommand(f"{profile.label(address)}: timings are a Timings or LEARNED, not {timings!r}")
@@ -401,6 +413,7 @@ class Bus:
         Raises InvalidCommand if the name is in use, and for invalid times and priorities.
         """
         self._check_loop()
+        # A bus that is being closed is still running, until the exchange on the wire has ended.
         if self._line.closed or not self.running:
             raise self._line.not_open()
         period = seconds(period, f"poll group {name!r}: a period")
@@ -575,6 +588,7 @@ class Bus:
             notify()
 
     def _on_written(self, write: Transaction, when: float) -> None:
+        # In this order: only points that are already stale are read after the write.
         self._line.touched(write, when)
         self._reads_after_writes.note(write, when)
 
@@ -597,20 +611,24 @@ class Bus:
             if event.after is Health.DOWN and self._line.limiter is not None:
                 self._line.limiter.forget(node)
             if event.returning:
+                # In a task: this runs in the pump, where user code would delay the next request.
                 self._start(self._run_hook(node))
         self._line.logbook.note(event, self.now())
         # Unexpected bytes can arrive thousands of times per second. They are counted and logged instead.
         if not isinstance(event, CameUnexpected):
+            # Not a copy: `put` runs no code of the consumers, so none can close its stream here.
             for stream in self._streams:
                 stream.put(event)
 
     def _on_failed(self, cause: LineDown) -> None:
+        # Requests that fail from now on name the same cause as the log, and not how the port was lost originally.
         self._arbiter.still_down(cause.what, cause.hint)
         self._on_event(PortFailed(cause.what, cause.hint, cause.__cause__))
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         """Start a background task. A task group would tie entering and leaving the bus to the same task."""
         task = asyncio.ensure_future(work)
+        # asyncio has only a weak reference to a task: without this one, it could be collected while it runs.
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -628,4 +646,5 @@ class Bus:
             # A node that never polls again because of a bug in a hook would be worse than one without its parameters.
             self._line.logbook.failed_hook(node.label, error)
         finally:
+            # Also after a failure or a cancellation: each return holds the polls, and only this call releases them.
             self._arbiter.dispatcher.release_node(node._record)

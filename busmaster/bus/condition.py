@@ -38,6 +38,7 @@ class LossLog:
         # Each failed attempt to reopen is reported here too: the loss began with the first.
         since = self.condition.since if self._lasts else now
         self._lasts = True
+        # Replaced as a whole, so that other threads never read the time of one loss with the reason of another.
         self.condition = LineCondition(True, since, reason or self.condition.reason)
 
     def found(self, now: float) -> None:

@@ -22,6 +22,7 @@ T = TypeVar("T")
 
 def checked_hold(max_hold: float, label: str) -> float:
     """Return `max_hold`, in seconds. Raises InvalidCommand with the node's name unless it is above 0 and at most 5."""
+    # The arbiter accepts any time. Checked here for the nodes of this process and for those of other programs' lines.
     if not 0 < seconds(max_hold, f"{label}: max_hold") <= LONGEST_HOLD:
         raise InvalidCommand(f"{label}: a line is held for {LONGEST_HOLD:g} s at most (max_hold), not {max_hold!r}")
     return max_hold
@@ -76,6 +77,7 @@ class HeldNode(ABC):
 
     def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
         """Raise InvalidCommand: sequences cannot be nested."""
+        # It would wait for the end of the sequence in which it is requested.
         raise InvalidCommand(f"{self.label}: the line is already held: send it within the running sequence")
 
     @abstractmethod

@@ -124,6 +124,7 @@ class Handle(ABC):
         self.node.check(*commands, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
         for point, command in zip(points, commands, strict=True):
+            # With the quantity: otherwise all samples of the node would be stale until their next poll.
             await requests.request(command, touches=point.command)
         for point, value in zip(points, values, strict=True) if requests.verify else ():
             if (found := point.value_of(await requests.read_back(point.command))) != value:
@@ -189,6 +190,7 @@ class Handle(ABC):
         for name in (name for item in items for name in self._counted(item)):
             command = self.point(name).command
             found.setdefault(command, known.get(command) or Parameter(item=name))
+            # Checked while they are counted: a few items with a count can stand for millions.
             if len(found) > MOST_MEMBERS:
                 raise InvalidCommand(f"a parameter set has {MOST_MEMBERS} parameters at most")
         return tuple(found.values())
@@ -213,6 +215,7 @@ class Handle(ABC):
             progress(one)
             if one.value is not None:
                 found[one.parameter.item] = Entry(one.parameter, one.value)
+        # `walk` yields the values of merged reads first.
         in_order = {one.item: found[one.item] for one in wanted if one.item in found}
         return replace(empty, entries=in_order)
 
@@ -237,6 +240,7 @@ class Handle(ABC):
         plain = self._plain()
 
         def usual(change: Change, item: str) -> Send:
+            # A load can have hundreds of writes, which must not delay polls and commands.
             [send] = plain._prepare_write(item, [change.value], priority=Priority.BACKGROUND)
             return send
 
@@ -312,6 +316,7 @@ class Handle(ABC):
     def _run_items(self, item: str, count: int) -> tuple[str, ...]:
         """Return the names of `count` items from ITEM on: 1.17, 1.18, ... Raises InvalidCommand."""
         first, colon, kind = item_text(item).partition(":")
+        # A form, such as ":wide", applies to every item of the run; a number is a count.
         suffix = f":{kind}" if colon and not is_decimal(kind) else ""
         menu, dot, number = first.rpartition(".")
         if not is_decimal(number):

@@ -28,6 +28,7 @@ class NodeLimits:
     def __init__(self, node: Requester) -> None:
         self.node = node
         self.limits: list[Limit] = []
+        # By limit and not by quantity: two limits of one quantity can have different units.
         self.known: dict[Limit, Any] = {}
         """The last confirmed values, in their own units."""
         self.writing = asyncio.Lock()
@@ -57,6 +58,8 @@ class Limiter:
         """Remove one limit. The others stay."""
         if node in self._of and limit in self._of[node].limits:
             self._of[node].limits.remove(limit)
+            # Writes do not update the value while the limit is lifted, so it would be wrong if the limit is added
+            # again.
             self._of[node].known.pop(limit, None)
 
     def forget(self, node: Requester) -> None:
@@ -71,6 +74,7 @@ class Limiter:
     def check(self, node: Requester, command: Command[Any]) -> None:
         """Raise InvalidCommand with node and limit for a write that is not allowed. Steps are not checked here."""
         for one in self._reached(node):
+            # Not before the loop: a write to a node without limits does not have to declare its changes.
             changes = _changes(node, command)
             for limit in one.touched_by(changes):
                 _checked(one.node, limit, changes)
@@ -104,6 +108,7 @@ class Limiter:
             try:
                 yield options
             except BaseException:
+                # Also after a cancellation or an unknown outcome: the drive may have carried out the write.
                 for one in reached:
                     one.known.clear()
                 raise
@@ -127,6 +132,7 @@ class Limiter:
         seen = [one.urgent for one in reached]
         patience = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
         try:
+            # The write is not sent before this ends, so both limits of the caller mean NotStarted here.
             async with asyncio.timeout(min(patience, default=None)):
                 for one in reached:
                     # In the order of `_reached`, the same for all writes: two writes to all nodes cannot wait for each
@@ -137,6 +143,7 @@ class Limiter:
                     asked = within if within is not None and one.node is node else one.node
                     one.known[limit] = await _value_now(asked, limit, command, options)
         except TimeoutError as late:
+            # NotStarted is a TimeoutError too, and the one from the read has the exact reason.
             if isinstance(late, NotStarted):
                 raise
             raise NotStarted("the current value was not read in time", node=node, command=str(command)) from None
@@ -186,6 +193,7 @@ def _remember(one: NodeLimits, node: Requester, command: Command[Any]) -> None:
 
 def _checked(node: Requester, limit: Limit, changes: Mapping[Hashable, Any]) -> None:
     try:
+        # A value that must not be written at all is rejected as such, even if the write changes only a part of it.
         limit.check(limit.value_after(changes) if limit.writable else None)
     except InvalidCommand as refused:
         raise InvalidCommand(f"{node.label}: {refused}") from None
@@ -201,6 +209,7 @@ def _check_step(one: NodeLimits, limit: Limit, changes: Mapping[Hashable, Any]) 
 async def _value_now(node: Requester, limit: Limit, command: Command[Any], options: RequestOptions) -> Any:
     try:
         return limit.decode(await node.request(limit.read, priority=options.priority))
+    # Raised for the write, these would mean that it was sent. The other errors of a read do not mean that.
     except (NoReply, GarbledReply, Refused) as error:
         what = f"the current value, needed for max_step, could not be read: {error.what}"
         raise NotStarted(what, node=node, command=str(command), hint=error.hint) from error

@@ -15,6 +15,7 @@ ROUNDING = 1e-6
 """Relative tolerance of limits: written values are rounded to the resolution of the protocol."""
 
 
+# Compared by identity: `lift` must not remove the equal limit of another caller.
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Limit:
     """Limits for writes to the quantity that `read` reads, under any name and in any way it is written.
@@ -38,6 +39,7 @@ class Limit:
             raise InvalidCommand(f"{self.name} cannot be limited: limit each value of it")
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
             raise InvalidCommand(f"{self.name}: its minimum of {self.minimum} is above its maximum of {self.maximum}")
+        # `not ... > 0`, so that nan is rejected too: with it, every step would be too large.
         if self.max_step is not None and not self.max_step > 0:
             raise InvalidCommand(f"{self.name}: max_step is more than 0, not {self.max_step}")
 

@@ -61,9 +61,11 @@ class Logbook:
             self._write((event.node, RepliesLate), logging.WARNING, text, now)
         elif isinstance(event, PortFailed):
             text = f"cannot connect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
+            # With the cause: another reason is logged at once (R13).
             self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)
         elif isinstance(event, AlarmChanged):
             level = logging.WARNING if event.active else logging.INFO
+            # With `active`: the end of a short alarm must not be hidden by the line for its begin.
             self._write((AlarmChanged, event.point.key, event.limit, event.active), level, event.text, now)
         elif isinstance(event, CameUnexpected) and event.collision:
             text = f"the echo differs from the bytes sent: a collision ({event.data.hex(' ')})"
@@ -80,6 +82,7 @@ class Logbook:
     def rounded(self, node: NodeRecord, what: str, now: float) -> None:
         """Log that a write has sent a rounded value: `what` is the text of its `Rounding`."""
         text = f"{node.label}: {what}; round it, or declare the decimals of the parameter"
+        # By parameter and not by value: a program that calculates values writes a different one each time.
         self._write((node, what.partition(" = ")[0]), logging.WARNING, text, now)
 
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:

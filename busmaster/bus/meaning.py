@@ -92,6 +92,7 @@ class Meaning:
         yield from self._faults_of_names()
         for name in ("precision", "deadband", "heartbeat", "low", "high", "hysteresis"):
             value = getattr(self, name)
+            # A bool is an int: `high = true` in LINE.toml would be a limit of 1.
             if value is not None and (isinstance(value, bool) or not isfinite(value)):
                 yield name, f"must be a finite number, not {value}"
         if self.precision is not None and not 0 <= self.precision <= MOST_DIGITS:
@@ -164,6 +165,7 @@ class Meaning:
             heartbeat=self.heartbeat,
             high=0 if name in self.alarm_if_set else None,
             low=1 if name in self.alarm_if_clear else None,
+            # The default margin is 0.01 for `low=1`: an alarm would never end, because a bit does not reach 1.01.
             hysteresis=0 if name in (*self.alarm_if_set, *self.alarm_if_clear) else None,
         )
 
@@ -190,6 +192,7 @@ class Meaning:
     def named(self, value: Any) -> Any:
         """Return the value with its names; unchanged if it has none, or names from its protocol."""
         # A list, a text or a fraction has no name.
+        # `//` and not `int`, which raises an error for nan and infinity; neither equals its quotient.
         if not isinstance(value, int | float) or value != value // 1:
             return value
         number = int(value)

@@ -53,6 +53,7 @@ class Request(Generic[T]):
     node that is DOWN, within the probe budget.
     """
 
+    # Not a data class: the decorator would generate its methods at each import, which costs start-up time.
     __slots__ = ("client", "command", "options", "probe", "stop", "stops_seen", "touches", "transaction")
 
     transaction: Transaction | None
@@ -92,6 +93,7 @@ class Node:
         self._record = record
         self.timings = record.timings
         """The timings as configured. The maximum reply delay of its record may have been raised since."""
+        # With the times of the profile filled in, so that a second handle that names the same times is accepted.
         self._asked = Learned(record.timings) if isinstance(asked, Learned) else record.timings
         self._kinds: dict[Hashable, Command[Any]] = {}
         """The first command of each kind that was sent to it. The worst case is calculated with them."""
@@ -183,6 +185,7 @@ class Node:
     @property
     def health(self) -> Health:
         """Return the health of the node: up, suspect, down or unknown; offline while the line is lost."""
+        # Without a port there is no reply to judge the node by: its record would stay UP for the whole loss.
         return Health.OFFLINE if self._shared.condition.is_lost else self._record.health
 
     def __repr__(self) -> str:
@@ -200,6 +203,7 @@ class Node:
     @on_return.setter
     def on_return(self, hook: Callable[[Node], Awaitable[None]] | None) -> None:
         self._on_return = hook
+        # The arbiter holds the polls of a returning node only if there is a hook that releases them afterwards.
         self._shared.arbiter.expect_hook(self._record, hook is not None)
 
     def _check_shared(self, profile: Profile, timings: Timings | Learned | None, retries: int | None) -> None:
@@ -239,8 +243,10 @@ class Node:
         before = self._sync_reads
         wanted = (probe or before[0], tuple(sync_reads) or before[1])
         for command in (probe, *sync_reads):
+            # The arbiter sends these without a caller, at any time: a write would change the drive by itself.
             if command is not None and getattr(command, "writes", False):
                 raise InvalidCommand(f"{self.label}: a probe or sync read must read, and {command} writes")
+        # Before anything is stored: a rejected handle must not change the node of the others.
         if any(earlier and earlier != now for earlier, now in zip(before, wanted, strict=True)):
             raise InvalidCommand(
                 f"{self.label} is already in use, and was requested again with another probe or other sync reads. "
@@ -315,6 +321,7 @@ class Node:
         try:
             yield _HeldNode(self, hold)
         finally:
+            # However the block is left: otherwise the line would be held for the rest of `max_hold`.
             self._shared.release(hold)
 
     def _within(self, request: Request[Any]) -> Requester | None:
@@ -325,6 +332,7 @@ class Node:
             return None
         if hold.over:
             raise hold_ended(self, hold.longest, request.command)
+        # The limiter reads the current value through it: another read would wait until the sequence is over.
         return _HeldNode(self, hold)
 
     def _hold(self, max_hold: float, client: LineClient | None = None) -> Hold:
@@ -368,6 +376,8 @@ class Node:
         limiter = self._shared.limiter
         if limiter is not None and not checked and getattr(request.command, "writes", False):
             free, within = request.stop or request.options.safe, self._within(request)
+            # The options are replaced: the time spent on earlier writes and on reading the value counts for the
+            # caller's limits.
             async with limiter.passing(self, request.command, request.options, free, within) as request.options:
                 return await self._run(request, checked=True)
         transaction = self._start(request)
@@ -454,6 +464,7 @@ class Node:
             client,
             None,
             None,
+            # Only such writes may share an outcome: equal ones that wait for the same node are sent once (R9).
             command.writes and (stop or options.safe),
         )
 
@@ -487,6 +498,7 @@ class Node:
 
         Raises InvalidCommand for more than a day.
         """
+        # A suspension does not end with the program that requested it, so it has to end by itself.
         if seconds(for_, f"{self.label}: a suspension") > LONGEST_SUSPENSION:
             raise InvalidCommand(f"{self.label}: a suspension lasts {LONGEST_SUSPENSION:g} s at most, not {for_!r}")
         self._shared.suspend(self._record, for_)
@@ -549,4 +561,6 @@ class _HeldNode(HeldNode):
     ) -> T:
         """Run one command within the sequence, see `HeldNode.request`."""
         own = self._own
+        # Not `Node.request`, which sends on behalf of the line's owner: the arbiter would let it wait for the hold's
+        # end.
         return await own._run(Request(command, own._options(options), touches, stops_seen, stop, self.hold))

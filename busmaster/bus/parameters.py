@@ -209,6 +209,7 @@ async def walk(handle: Holder, parameters: Sequence[Parameter]) -> AsyncIterator
     commands = [handle.point(parameter.item).command for parameter in parameters]
     for start in range(0, len(parameters), AT_A_TIME):
         part = commands[start : start + AT_A_TIME]
+        # A dict as an ordered set: reads that no batch serves are sent in the given order.
         left = dict.fromkeys(range(len(part)))
         # The largest first: it saves most, and those that overlap with it are skipped.
         for batch in sorted(merge(part) if merge else (), key=lambda batch: -len(batch.serves)):
@@ -264,6 +265,7 @@ def _found(handle: Holder, parameter: Parameter, raw: Any) -> Found:
         value = handle.point(parameter.item).value_of(raw)
     except GarbledReply as error:
         return Found(parameter, why=error.what)
+    # First, because a bool is an int too and would become 0 or 1 in the set.
     if isinstance(value, bool):
         return Found(parameter, value)
     if isinstance(value, int):
@@ -295,6 +297,8 @@ class ParameterLoad:
         for (own, value), now in found:
             if now.value is None:
                 left.append(Left(own, None, value, now.why, False))
+            # Before the checks: a read-only parameter that has the value already is equal, and not one that could not
+            # be written.
             elif alike(type(self._handle), own.item, now.value, value):
                 self.equal += 1
             elif why := self._why_never(own):
@@ -303,6 +307,7 @@ class ParameterLoad:
                 left.append(Left(own, now.value, value, why, False))
             else:
                 changes.append(Change(own, now.value, value))
+        # `sorted` is stable, so the document's order remains within each stage.
         self.changes = tuple(sorted(changes, key=lambda change: change.parameter.stage))
         self.left = tuple(left)
         entries = {change.parameter.item: Entry(change.parameter, change.before) for change in self.changes}
@@ -344,6 +349,7 @@ class ParameterLoad:
 
     async def _outcome(self, change: Change, around: Around) -> Outcome:
         try:
+            # The exception passes through the context, so that an audit log gets the outcome too.
             with around(change):
                 await self._write(change)
         except (Refused, InvalidCommand) as error:
@@ -362,6 +368,7 @@ class ParameterLoad:
         unconfirmed: BusError | None = None
         for _ in range(ROUNDS):
             try:
+                # Checked again: a limit can have been added since the load was prepared.
                 await self._sending(change)()
                 unconfirmed = None
             except (WriteUnconfirmed, NoReply, GarbledReply) as error:

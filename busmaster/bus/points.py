@@ -142,6 +142,7 @@ class Point(Generic[T]):
         """Write a value. Raises InvalidCommand, before anything is sent, if it is read-only or cannot be sent."""
         if self.encode is None:
             raise InvalidCommand(f"{self.node.label}: {self.item} is read-only")
+        # Without `touches`, the write would make all samples of the node stale.
         await self.node.request(self.encode(value), touches=self.command, **options)
 
 

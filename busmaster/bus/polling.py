@@ -86,6 +86,7 @@ class PollGroup(Cycles):
         self._client = client
         """The client that is charged for the line time; None: the line's owner."""
         self._merge = tuple(merge)
+        # With the node: a batch that one node refuses is still merged for the others.
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
         # With a group, the arbiter reports each exchange when it ends, and not only the whole cycle.
@@ -162,12 +163,15 @@ class PollGroup(Cycles):
         self._line.check_loop()
         for point in points:
             self._points.pop(point, None)
+            # If the point is added again, it must not report a time from before its removal.
             self._good_at.pop(point, None)
             self._reported_outdated.pop(point, None)
         self._points_changed()
 
     def pause(self) -> None:
         """Start no cycle until `resume`. These cycles do not count as missed."""
+        # A flag, and not a removal from the schedule: the poll keeps its phase, and `resume` continues on the same
+        # grid.
         self._poll.paused = True
 
     def resume(self) -> None:
@@ -189,6 +193,7 @@ class PollGroup(Cycles):
             self._on_close(self)
             # First: an alarm of a point that is no longer polled would stay active for ever.
             self._watch(())
+            # `Bus.latest` and the audit log would otherwise go on using values that no cycle refreshes any more.
             self._line.latest_of.pop(self.name, None)
             self._line.answers_of.pop(self.name, None)
             self._line.remove_poll(self._poll)
@@ -199,6 +204,7 @@ class PollGroup(Cycles):
 
         With `changes` it also gets the changes between two cycles, each as a snapshot of the changed values.
         """
+        # Checked because the pump fills streams in the loop's thread, without a lock.
         self._line.check_loop()
         return super().subscribe(buffer, changes=changes)
 
@@ -236,6 +242,7 @@ class PollGroup(Cycles):
         # the loop.
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
+            # All reads of the group share `blank`. The copy becomes the dict of the published snapshot.
             self._samples = read.blank.copy()
             self._qualities = NO_SAMPLES.copy()
             self._line_time = 0.0
@@ -258,6 +265,7 @@ class PollGroup(Cycles):
     def cycle_finished(self) -> None:
         """Publish the snapshot of a finished cycle. Runs in the pump: no user code."""
         poll = self._poll
+        # With fresh members, `_choosing` has already set their cost; the measured line time is that of the old ones.
         if poll.fresh is None:
             poll.cost = self._line_time  # uses the cost of the last cycle, so that not all groups are calculated again
         if self._refusals:
@@ -272,6 +280,7 @@ class PollGroup(Cycles):
         wall = poll.finished + self._wall_offset
         snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, wall, self._samples)
         self._line.latest_of[self.name] = snapshot
+        # The values are taken out of the transactions, because the next cycle resets these.
         self._line.answers_of[self.name] = [
             Answer(done.tag.node, done.tag.served.command, done.tag.points, done.value, done.started)
             for done in poll.results
@@ -297,6 +306,7 @@ class PollGroup(Cycles):
                 value = point.value_of(transaction.value if place is None else transaction.value[place])
             except GarbledReply as bad:  # an error of this point only: the other points of the exchange are good
                 error, quality = bad, Quality.BAD
+        # A copy of the times: the next cycle resets the transaction.
         timeline = transaction.timeline()
         finished = transaction.ended_at
         wall = finished + self._wall_offset
@@ -314,6 +324,7 @@ class PollGroup(Cycles):
 
         Thread-safe.
         """
+        # Safe in another thread: `latest` is replaced as a whole and never becomes None again.
         sample = None if self.latest is None else self.latest.samples.get(point)
         if sample is None or sample.error is not None:
             return self._good_at.get(point)
@@ -357,6 +368,7 @@ class PollGroup(Cycles):
         self._between |= fresh
         # A copy: consumers may still hold the snapshot of the cycle, which must not change.
         self._line.latest_of[self.name] = self.latest = replace(latest, samples={**latest.samples, **fresh})
+        # In addition to the replies of the cycle: the last values of all other points must stay known.
         answer = Answer(read.node, read.command, [(point, None) for point in fresh], reading.value, reading.started)
         self._line.answers_of[self.name] = [*self._line.answers_of.get(self.name, ()), answer]
         finished = reading.ended_at
@@ -377,12 +389,14 @@ class PollGroup(Cycles):
         outdated = {}
         for point in self._points if to_all else self.points_of(record):
             sample = latest.samples.get(point)
+            # Once for each sample: the second of several writes in a row makes nothing else stale.
             if sample is None or not sample.quality.is_current or self._reported_outdated.get(point) is sample:
                 continue
             if self._line.is_stale(point, before):
                 self._reported_outdated[point] = sample
                 outdated[point] = sample._replace(quality=Quality.STALE, wall=wall)
         if outdated:
+            # The time of the write, not of the read: consumers get changes in the order of their times.
             times = (latest.due, latest.started, when)
             self._publish_change(Outdated(self.name, latest.cycle, *times, self._poll.missed, wall, outdated))
 
@@ -429,8 +443,11 @@ class PollGroup(Cycles):
             except Exception as bug:  # a merge may be code of the application
                 self._line.logbook.failed_choice(self.name, bug)
         else:
+            # The exchange itself cannot be opened, for example because of a bug in its protocol. The group continues
+            # with the members that it has.
             return
         poll = self._poll
+        # Members that no cycle has used yet are the current choice too.
         asked = poll.results if poll.fresh is None else poll.fresh
         # Unchanged reads keep their transactions, and with them their count of refusals.
         if [transaction.tag.points for transaction in asked] == [read.points for read in reads]:
@@ -441,6 +458,7 @@ class PollGroup(Cycles):
             # All points in order, so that a snapshot has the group's order, whichever exchange ends first.
             read.blank.update((point, None) for point, _ in read.points)
             yield 5
+        # Only now, all together: cycles that started between the slices have used the old members.
         set_members(poll, fresh, self._priority)
         poll.cost = sum(read.line_time for read in reads)
 
@@ -476,6 +494,8 @@ class PollGroup(Cycles):
         blank: dict[Point[Any], Any],
     ) -> _Read:
         exchange, byte_time = node.planned().open(served.command), self._line.arbiter.byte_time
+        # `Node._transaction` registers the commands of requests only. With the shape, because merged reads of one type
+        # differ in length, and the longest one counts in the worst case (R9).
         node._kinds.setdefault((type(served.command), *shape(exchange)), served.command)
         unwaited, guess = line_time(exchange, byte_time, 0.0), line_time(exchange, byte_time)
         bytes_time = unwaited - exchange.closing * byte_time - exchange.timing.driver_release_time
@@ -490,6 +510,7 @@ class PollGroup(Cycles):
         # For good: a node that lacks one item of a run would refuse it in each cycle.
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
+        # If the choice takes several slices, the schedule runs this cycle after the last of them.
         self._line.demand(self._poll)
 
 

@@ -78,6 +78,7 @@ class ReadsAfterWrites:
         except (BusError, InvalidCommand):  # InvalidCommand: the bus was closed or the node given back in the meantime
             self.failed += 1
         finally:
+            # In any case: no later write to this quantity would be read otherwise.
             self._waiting.discard(point.quantity)
 
 

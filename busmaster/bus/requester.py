@@ -68,6 +68,7 @@ class WriteOptions(CommandOptions, total=False):
     verify: bool | None
 
 
+# Frozen, because most requests share the one object `ORDINARY`.
 @dataclass(frozen=True, slots=True)
 class RequestOptions:
     """Options of a request. Raises InvalidCommand for invalid values.
@@ -231,6 +232,7 @@ class SeveralRequests:
             raise InvalidCommand(f"{node.profile.name}: a write to all cannot be verified: no node replies to a read")
         self.verify = chosen.verify
         self._finish_by = None if chosen.finish_within is None else node.now() + chosen.finish_within
+        # A node rejects `verify`, and `finish_within` is calculated again for each request from the remaining time.
         several = {name: value for name, value in given.items() if name not in ("verify", "finish_within")}
         self._options = cast("CommandOptions", several)
         self._reading: CommandOptions = {"priority": chosen.priority} if given else {}
@@ -250,6 +252,7 @@ class SeveralRequests:
         self, command: Command[T], options: CommandOptions, so_far: str, touches: Command[Any] | None = None
     ) -> T:
         if self._finish_by is not None:
+            # Not below 0, which is rejected as a mistake of the caller: the request then ends with NotStarted.
             options = {**options, "finish_within": max(0.0, self._finish_by - self._node.now())}
         try:
             return await self._node.request(command, touches=touches, **options)

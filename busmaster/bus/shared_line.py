@@ -30,9 +30,11 @@ from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from busmaster.planning import Sharing
 from busmaster.transport.pump import Pump
 
+# The two clocks are read one after the other, so their difference varies a little although neither was set.
 CLOCK_WAS_SET = 0.005
 """Difference in seconds above which the machine's clock counts as set."""
 
+# Not None, which `running_loop` returns outside of a loop: a request there would pass the check for an open bus.
 NO_LOOP = object()
 """In place of the event loop of a bus that is not open."""
 running_loop = asyncio._get_running_loop
@@ -129,6 +131,7 @@ class SharedLine:
         self.last_touched = -inf
         """When the last write to any node ended."""
         self._all_touched = -inf
+        # By node, (node, command) or (node, place), because not every write declares which values it changes.
         self._touched: dict[object, float] = {}
         self._written: dict[NodeRecord, float] = {}
         self._wall_offset = inf
@@ -145,7 +148,10 @@ class SharedLine:
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
         """Open the bus: it is used from this thread and by this loop from now on."""
         self.pump.bind(loop)
+        # With `wait_for_port` the bus can run for a long time before its port exists, and until then its values are bad
+        # for this reason.
         self.losses.lost(self.now(), "its port is not open yet")
+        # Last: other threads use the clock and the losses as soon as the bus is running.
         self.thread, self.loop = get_ident(), loop
 
     def unbind(self) -> None:
@@ -167,13 +173,16 @@ class SharedLine:
         While the line is lost it is bad, with the reason as its error. After a write to its quantity it is stale. Every
         consumer that shows a value later than its cycle uses this. Thread-safe.
         """
+        # Its own error stays while the line is lost: it is the reason why this read failed.
         if sample.error is not None:
             return sample
+        # Read once: this also runs in the threads of outputs, and the line can return between two reads.
         condition = self.condition
         if condition.is_lost:
             return sample._replace(value=None, error=condition.error, quality=Quality.BAD)
         if sample.quality.is_current and sample.started is not None and self.is_stale(point, sample.started):
             return sample._replace(quality=Quality.STALE)
+        # The same object if nothing has changed: MQTT recognises changed values by that.
         return sample
 
     def is_outdated(self, point: Point[Any], asked: float) -> bool:
@@ -206,6 +215,7 @@ class SharedLine:
     def demand(self, poll: Poll) -> None:
         """Implement `PollGroup.demand`."""
         self.check_loop()
+        # With `turn`, because the cycle would otherwise leave only with the next event of the line.
         self.arbiter.demand(poll, self.now())
         self.pump.turn()
 
@@ -221,6 +231,7 @@ class SharedLine:
         youngest = None
         for snapshot in self.latest_of.values():
             sample = snapshot.samples.get(point)
+            # A failed read in one group must not hide the good value of another group.
             if sample is None or sample.error is not None or sample.started is None:
                 continue
             if (youngest is None or sample.finished > youngest.finished) and not self.is_stale(point, sample.started):
@@ -233,6 +244,7 @@ class SharedLine:
         None if it is not known, or may have been written since.
         """
         answers = [answer for cycle in self.answers_of.values() for answer in cycle if answer.node is point.node]
+        # Each group has its own list: after sorting, the last match is the newest value.
         answers.sort(key=lambda answer: answer.started)
         found = [raw for one in answers if not self.is_stale(point, one.started) for raw in one.found(point.command)]
         # A write makes values stale by the name of the quantity. The same value may be read under another name, as part
@@ -243,6 +255,7 @@ class SharedLine:
         try:
             return point.value_of(found[-1]) if found else None
         except GarbledReply:
+            # Used for the audit log, as the value before a write: an error here must not prevent the write.
             return None
 
     # nodes
@@ -258,6 +271,7 @@ class SharedLine:
         self.arbiter.remove_node(record)
         if self.limiter is not None:
             self.limiter.forget_node(node)
+        # Clients can borrow one node after another: these tables would grow for ever (R12).
         self._written.pop(record, None)
         for touched in [what for what in self._touched if node in (what if isinstance(what, tuple) else (what,))]:
             del self._touched[touched]
@@ -301,6 +315,7 @@ class SharedLine:
         self._touched[write.touches] = self._written[write.node] = self.last_touched = when
         if write.node.address == write.node.profile.broadcast:
             self._all_touched = when
+        # A write that names no quantity has made the whole node stale already.
         if isinstance(write.touches, tuple) and isinstance(write.command, Changing):
             # the same place can have another name, or be read in another run
             for place in write.command.changes(write.node.profile):
@@ -308,6 +323,7 @@ class SharedLine:
         # Not isinstance: that would calculate the text of a `Rounding` twice, for every write.
         if text := getattr(write.command, "rounded", ""):
             self.logbook.rounded(write.node, text, self.now())
+        # Last: the listeners query which values are stale now.
         for notify in self.on_touched:
             notify(write.node, when)
 
@@ -328,6 +344,7 @@ class SharedLine:
 
     def check_loop(self) -> None:
         """Raise InvalidCommand if an open bus is used from another thread or another event loop."""
+        # A bus that is not open has no thread: handles can be made before it is entered, by another thread too.
         if self.running and running_loop() is not self.loop:
             self._check_elsewhere()
 

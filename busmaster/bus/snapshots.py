@@ -132,6 +132,8 @@ class Tally:
         self.cycles += 1
         self.cycle_time.record(poll.finished - poll.due)
         for transaction in poll.results[:1]:
+            # Until an exchange is sent, these hold the line's counters at the time when it was queued, not the
+            # difference.
             if transaction.started > -inf:
                 self.exchanges_ahead += transaction.exchanges_ahead
                 self.quiet_time_ahead += transaction.quiet_time_ahead
@@ -172,6 +174,7 @@ class Stream(Generic[T]):
         return self
 
     async def __anext__(self) -> T:
+        # Checked again after each wake-up: another task that shares the stream may have taken the item.
         while not self._items:
             if self._closed:
                 raise StopAsyncIteration if self._cause is None else self._cause
@@ -231,6 +234,7 @@ class Cycles:
             async for snapshot in consumer:
                 yield snapshot
         finally:
+            # Also if the application leaves its loop early: the buffer would be filled as long as the group runs.
             consumer.close()
 
     def _publish(self, snapshot: Snapshot) -> None:

@@ -32,6 +32,7 @@ def check_settings(profile: Profile, endpoint: Endpoint) -> None:
     if settings is None or not isinstance(endpoint, SerialPort | TcpPort):
         return
     framings = dict.fromkeys(line.framing for line in (profile.line, *profile.other_lines))
+    # Not `isinstance`: an Rfc2217Port is a TcpPort too, and it sets the framing of the serial server.
     if type(endpoint) is not TcpPort and settings.framing not in framings:
         usual = " or ".join(framings)
         warnings.warn(
