@@ -15,6 +15,7 @@ from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.shared_backlog import PASSED_BY_EACH
 from busmaster.arbiter.transaction import Transaction
+from busmaster.contract.bounds import MOST_RETRIES
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
@@ -101,7 +102,8 @@ def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path
         with pytest.raises(NotStarted, match="of this program have no reply yet"):
             await Hcp2Controller(remote, 5).write(1, 7, **options)
         await given_up(waiting)
-        assert await Hcp2Controller(remote, 5).read(1) == 0
+        # The reply of the absent node could still come: on a busy machine some attempts are ambiguous.
+        assert await Hcp2Controller(remote, 5).read(1, retries=MOST_RETRIES) == 0
 
     on_a_served_line(tmp_path, story)
 
