@@ -35,8 +35,11 @@ def test_each_slip_changes_what_its_name_says(operator: str, source: str, change
     assert [slipped(source, PREFIX + operator, place) for place in range(len(there))] == changed
 
 
-@pytest.mark.parametrize("source", ['x = f"{a or b} {c(d=1)}"\n', 'x = """a"""\n', "x = 1\n"])
-def test_texts_and_constants_are_left_alone(source: str) -> None:
+@pytest.mark.parametrize(
+    "source",
+    ['x = f"{a or b} {c(d=1)}"\n', 'x = """a"""\n', "x = 1\ny = 2\n", "@f(a=1)\nclass A:\n    x = 1\n    y = 2\n"],
+)
+def test_texts_constants_decorators_and_definitions_are_left_alone(source: str) -> None:
     assert edits(source) == {}
 
 
