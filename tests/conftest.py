@@ -45,7 +45,7 @@ for number, handler in (
         signal.signal(number, handler)
 
 
-SEEN_BY_GARBAGE_COLLECTION = 10_000
+GARBAGE_THRESHOLD = 10_000
 """New objects after which Python looks for garbage."""
 
 SLOW = "slow and not exhaustive"
@@ -106,7 +106,7 @@ def pytest_collection_finish() -> None:
     """
     gc.collect()
     gc.freeze()
-    gc.set_threshold(SEEN_BY_GARBAGE_COLLECTION, *gc.get_threshold()[1:])
+    gc.set_threshold(GARBAGE_THRESHOLD, *gc.get_threshold()[1:])
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -589,11 +589,15 @@ class RemoteBus:
     # inside
 
     async def _read_clock(self) -> None:
-        """Read the owner's clock. Correct the offset only if this reply excludes it: a slow reply permits many."""
+        """Read the owner's clock. Correct the offset only if this reply excludes it: a slow reply permits many.
+
+        Of the offsets that are possible, the lowest is used: with a higher one, an old write would seem to be new.
+        """
         asked = time.monotonic()
         now: float = await self._ask("now", NoParams())
         lowest, highest = now - time.monotonic(), now - asked
-        self._ahead = min(max(self._ahead, lowest), highest)
+        if not lowest <= self._ahead <= highest:
+            self._ahead = lowest
 
     async def _follow_clock(self) -> None:
         """Read the owner's clock until the connection ends."""

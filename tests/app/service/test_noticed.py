@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, Service, connect
+from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, RemoteBus, Service, connect
 from busmaster.app.service import remote as remote_module
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.rights import Role
@@ -61,17 +61,24 @@ async def by_way(line: Served) -> AsyncIterator[tuple[Way, str]]:
         yield way, f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"
 
 
+@contextlib.asynccontextmanager
+async def behind_a_stopped_way(folder: Path) -> AsyncIterator[tuple[Served, RemoteBus, Way]]:
+    """A line, and a program that has read node 5, and whose connection stands still."""
+    async with (
+        asyncio.timeout(PATIENCE),
+        served(folder, listen=("127.0.0.1", 0)) as line,
+        by_way(line) as (way, address),
+        connect(address) as remote,
+    ):
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+        way.open.clear()
+        yield line, remote, way
+
+
 def test_a_request_is_over_when_its_time_is_though_its_owner_says_nothing(tmp_path: Path) -> None:
     async def run() -> None:
-        async with (
-            asyncio.timeout(PATIENCE),
-            served(tmp_path, listen=("127.0.0.1", 0)) as line,
-            by_way(line) as (way, address),
-            connect(address) as remote,
-        ):
+        async with behind_a_stopped_way(tmp_path) as (line, remote, way):
             controller = Hcp2Controller(remote, 5)
-            assert await controller.read(1) == 0
-            way.open.clear()
             with pytest.raises(NoReply, match="the program that owns the line did not reply"):
                 await controller.read(1, finish_within=0.05)
             with pytest.raises(WriteUnconfirmed, match="the program that owns the line did not reply"):
@@ -90,15 +97,8 @@ def test_the_wait_for_a_place_counts_as_time_of_a_request_whose_owner_says_nothi
     never = 10 * PATIENCE
 
     async def run() -> None:
-        async with (
-            asyncio.timeout(PATIENCE),
-            served(tmp_path, listen=("127.0.0.1", 0)) as line,
-            by_way(line) as (way, address),
-            connect(address) as remote,
-        ):
+        async with behind_a_stopped_way(tmp_path) as (_, remote, way):
             controller = Hcp2Controller(remote, 5)
-            assert await controller.read(1) == 0
-            way.open.clear()
             asked: dict[type[Exception], Coroutine[Any, Any, object]] = {
                 NoReply: controller.read(1, finish_within=never),
                 WriteUnconfirmed: controller.write(1, 5, finish_within=never),
@@ -151,15 +151,23 @@ def test_the_owners_clock_is_read_again_because_two_clocks_drift_apart(
         ):
             async with connect(address) as remote:
                 controller = Hcp2Controller(remote, 5)
+
+                def behind() -> float:
+                    now = remote.now()
+                    return time.monotonic() - now
+
                 for clock.ahead in (3.0, -3.0, 500.0, 0.0):
-                    await until(lambda: abs(remote.now() - time.monotonic()) < 0.2)
+                    await until(lambda: abs(behind()) < 0.2)
+                    assert behind() >= 0, "never ahead: an old write would seem to be new"
                     assert await controller.read(1, start_within=2) == 0
                 way.slow_once = 0.5
                 await until(lambda: not way.slow_once)
                 for _ in range(3):  # a slow reply permits many offsets, and changes nothing
                     assert await controller.read(1, start_within=2) == 0
-                    assert abs(remote.now() - time.monotonic()) < 0.2
-            await until(lambda: not any("_follow_clock" in str(task) for task in asyncio.all_tasks()))
+                    assert 0 <= behind() < 0.2
+                [following] = [task for task in asyncio.all_tasks() if "_follow_clock" in str(task)]
+            await asyncio.wait([following])
+            assert following.cancelled()
 
     asyncio.run(run())
 
