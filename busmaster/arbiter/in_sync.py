@@ -203,17 +203,18 @@ class InSync:
         """Yield the nodes that have an overdue reply with one of these keys (None: any key) and are not known to be
         silent.
 
-        Removed nodes are skipped, because no request is sent to them.
+        Removed and suspended nodes are skipped, because no request is sent to them.
         """
         for overdue in self.overdue_replies:
             if (
                 overdue.node is None
                 or overdue.node.removed
+                or now < overdue.node.suspended_until
                 or now >= overdue.until
                 or not (answers is None or _could_be(overdue, answers))
             ):
                 continue
-            if not _is_silent(overdue) or (
+            if not _is_silent(overdue, now) or (
                 overdue.awaited is not None and now < overdue.over and overdue.node.unheard <= MOST_UNHEARD
             ):
                 yield overdue.node
@@ -252,7 +253,7 @@ class InSync:
         for overdue in self.overdue_replies:
             # Only a request sent after the maximum reply delay proves something. Before that, both replies can be on
             # the way.
-            if overdue.over <= asked and overdue.until == inf and _is_silent(overdue):
+            if overdue.over <= asked and overdue.until == inf and _is_silent(overdue, now):
                 # Delayed replies arrive together, and that of the slower node arrives last.
                 overdue.until = now + (0.0 if overdue.node is None else overdue.node.latest(patience))
                 self._ambiguous.append(
@@ -438,11 +439,11 @@ def _could_be(overdue: OverdueReply, answers: Sequence[bytes]) -> bool:
     return overdue.key in answers if overdue.key else any(len(key) == 1 for key in answers)
 
 
-def _is_silent(overdue: OverdueReply) -> bool:
-    """Return True if the node of the overdue reply is not known to answer, so that another node's reply must clear
-    it."""
+def _is_silent(overdue: OverdueReply, now: float) -> bool:
+    """Return True if the node of the overdue reply is not known to answer, or no request may be sent to it, so that
+    another node's reply must clear it."""
     node = overdue.node
-    return node is None or node.removed or node.silent or node.last_reply == -inf
+    return node is None or node.removed or now < node.suspended_until or node.silent or node.last_reply == -inf
 
 
 def _is(run: bytes, key: bytes) -> bool:

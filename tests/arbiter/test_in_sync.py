@@ -601,16 +601,20 @@ def test_r6_a_nak_does_not_repeat_a_write_whose_caller_has_gone(leave: Callable[
     assert bench.sent() != request
 
 
-# a removed node
+# a node that may be sent nothing
 
 
-def test_r15_a_removed_node_is_sent_nothing_though_its_reply_is_overdue() -> None:
-    """Its label may have gone from the file, its address may be another drive's by now. Another node's reply clears
-    what is overdue of it."""
+@pytest.mark.parametrize("suspended", [False, True], ids=["removed", "suspended"])
+def test_r15_a_node_that_may_be_sent_nothing_is_sent_nothing_though_its_reply_is_overdue(suspended: bool) -> None:
+    """The label of a removed node may have gone from the file, its address may be another drive's by now. A suspended
+    node may be switched off. Another node's reply clears what is overdue of it."""
     bench = Bench()
     gone, other = up(bench, 9), up(bench, 5)
     lost(bench, gone)
-    bench.arbiter.remove_node(gone)
+    if suspended:
+        bench.arbiter.dispatcher.suspend(gone, bench.now + 60.0)
+    else:
+        bench.arbiter.remove_node(gone)
     asked = bench.ask(other)
     sent = []
     while not bench.ended(asked):
@@ -618,6 +622,16 @@ def test_r15_a_removed_node_is_sent_nothing_though_its_reply_is_overdue() -> Non
         sent.append(bench.answer())
     assert asked.error is None
     assert not [request for request in sent if request.startswith("07 30 39")], "a request to node 9"
+
+
+def test_r15_a_node_whose_suspension_is_over_is_asked_for_its_overdue_reply() -> None:
+    bench = Bench()
+    node, other = up(bench, 9), up(bench, 5)
+    lost(bench, node)
+    bench.arbiter.dispatcher.suspend(node, bench.now)
+    bench.ask(other)
+    bench.until_sent()
+    assert bench.sent().startswith("07 30 39"), "a request to node 9"
 
 
 # the first frame after the line came up
