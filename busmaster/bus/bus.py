@@ -452,7 +452,7 @@ class Bus:
 
     def wall_time(self) -> float:
         """Return the current time in seconds since 1970, by the machine's clock."""
-        return self.now() + self._line.wall_offset()
+        return self._line.wall_offset() + self.now()
 
     @property
     def running(self) -> bool:

@@ -200,7 +200,11 @@ class SharedLine:
 
         The value stays exactly the same until the machine's clock is set.
         """
-        offset = time.time() - self.now()
+        before, wall = self.now(), time.time()
+        if self.now() - before > CLOCK_WAS_SET:
+            # The process was stopped between the two readings, for example by a debugger: the clock was not set.
+            before, wall = self.now(), time.time()
+        offset = wall - before
         if abs(offset - self._wall_offset) > CLOCK_WAS_SET:
             self._wall_offset = offset
         return self._wall_offset

@@ -30,6 +30,7 @@ from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import make_device
+from busmaster.testing.virtual_time import VirtualTimeLoop
 from tests.stories import cycles, on_a_bus
 
 SERVER_DEVICE_BUSY = 6
@@ -497,6 +498,25 @@ def test_samples_carry_the_time_of_day_which_follows_a_clock_that_was_set(monkey
             assert snapshot.wall_at(snapshot.due) == pytest.approx(snapshot.wall - (snapshot.finished - snapshot.due))
             assert bus.wall_time() - bus.now() == pytest.approx(min(found[-1]))
         assert found == [{1000.0}, {1000.0}, {5000.0}, {400.0}]  # 2 ms is two clocks read one after the other
+
+    on_a_bus(story)
+
+
+def test_samples_carry_the_right_time_of_day_though_the_program_was_stopped_while_it_read_the_clocks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def story(bus: Bus) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualTimeLoop)
+        standstills = [10.0]
+
+        def wakes() -> float:
+            """The machine's clock, which is read after the program has stood still."""
+            loop.jump(standstills.pop() if standstills else 0.0)
+            return bus.now() + 1000.0
+
+        monkeypatch.setattr(time, "time", wakes)
+        assert bus.wall_time() - bus.now() == pytest.approx(1000.0)
 
     on_a_bus(story)
 
