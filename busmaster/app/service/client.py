@@ -372,11 +372,18 @@ class Client:
             case messages.RefusalsParams():
                 self._take_refusals(params)
             case messages.StopParams():
-                node = self._nodes.get((params.protocol, params.address))
-                if node is not None and self.permission.covers(node):
-                    node.note_stop()
-                elif node is not None:
-                    self._stopping.add(node)
+                self._take_stop(params)
+
+    def _take_stop(self, params: messages.StopParams) -> None:
+        """Count a stop that follows, also of a node that this client has not named yet."""
+        try:
+            node = self.node(params.protocol, params.address)
+        except REFUSED:
+            return  # the request that follows is refused with the reason
+        if self.permission.covers(node):
+            node.note_stop()
+        else:
+            self._stopping.add(node)
 
     def _take_refusals(self, params: messages.RefusalsParams) -> None:
         """Count the refusals that an interface in another process reports. Names that cannot be shown are ignored."""
@@ -507,8 +514,13 @@ class Client:
         return node
 
     def stops_before(self, node: Node) -> int:
-        """Return the number of stops of a node when this client named it."""
-        return self._stops[node.profile.name, node.address]
+        """Return the number of stops of a node when this client named it. Raises InvalidCommand if it has not."""
+        stops = self._stops.get((node.profile.name, node.address))
+        if stops is None:
+            raise InvalidCommand(
+                f"{node.label}: stops are counted from the message `node`: send it before `stops_seen`"
+            )
+        return stops
 
     def takes_stop(self, node: Node) -> bool:
         """Return whether the write to a node that is begun now is the stop that this client has announced: once."""
@@ -562,8 +574,10 @@ class Client:
     # streams
 
     def _follow(self, stream: int, source: Broadcast) -> None:
-        if stream in self._streams or len(self._streams) >= MOST_STREAMS:
-            raise InvalidCommand(f"one program has {MOST_STREAMS} streams at most, each with a number of its own")
+        if stream in self._streams:
+            raise InvalidCommand(f"stream {stream} of this program is in use; choose another number, or end it first")
+        if len(self._streams) >= MOST_STREAMS:
+            raise InvalidCommand(f"one program has {MOST_STREAMS} streams at most; end one first")
         self._streams[stream] = source
         source.join(self, stream)
 
@@ -609,6 +623,7 @@ class Client:
             group.close()
             raise
         self._groups[params.stream] = group
+        self._line.of_programs.add(group)
         return PollResult(group.period, group.name)
 
     def _end_stream(self, stream: int) -> None:
@@ -618,6 +633,7 @@ class Client:
         self._gathered.pop(stream, None)
         group = self._groups.pop(stream, None)
         if group is not None:
+            self._line.of_programs.discard(group)
             group.close()
         self.dropped.pop(stream, None)
 

@@ -157,6 +157,12 @@ class ClientConnection:
         """Close the connection, because the line's owner ends, after all messages."""
         self._end(GOING_AWAY, "the program that owns the line ends")
 
+    def cut(self, reason: str) -> None:
+        """End the connection at once, because its program may not use the line any more. Nothing of it may go on while
+        it does not read, so its agreement is not awaited."""
+        self._end(POLICY, reason)
+        self.websocket.abort()
+
     # inside
 
     def _go_on(self) -> None:

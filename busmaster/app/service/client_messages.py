@@ -139,6 +139,7 @@ class WriteParams(Struct, frozen=True, omit_defaults=True):
     key: str
     value: Value
     options: OptionsForm | None = None
+    stops_seen: int | None = None
     requested: Moment | None = None
 
 

@@ -273,14 +273,9 @@ class Writing:
             if refusal := self._line.authorisation.refusal(request):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
-                raise NotStarted(
-                    f"the request arrived {age:.1f} s after the program made it",
-                    node=self.node,
-                    command=str(self.command),
-                    hint="check whether the requesting program, or the owner of the line, was stopped meanwhile",
-                )
+                raise _arrived_late(age, self.node, self.command)
             self._request.options = ext.checked_options(
-                self.node, shortened(self._options, self._line.bus.now() - self._asked)
+                self.node, _left(self._options, self._line.bus.now() - self._asked, self.node, self.command)
             )
             value = await ext.run(self.node, self._request)
         except BaseException as error:
@@ -327,23 +322,44 @@ def client_request_of(params: RequestParams | WriteParams, sender: RequestSender
     """Return the request of a client. Raises InvalidCommand for a command that the protocol does not have."""
     if isinstance(params, WriteParams):
         task = RequestedCommand.of_point(params, sender, line)
-        stops_seen, client, stop = None, sender.client_of(None, task.node), False
+        client, stop = sender.client_of(None, task.node), False
     else:
         task = RequestedCommand.of_node(params, sender)
-        stops_seen = None if params.stops_seen is None else params.stops_seen + sender.stops_before(task.node)
         client = sender.client_of(params.sequence, task.node)
         stop = params.stop and _check_stop(task.node, task.command)
     node, command = task.node, task.command
+    stops_seen = None if params.stops_seen is None else params.stops_seen + sender.stops_before(node)
     if params.options is None and params.requested is None and not command.writes:
         return Reading(node, command, client, stops_seen, sender.reads)
     given = _options_of(params.options, node)
     now = line.bus.now()
     asked = now if params.requested is None else min(now, _requested(params.requested, now))
     if not command.writes:
-        options = RequestOptions.of(shortened(given, now - asked), node.label)
+        options = RequestOptions.of(_left(given, now - asked, node, command), node.label)
         options = replace(options, priority=max(options.priority, sender.rights.reads))
         return Reading(node, command, client, stops_seen, options)
     return Writing(task, given, line=line, sender=sender, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+
+
+def _left(options: CommandOptions, age: float, node: Node, command: Command[Any]) -> CommandOptions:
+    """Return the options of a request that is `age` seconds old, its times reduced by that.
+
+    Raises NotStarted if its `start_within` is over: on an idle line, a request that may start at once is always sent.
+    """
+    limit = options.get("start_within")
+    if limit is not None and age > limit:
+        raise _arrived_late(age, node, command)
+    return shortened(options, age)
+
+
+def _arrived_late(age: float, node: Node, command: Command[Any]) -> NotStarted:
+    late = f"{age:.1f} s" if age >= 1.0 else f"{age * 1000.0:.0f} ms"
+    return NotStarted(
+        f"the request arrived {late} after the program made it",
+        node=node,
+        command=str(command),
+        hint="check whether the requesting program, or the owner of the line, was stopped meanwhile",
+    )
 
 
 def _requested(requested: float, now: float) -> float:

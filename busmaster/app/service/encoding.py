@@ -135,10 +135,13 @@ class OwnersPoint(Point[Any]):
 
 
 def point_of(form: PointForm, find: FindNode) -> Point[Any]:
-    """Return the point in a message. It does not change values, because they were decoded by the owner."""
+    """Return the point in a message. It does not change values, because they were decoded by the owner.
+
+    Without a name, the command is its name: two points of a node must not have the same key.
+    """
     protocol = protocol_of(form.protocol)
-    node = find(protocol.name, form.address)
-    return Point(node, form.item, protocol.read_back(form.command), form.unit)
+    node, command = find(protocol.name, form.address), protocol.read_back(form.command)
+    return Point(node, form.item or form.key or str(command), command, form.unit)
 
 
 def owners_point_of(form: PointForm, find: FindNode) -> Point[Any]:

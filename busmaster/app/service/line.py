@@ -36,6 +36,8 @@ class ServedLine:
         """The events from now on, also before the line is served."""
         self._demanded: dict[tuple[str, Role], float] = {}
         """When a role's programs last had a group polled off its grid."""
+        self.of_programs: set[PollGroup] = set()
+        """Poll groups of connected programs, which choose the names of their points."""
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._overview: Overview | None = None
@@ -97,8 +99,8 @@ class ServedLine:
         raise InvalidCommand(f"node {address} of {protocol} is not on this line; check protocol and address")
 
     def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
-        """Return the point of a poll group that reads these places of a node."""
-        groups = [(group.name, group.points) for group in self.bus.groups]
+        """Return the point of a poll group of the owner that reads these places of a node."""
+        groups = [(group.name, group.points) for group in self.bus.groups if group not in self.of_programs]
         if groups != self._points_of:
             self._points_of = groups
             self._points = {
@@ -115,8 +117,10 @@ class ServedLine:
         None means all points of the node, also if the list would be too long. A stale mark on a good value is harmless.
         """
         before = nextafter(when, -inf)
-        points = {point.item: point for group in self.bus.groups for point in group.points_of(record)}
-        stale = [item for item, point in points.items() if ext.line_of(self.bus).is_stale(point, before)]
+        points = {(point.item, point.command): point for group in self.bus.groups for point in group.points_of(record)}
+        is_stale = ext.line_of(self.bus).is_stale
+        # One program can give a point the name of another one: the name is stale if either is.
+        stale = list({point.item: None for point in points.values() if is_stale(point, before)})
         return stale if len(stale) <= MOST_NAMED else None
 
     def _forget_group(self, group: PollGroup) -> None:

@@ -310,7 +310,7 @@ def encode_details(bus: Bus, group: PollGroup, point: Point[Any]) -> DetailsResu
     node = point.node if isinstance(point.node, Node) else None
     return DetailsResult(
         command=str(point.command),
-        sample=_encode_value(bus, point, sample),
+        sample=_encode_value(bus, point, sample, bus.alarms.get(point)),
         hint="" if sample is None or sample.error is None else sample.error.hint or "",
         timeline=None if sample is None else TimelineForm(*sample.timeline),
         due=None if sample is None else sample.due,

@@ -69,7 +69,8 @@ class RemoteOverview:
 
     async def write(self, group: str, key: str, value: Any) -> None:
         """Write a point of a group. Raises BusError or InvalidCommand as `Point.write`; the owner's limits hold."""
-        params = WriteParams(group, key, encode_value(value), OptionsForm(start_within=SOON), self._now())
+        options = OptionsForm(start_within=SOON)
+        params = WriteParams(group, key, encode_value(value), options, requested=self._now())
         asked = self._link.ask("write", params, writes=True)
         await self._link.answer(asked)
 

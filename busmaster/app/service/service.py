@@ -313,7 +313,7 @@ class Service:
             if client.peer.may_stay(self.authorisation.access):
                 client.notify_access()
             else:
-                connection.websocket.abort()
+                connection.cut("this token is not valid any more")
 
     def admit(self, connection: ClientConnection, message: ClientMessage, /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""

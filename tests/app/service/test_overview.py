@@ -247,6 +247,11 @@ def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> Non
         times = told["timeline"]
         assert times["queued"] <= times["started"] < times["first_byte"] <= times["last_byte"]
         assert times["started"] - PATIENCE < told["due"] <= times["started"]
+        assert told["sample"][-1] == ""
+        await controller.write(10, 45)
+        await until(lambda: line.bus.alarms[point] is not None)
+        told = await view.details("slow", "5/10")
+        assert (told["sample"][0], told["sample"][-1]) == (45, "high")
         with pytest.raises(InvalidCommand, match="no poll group 'none'"):
             await view.details("none", "5/10")
 

@@ -107,6 +107,24 @@ def test_what_a_request_took_to_come_is_taken_off_its_times(
 
 
 @pytest.mark.parametrize("request_", [READ, write(1.0)], ids=["read", "write"])
+def test_a_request_that_came_after_its_time_is_not_sent_on_an_idle_line_either(
+    request_: dict[str, Any], tmp_path: Path
+) -> None:
+    async def story(line: Served) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        assert await controller.read(1) == 0
+        async with raw(line) as client:
+            for late, options in ((0.9, {"start_within": 0.5}), (0.9, {"finish_within": 0.5})):
+                said = await client.ask("request", **request_, requested=line.bus.now() - late, options=options)
+                assert error_of(said) == "NotStarted"
+            assert await controller.read(1) == 0
+            in_time = {"start_within": PATIENCE, "finish_within": PATIENCE}
+            assert "result" in await client.ask("request", **request_, requested=line.bus.now(), options=in_time)
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("request_", [READ, write(1.0)], ids=["read", "write"])
 def test_a_request_of_the_future_has_no_more_time_than_one_of_now(request_: dict[str, Any], tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line) as client, busy(line):
@@ -221,7 +239,7 @@ def test_a_poll_group_that_cannot_be_followed_is_not_polled(tmp_path: Path) -> N
             accepted = (await asked(client, 1, "poll", **polled(7)))["result"]
             assert accepted == {"period": 60.0, "name": line.bus.groups[0].name}
             said = await asked(client, 2, "poll", **{**polled(7), "name": "another"})
-            assert "each with a number of its own" in said["error"]["message"]
+            assert "stream 7 of this program is in use" in said["error"]["message"]
             assert len(line.bus.groups) == 1
 
     on_a_line(tmp_path, story)
@@ -538,7 +556,8 @@ def test_a_program_has_so_many_streams(tmp_path: Path, monkeypatch: pytest.Monke
             reply = await asked(client, 1, "events", stream=3)
             assert "one program has 2 streams at most" in reply["error"]["message"]
             await client.say(method="end", params={"stream": 1})
-            assert "error" in await asked(client, 1, "events", stream=2)
+            reply = await asked(client, 1, "events", stream=2)
+            assert "stream 2 of this program is in use" in reply["error"]["message"]
             assert (await asked(client, 1, "exchanges", stream=1))["result"] == {}
 
     on_a_line(tmp_path, story)
@@ -576,6 +595,47 @@ def test_a_program_that_names_a_node_again_keeps_its_count_of_stops(tmp_path: Pa
             assert "result" in await client.ask("node", **naming)
             assert error_of(await client.ask("request", **write(2.0), stops_seen=0)) == "Superseded"
             assert (await client.ask("request", **write(3.0), stops_seen=1))["result"] is None
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_stop_by_a_program_that_has_not_named_the_node_supersedes_the_writes_of_others(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as other, raw(line) as stopping:
+            assert "result" in await other.ask("node", protocol="hcp2", address=5)
+            await stopping.say(method="stop", params={"protocol": "hcp2", "address": 5})
+            assert (await asked(stopping, 1, "request", **write(0.0), stop=True))["result"] is None
+            assert (await other.hear())["params"]["stops"] == 1
+            assert error_of(await other.ask("request", **write(5.0), stops_seen=0)) == "Superseded"
+            assert await Hcp2Controller(line.bus, 5).read(1) == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_stop_of_a_node_that_the_line_cannot_have_is_refused_with_its_request(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            await client.say(method="stop", params={"protocol": "hcp2", "address": 256})
+            reply = await client.ask("request", **write(0.0, address=256), stop=True)
+            assert error_of(reply) == "InvalidCommand"
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_write_to_a_point_is_superseded_by_a_stop_that_its_program_has_not_seen(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        line.bus.poll_group("axes", period=60.0, points=[own.point("1")])
+        to_point: dict[str, Any] = {"group": "axes", "key": "5/1", "value": 5}
+        async with raw(line) as client:
+            reply = await client.ask("write", **to_point, stops_seen=0)
+            assert "stops are counted from the message `node`" in reply["error"]["message"]
+            assert "result" in await client.ask("node", protocol="hcp2", address=5)
+            own.node.note_stop()
+            assert (await client.hear())["params"]["stops"] == 1
+            assert error_of(await client.ask("write", **to_point, stops_seen=0)) == "Superseded"
+            assert await own.read(1) == 0
+            assert (await client.ask("write", **to_point, stops_seen=1))["result"] is None
 
     on_a_line(tmp_path, story)
 
@@ -632,6 +692,55 @@ def test_a_program_with_a_stream_is_notified_of_values_that_a_write_makes_stale(
             while (message := await client.hear()).get("id") != 2:
                 received += [message["params"]["items"]] if message.get("method") == "touched" else []
         assert received == ([] if method is None else [["1"]])
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_names_that_a_program_gives_its_points_hide_no_stale_value_of_the_owner(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        line.bus.poll_group("axes", period=60.0, points=[own.point("1")])
+        async with raw(line) as client, raw(line) as other:
+            assert "result" in await asked(client, 1, "events", stream=1)
+            named_alike = {**polled(1)["points"][0], "command": {"command": "read", "element": 2}}
+            assert "result" in await asked(other, 1, "poll", **polled(1, points=[named_alike]))
+            await own.write(1, 2.5)
+            await client.say(method="now", params={}, id=2)
+            received: list[Any] = []
+            while (message := await client.hear()).get("id") != 2:
+                received += [message["params"]["items"]] if message.get("method") == "touched" else []
+        assert received == [["1"]]
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_names_that_a_program_gives_its_points_are_not_on_record_for_the_writes_of_others(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        line.bus.poll_group("axes", period=60.0, points=[Hcp2Controller(line.bus, 5).point("1")])
+        async with raw(line) as client, raw(line) as other:
+            point = polled(1)["points"][0]
+            second = {**point, "item": "hoist", "command": {"command": "read", "element": 2}}
+            points = [{**point, "item": "hoist"}, second]
+            assert "result" in await asked(other, 1, "poll", **polled(1, points=points))
+            for element in (1, 2):
+                command = {**write(3.0)["command"], "element": element}
+                said = await asked(client, element, "request", protocol="hcp2", address=5, command=command)
+                assert said["result"] is None
+        assert [record.point for record in line.records] == ["5/1", "5/raw command"]
+
+    on_a_line(tmp_path, story)
+
+
+def test_points_without_a_name_have_keys_of_their_own(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        point = polled(1)["points"][0]
+        del point["item"]
+        reads = [{"command": "read", "element": element} for element in (1, 2)]
+        points = [{**point, "key": "speed"}, *({**point, "command": read} for read in reads)]
+        async with raw(line) as client:
+            await client.say(method="poll", params=polled(1, points=points), id=1)
+            body = (await client.hear())["params"]["body"]
+            assert [one["key"] for one in body["points"]] == ["5/speed", "5/read element 1", "5/read element 2"]
 
     on_a_line(tmp_path, story)
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from websockets.asyncio.client import connect as connect_websocket
+from websockets.exceptions import ConnectionClosedError
 
 from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, RemoteBus, Service, connect, ext
 from busmaster.app import bounds
@@ -283,6 +284,24 @@ def test_a_token_that_is_withdrawn_before_the_first_message_is_not_admitted(tmp_
                 said = await Raw(connection).ask("hello", versions=[3])
                 assert said["error"]["message"] == "this token is not valid any more"
             assert line.service.clients == ()
+
+    asyncio.run(run())
+
+
+def test_a_program_whose_token_is_withdrawn_is_told_why_it_is_cut_off(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, access=TOKENS, listen=("127.0.0.1", 0)) as line:
+            assert line.service.tcp_address is not None
+            known = {"Authorization": f"Bearer {SECRET}"}
+            address = line.service.tcp_address.replace("tcp://", "ws://")
+            async with connect_websocket(address, additional_headers=known) as connection:
+                assert "result" in await Raw(connection).ask("hello", versions=[3])
+                line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
+                await line.alone()
+                with pytest.raises(ConnectionClosedError) as closed:
+                    await connection.recv()
+                assert closed.value.rcvd is not None
+                assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "this token is not valid any more")
 
     asyncio.run(run())
 
