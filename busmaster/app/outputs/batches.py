@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from math import inf
 from typing import Any, Generic, TypeVar
 
 from busmaster import Point, Sample, Snapshot
 from busmaster.app.outputs.base import BATCH, PAUSE, TICK, Item, size_of
 from busmaster.app.outputs.settings import SpillingSettings
-from busmaster.app.outputs.spilling import SpillingOutput
+from busmaster.app.outputs.spilling import HURRY, SpillingOutput
 from busmaster.app.outputs.spool import Record
 from busmaster.app.service.record import WriteRecord
 
@@ -37,6 +38,8 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
         """How many values each of the batch holds."""
         self._entries: list[WriteRecord] = []
         """The audit entries in the batch."""
+        self._hurries_at = inf
+        """When it writes nothing more, because it is to end and the rest can go to disk."""
 
     @abstractmethod
     def format(self, item: Item) -> Formatted | None:
@@ -63,7 +66,7 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
         """Let go of what `commit` opened. It never raises."""
 
     def work(self) -> None:
-        """Write batch by batch until it is stopped, then the rest."""
+        """Write batch by batch until it is stopped, then the rest: with a spool, as much of it as takes HURRY."""
         self.open_spool()
         try:
             stopped = False
@@ -74,12 +77,18 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
                     self._reopen.clear()
                     self.shut()
                 self._write_spilled()
-                while not self.spilled and self.hold(BATCH):
+                while not self.spilled and not self._hurries() and self.hold(BATCH):
                     self.commit(self._batch)
                     self.written += self.let_go()
                     self.up()
         finally:
             self.shut()
+
+    def _hurries(self) -> bool:
+        """Return whether the rest must go to disk now: a slow output would be left before it has written all."""
+        if self._spool is not None and self._stop.is_set() and self._hurries_at == inf:
+            self._hurries_at = time.monotonic() + HURRY
+        return time.monotonic() >= self._hurries_at
 
     def _write_spilled(self) -> None:
         """Write all that is on disk. When all is to end the rest stays there."""

@@ -48,7 +48,7 @@ from busmaster.app.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.app.outputs.mqtt_connection import secrets, taking_in, topic_part, unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
-from busmaster.app.outputs.spilling import SpillingOutput
+from busmaster.app.outputs.spilling import HURRY, SpillingOutput
 from busmaster.app.outputs.spool import Record
 from busmaster.app.service.authorisation import Authorisation, WriteRequest
 from busmaster.app.service.record import WriteRecord
@@ -79,8 +79,6 @@ LAST_ANSWERS = 2.0
 """Seconds for replies to the commands received so far, when no more are accepted."""
 MARGIN = 1.0
 """Seconds, beyond those, for a thread that does not get on: who does not answer then never will."""
-HURRY = 2.0
-"""Seconds from the request to end until what could not be sent goes to disk."""
 
 
 class Outgoing(NamedTuple):

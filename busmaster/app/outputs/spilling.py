@@ -18,6 +18,8 @@ from busmaster.app.outputs.base import BATCH, Output, check_folder
 from busmaster.app.outputs.settings import SpillingSettings
 from busmaster.app.outputs.spool import Record, Spool
 
+HURRY = 2.0
+"""Seconds from the request to end until what could not be delivered goes to disk: less than an output has to end."""
 SPILL_EVERY = 0.2
 """Seconds between two movings of what waits to disk, while the output is down."""
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from busmaster.app.config import FileError
-from busmaster.app.outputs import base
+from busmaster.app.outputs import base, batches
 from busmaster.app.outputs.base import Happening
 from busmaster.app.outputs.batches import BatchOutput
 from busmaster.app.outputs.distributor import Distributor, Wanted
@@ -110,6 +110,46 @@ def test_what_could_not_be_written_at_the_end_is_written_by_the_next_process(tmp
     counts = again.statistics()
     assert (counts.written, counts.dropped, counts.spilled, counts.waiting) == (51, 0, 0, 0)
     assert numbers(tmp_path / "x") == list(range(1, 52))
+
+
+def test_what_a_slow_output_cannot_write_until_it_must_end_goes_to_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "HURRY", 0.0)
+    monkeypatch.setattr(batches, "BATCH", 1)
+
+    class Slow(CsvOutput):
+        """Its first batch takes until it must end."""
+
+        def commit(self, batch: list[Any]) -> None:
+            self._stop.wait(PATIENCE)
+            super().commit(batch)
+
+    settings = FileSettings(path=str(tmp_path / "x"), spill=str(tmp_path / "spool"))
+    output = Slow("csv", settings)
+    for number in range(1, 51):
+        output.offer(cycle(number, number))
+    output.start()
+    until(lambda: len(output._batch) == 1)
+    output.close(PATIENCE)
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.spilled) == (1, 0, 49)
+    again = CsvOutput("csv", settings)
+    again.start()
+    until(lambda: again.written == 49)
+    again.close(PATIENCE)
+    assert numbers(tmp_path / "x") == list(range(1, 51))
+
+
+def test_a_slow_output_without_a_spool_writes_all_that_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "HURRY", 0.0)
+    monkeypatch.setattr(batches, "BATCH", 1)
+    output = CsvOutput("csv", FileSettings(path=str(tmp_path / "x")))
+    for number in range(1, 51):
+        output.offer(cycle(number, number))
+    output.start()
+    output.close(PATIENCE)
+    assert (output.statistics().written, numbers(tmp_path / "x")) == (50, list(range(1, 51)))
 
 
 @every
