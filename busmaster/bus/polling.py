@@ -362,7 +362,9 @@ class PollGroup(Cycles):
         for point in self._points:
             before = latest.samples.get(point)
             if point.quantity == read.quantity and before is not None and _is_older(before, reading.started):
-                fresh[point] = self._sample(point, None, reading)
+                fresh[point] = sample = self._sample(point, None, reading)
+                if sample.error is not None:
+                    self._note_good(point)
         if not fresh:
             return
         self._between |= fresh

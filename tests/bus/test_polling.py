@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -651,6 +652,29 @@ def test_when_a_point_was_last_good_is_known_while_it_fails() -> None:
         assert group.good_at(point) is None, "a point that was removed begins again"
 
     on_a_bus(story, device)
+
+
+def test_when_a_point_was_last_good_is_known_after_a_read_after_a_write_that_failed() -> None:
+    def decode(raw: float) -> float:
+        if raw >= 5:
+            raise GarbledReply("out of range")
+        return raw
+
+    async def story(bus: Bus) -> None:
+        controller = Hcp2Controller(bus, 1)
+        point = replace(controller.point("7"), decode=decode, read_after_write=True)
+        group = bus.poll_group("g", period=1000.0, points=[point])
+        [snapshot] = await cycles(group, 1)
+        changes = group.subscribe(changes=True)
+        await controller.write(7, 6)
+        while (change := await anext(changes))[point].error is None:
+            pass
+        assert group.latest is not None
+        assert group.latest[point].error is not None
+        assert change.cycle == snapshot.cycle
+        assert group.good_at(point) == snapshot[point].wall
+
+    on_a_bus(story)
 
 
 def test_a_stream_that_is_closed_holds_what_it_has_and_takes_no_more() -> None:

@@ -844,6 +844,11 @@ class ModbusTcpServer:
             self._replaced.pop(writer, None)
             writer.transport.abort()
 
+    def close(self) -> None:
+        """End all connections."""
+        for writer in (*self._open, *self._replaced):
+            writer.transport.abort()
+
     def _make_room(self, peer: str) -> bool:
         """Close a connection for one more of this peer. Returns False if none may be closed.
 
@@ -918,9 +923,14 @@ async def serve(
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(values.run())
         tasks.create_task(values.line.follow())
-        async with await asyncio.start_server(server.accept, sock=socket, limit=MOST_GATEWAY_UNREAD) as accepting:
+        accepting = await asyncio.start_server(server.accept, sock=socket, limit=MOST_GATEWAY_UNREAD)
+        try:
             opened(address_text(*accepting.sockets[0].getsockname()[:2]))
-            await accepting.serve_forever()
+            await asyncio.get_running_loop().create_future()
+        finally:
+            # Not `serve_forever`, nor `async with`: from Python 3.12 on, both wait until each client has left.
+            accepting.close()
+            server.close()
 
 
 async def map_text(values: Values, allow: Collection[str]) -> str:

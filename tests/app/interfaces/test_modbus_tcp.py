@@ -388,6 +388,32 @@ def test_a_client_that_floods_is_served_in_turn_with_the_others() -> None:
     with_server(story)
 
 
+def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
+    """From Python 3.12 on, a server that waits for its clients would not end before they do."""
+
+    async def forever() -> None:
+        await asyncio.get_running_loop().create_future()
+
+    async def run() -> None:
+        opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        line: Any = SimpleNamespace(follow=forever, on_state=lambda _: None)
+        values: Any = SimpleNamespace(run=forever, line=line)
+        listen = ("127.0.0.1", 0)
+        serving = asyncio.ensure_future(modbus_tcp.serve(values, Rules(), listen, opened.set_result, print))
+        async with asyncio.timeout(PATIENCE):
+            host, _, port = (await opened).rpartition(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            writer.write(frame(b"\x63"))  # there is no such function
+            assert (await reader.readexactly(9))[7:] == b"\xe3\x01"
+            serving.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await serving
+            assert await is_closed(reader)
+            writer.transport.abort()
+
+    asyncio.run(run())
+
+
 @pytest.mark.parametrize(
     "sent", [frame(READ, protocol=1), frame(READ, length=1), frame(READ, length=255), b"GET / HTTP"]
 )

@@ -37,9 +37,12 @@ async def serve(line: Following, host: str, port: int) -> None:
         finally:
             writer.close()
 
-    async with await asyncio.start_server(client, host, port, limit=LONGEST) as server:
+    server = await asyncio.start_server(client, host, port, limit=LONGEST)
+    try:
         note(f"listening at {server.sockets[0].getsockname()[1]}")
         await line.follow()
+    finally:
+        server.close()  # `async with` would wait until each client has left
 
 
 async def reply(line: Following, request: str) -> str:
