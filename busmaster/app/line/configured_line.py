@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from itertools import islice
@@ -360,9 +360,10 @@ class ConfiguredLine:
                 raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             bits = (f"{point.name}.{bit}" for point in section.points.values() for bit in point.meaning.bits)
+            symbols = section.options.get("symbols", ())
             # a1-3 can be a name, and then it is not a range
-            known = {*section.points, *section.options.get("symbols", ()), *bits}
-            for item in (name for part in listed(items) for name in expanded(part, known)):
+            known = {*section.points, *symbols, *bits}
+            for item in (name for part in listed(items) for name in _expanded_item(part, known, symbols)):
                 count += 1
                 if count > MOST_MEMBERS:
                     raise InvalidCommand(f"{text[:SHOWN]!r} expands to more than {MOST_MEMBERS} points")
@@ -483,6 +484,14 @@ def _section(file: LineFile, name: str) -> PointSection | None:
     node, _, point = name.partition("/")
     section = file.nodes.get(node)
     return None if section is None else section.points.get(point) or _word_of(section, point)
+
+
+def _expanded_item(part: str, known: Container[str], symbols: Container[str]) -> Iterator[str]:
+    """Yield the items that `part` stands for. In a run of a symbol (a1-3:32), the symbol is not a range."""
+    symbol, colon, count = part.partition(":")
+    if colon and symbol in symbols and part not in known:
+        return (f"{symbol}:{number}" for number in expanded(count))
+    return expanded(part, known)
 
 
 def _word_of(node: NodeSection, name: str) -> PointSection | None:

@@ -77,11 +77,13 @@ class _Server:
             self._silent.pop(writer, None)
             self._asking.add(writer)
             busy = len(self._asking) > MOST_ASKING
+            writer.transport.set_write_buffer_limits(0)  # drain() waits until the system has taken everything
             writer.write(response(BUSY, "text/plain", b"too many ask at once\n") if busy else await self._reply(head))
             async with asyncio.timeout(PATIENCE):
                 await writer.drain()
         except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError):
-            pass  # the client is not a scraper, or has disconnected
+            # The client is not a scraper, does not read, or has disconnected. close() would wait until it has read.
+            writer.transport.abort()
         finally:
             self._drop(writer)
 

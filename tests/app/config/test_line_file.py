@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import Priority, Rfc2217Port, Rs485, SerialPort, TcpPort
+from busmaster import InvalidCommand, Priority, Rfc2217Port, Rs485, SerialPort, TcpPort
 from busmaster.app.bounds import LONGEST_TITLE
 from busmaster.app.config import FileError, LineFile, emulated_line, load
 from busmaster.app.config.sections import read
@@ -299,6 +299,20 @@ def test_a_point_of_a_group_may_be_many() -> None:
         *("drive1/1", "drive1/2", "drive1/axis0.position"),
     ]
     assert configured.file.groups["all"].priority is Priority.BACKGROUND
+
+
+def test_a_name_that_looks_like_a_range_is_the_point_or_the_symbol_with_this_name() -> None:
+    text = (
+        f'{SLOW}{PRESS}symbols = {{ zone1-3 = 3000 }}\npoints = {{ "cam1-2" = {{ item = "2008" }} }}\n'
+        '[groups.all]\nperiod = 1\npoints = "press/zone1-3,cam1-2,2012-2013,zone1-3:4,zone1-3:5-6,cam1-2"\n'
+    )
+    configured = line(text)
+    assert [point.key for point in configured._wanted["all"]] == [
+        *("press/zone1-3", "press/cam1-2", "press/2012", "press/2013"),
+        *("press/zone1-3:4", "press/zone1-3:5", "press/zone1-3:6", "press/cam1-2"),
+    ]
+    with pytest.raises(InvalidCommand, match="no such item 'zone1'"):
+        list(configured.points_named("press/zone1-2"))
 
 
 # outputs and the emulator

@@ -549,6 +549,8 @@ class Scrapes:
         self.listener = scrapes.listening("127.0.0.1", 0)
         self.go_on = threading.Event()
         self.made: list[str] = []
+        self.longer: dict[str, int] = {}
+        """Bytes behind the page for a form."""
         self.stop = threading.Event()
         self.error: Exception | None = None
         self.inner: Any = None
@@ -559,7 +561,7 @@ class Scrapes:
         self.go_on.wait(PATIENCE)
         if self.error is not None:
             raise self.error
-        return "text/plain", f"page for {accept}".encode()
+        return "text/plain", f"page for {accept}".encode() + bytes(self.longer.get(accept, 0))
 
     async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         reader, writer = await asyncio.open_connection(*self.listener.getsockname())
@@ -660,6 +662,32 @@ async def test_half_a_scrape_is_closed_when_its_time_is_over(monkeypatch: pytest
         reader, writer = await server.connect()
         writer.write(b"GET /metrics HT")
         assert await reader.read() == b""
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("size", [60_000, 8_000_000])
+async def test_a_scraper_that_does_not_take_its_page_is_disconnected_when_its_time_is_over(
+    monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    monkeypatch.setattr(scrapes, "MOST_ASKING", 1)
+    async with scrape_server(monkeypatch) as server:
+        server.listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        server.longer["all"] = size
+        with socket.socket() as lazy:
+            lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            lazy.connect(server.listener.getsockname())
+            lazy.sendall(b"GET /metrics HTTP/1.1\r\nAccept: all\r\n\r\n")
+            await server.until_made(1)
+            monkeypatch.setattr(scrapes, "PATIENCE", 0.02)
+            server.go_on.set()
+            while not (await (await server.ask()).read()).startswith(b"HTTP/1.1 200 OK"):
+                pass  # the other one still has the only place
+            lazy.setblocking(False)
+            received = 0
+            with suppress(ConnectionResetError):
+                while part := await asyncio.get_running_loop().sock_recv(lazy, size):
+                    received += len(part)
+            assert 0 < received < size, "the rest of the page was discarded"
 
 
 @pytest.mark.asyncio

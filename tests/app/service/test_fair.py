@@ -18,7 +18,7 @@ from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.bounds import MOST_RETRIES
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
+from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, raw, until
 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2
 
@@ -203,6 +203,28 @@ def test_a_sequence_ends_with_its_program(tmp_path: Path) -> None:
                 await held.read(1)
 
     on_a_served_line(tmp_path, story)
+
+
+@pytest.mark.parametrize("sequences", [1, 3])
+def test_a_program_that_leaves_gives_back_its_sequences_and_its_nodes(tmp_path: Path, sequences: int) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for number in range(sequences):
+                hold = {"sequence": number, "protocol": "hcp2", "address": 5 + number, "max_hold": 5.0}
+                await client.say(method="hold", params=hold)
+            refused = {"sequence": sequences, "protocol": "none", "address": 5, "max_hold": 5.0}
+            await client.say(method="hold", params=refused)
+            read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+            assert (await client.ask("request", **read, sequence=0))["result"] == 0
+            [program] = line.service.clients
+            holds = [hold for hold in program._holds.values() if isinstance(hold, Hold)]
+            assert len(line.bus.nodes) == sequences
+            assert ext.line_of(line.bus).clients == 1
+        await until(lambda: not line.bus.nodes)
+        assert ext.line_of(line.bus).clients == 0
+        assert [held_no_longer(hold) for hold in holds] == [True] * sequences
+
+    on_a_line(tmp_path, story)
 
 
 def test_a_sequence_whose_time_is_over_says_so_to_its_program(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from functools import partial
 from math import nan
 from pathlib import Path
 from types import SimpleNamespace
@@ -528,6 +529,34 @@ async def test_unchanged_values_and_rows_are_sent_once(monkeypatch: pytest.Monke
         assert seen.count("frame") == pytest.approx(5.0 / INTERVAL, abs=1)
         assert seen.count("groups") == pytest.approx(5.0 / 0.6, abs=2)  # the first picture after COUNTED_EVERY
         pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
+async def test_a_screen_that_joins_while_others_look_has_the_counts_in_its_first_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        group = polled(bus, "axes", "1", address=1, period=0.1)
+        await anext(aiter(group))
+        group.pause()
+        pictures, screens = overview_of(bus), [Screen(), Screen(), Screen()]
+        seen: list[list[str]] = [[], [], []]
+        for screen, methods in zip(screens, seen, strict=True):
+            noted = partial(lambda methods, stream, method, body, part=0: methods.append(method), methods)
+            monkeypatch.setattr(screen, "notify_surely", noted)
+        pictures.join(screens[0], 1)
+        await until(lambda: "frame" in seen[0])
+        seen[0].clear()
+        pictures.join(screens[1], 1)
+        pictures.join(screens[2], 1)
+        await until(lambda: "frame" in seen[2])
+        assert seen == [["frame"], *[["rows", "values", "groups", "nodes", "frame"]] * 2], "nothing else is new"
+        await asyncio.sleep(5.0)
+        assert len({(methods.count("groups"), methods.count("nodes")) for methods in seen}) == 2
+        assert seen[1].count("groups") == seen[0].count("groups") + 1
+        for screen in screens:
+            pictures.leave(screen, 1)
         await pictures._journal.close()
 
 

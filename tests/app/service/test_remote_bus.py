@@ -49,6 +49,7 @@ from busmaster.protocols.hcp2 import StatusWord
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.modbus.codec import PROFILE as MODBUS
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, served, until
+from tests.patience import PATIENCE
 
 RECEIVED = Link.received
 BRIEF = Timings.uniform(ReplyTiming(0.02, 0.02, 0.02, 0.02))
@@ -471,6 +472,40 @@ def test_a_program_that_could_not_connect_leaves_no_error_that_nobody_hears(
         with pytest.raises(LineDown):
             await connect(f"unix:{tmp_path}/line.sock").__aenter__()
         assert [one.future.cancelled() for one in asked] == [True]
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("withheld", ["hello", "now", "check"])
+def test_a_program_that_is_cancelled_while_it_enters_leaves_no_connection(
+    withheld: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    receive, ask = Link.received, Link.ask
+
+    def note(self: Link, method: str, params: Any, **options: Any) -> link.PendingRequest:
+        asked.append(method)
+        return ask(self, method, params, **options)
+
+    def without_the_reply(self: Link, text: str | bytes) -> None:
+        if (asked[-1] if asked else "hello") != withheld:
+            receive(self, text)
+
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, listen=("127.0.0.1", 0)) as line:
+            assert line.service.tcp_address is not None
+            with monkeypatch.context() as patch:
+                patch.setattr(Link, "ask", note)
+                patch.setattr(Link, "received", without_the_reply)
+                remote = connect(line.address if withheld == "check" else line.service.tcp_address)
+                if withheld == "check":
+                    Hcp2Controller(remote, 5).node.check(hcp2.Write(1, (1.0,)))
+                entering = asyncio.ensure_future(remote.__aenter__())
+                await until(lambda: line.service.clients and (withheld == "hello" or withheld in asked))
+                entering.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await entering
+            await line.alone()
 
     asyncio.run(run())
 
