@@ -352,6 +352,19 @@ def test_events_and_refusals_from_its_start_on_are_kept_for_those_who_look_later
     on_a_served_line(tmp_path, story)
 
 
+def test_events_are_kept_by_a_service_that_serves_again_too(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        point = replace(Hcp2Controller(line.bus, 5).point("11"), meaning=Meaning(high=5))
+        await line.service.__aexit__(None, None, None)
+        await line.service.__aenter__()
+        await point.write(6)
+        line.bus.poll_group("axes", period=60, points=[point]).demand()
+        await until(lambda: line.service.line.journal.entries)
+        assert [text for _, text in line.service.line.journal.entries] == ["5/11 = 6 is above its high of 5"]
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_line_whose_adapter_has_an_echo_says_so(tmp_path: Path) -> None:
     async def run() -> None:
         line = Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False, echo=Echo())
