@@ -141,6 +141,7 @@ def test_a_group_that_was_closed_here_can_be_read_again(tmp_path: Path) -> None:
                 theirs.close()
                 await until(lambda: not line.service.clients[0]._streams)
             assert len(line.bus.groups) == 1
+            await until(lambda: not line.bus.groups[0]._consumers_of_changes)
 
     on_a_line(tmp_path, story)
 
@@ -178,6 +179,25 @@ def test_a_service_that_ended_before_the_list_of_groups_was_sent_sends_it_when_i
             await until(lambda: [group.name for group in remote.groups] == ["first", "second"])
 
     on_a_line(tmp_path, story)
+
+
+def test_a_value_that_the_owner_reads_between_two_cycles_arrives_with_the_others_of_the_cycle(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        points = [replace(controller.point("1"), read_after_write=True), controller.point("2")]
+        group = line.bus.poll_group("axes", period=3600, points=points)
+        await until(lambda: remote.groups)
+        theirs = remote.group("axes")
+        consumer = theirs.subscribe(changes=True)
+        await theirs.ready()
+        group.demand()
+        cycle = await anext(consumer)
+        await points[0].write(7.5)
+        between = await anext(consumer)
+        assert ([point.key for point in between], between.cycle) == (["5/1", "5/2"], cycle.cycle)
+        assert [sample.value for sample in between.values()] == [7.5, 0]
+
+    on_a_served_line(tmp_path, story)
 
 
 async def first(group: RemoteGroup) -> object:

@@ -646,6 +646,8 @@ async def test_details_have_only_the_limits_of_the_places_of_their_point() -> No
             (-1, 50, 5, True)
         ]
         assert (details.low, details.high, details.labels) == (-3.5, 40, {})
+        from_zero = overview.encode_details(bus, group, replace(point, meaning=Meaning(low=0)))
+        assert (from_zero.low, from_zero.high) == (0, None)
         sample = snapshot[point]
         assert details.sample is not None
         assert details.timeline is not None
@@ -700,6 +702,23 @@ async def test_values_are_sent_again_when_they_change_or_a_write_makes_them_stal
         [body] = [body for body in screen.parts("values") if body["first"] == 1]
         assert body["values"][0][1] != quality
         pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
+async def test_a_value_that_is_read_after_a_write_is_shown_before_the_next_cycle() -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        point = replace(Hcp2Controller(bus, 1).point("2"), read_after_write=True)
+        await anext(aiter(bus.poll_group("slow", period=1000.0, points=[point])))
+        pictures = overview_of(bus)
+        pictures._regroup()
+        [part] = pictures._parts
+        part.send_values(1, bus)
+        await point.write(5.0)
+        assert part.send_values(1, bus)  # it is stale
+        await asyncio.sleep(1.0)
+        assert part.send_values(1, bus)
+        assert json.loads(part.values)["values"][0][:2] == [5.0, "good"]
         await pictures._journal.close()
 
 

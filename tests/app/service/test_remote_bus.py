@@ -259,6 +259,10 @@ def test_handles_of_one_node_agree_on_its_timings(tmp_path: Path) -> None:
             Hcp2Controller(remote, 5, timings=BRIEF)
         with pytest.raises(InvalidCommand, match="other timings or retries"):
             Hcp2Controller(remote, 5, timings=PATIENT, retries=7)
+        with pytest.raises(InvalidCommand, match="other timings or retries"):
+            Hcp2Controller(remote, 5, retries=0)
+        with pytest.raises(InvalidCommand, match="address 999 does not exist"):
+            Hcp2Controller(remote, 999)
         Hcp2Controller(remote, 5, timings=PATIENT)
         assert await first.read(1) == await Hcp2Controller(remote, 5).read(1) == 0
 

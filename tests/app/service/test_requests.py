@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import time
 from collections.abc import AsyncIterator
@@ -23,7 +24,7 @@ from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.client_requests import Reading, Writing, client_request_of
 from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.fields import OptionsForm, shortened
-from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, encode_value
+from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, Malformed, decode_client_message, encode_value
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.record import Outcome
 from busmaster.app.service.rights import RIGHTS, Role
@@ -337,6 +338,36 @@ async def test_a_safe_state_that_could_not_be_sent_to_its_end_is_reported() -> N
         (2, ValueError),
     ]
     assert replies.answers == []
+
+
+def test_a_cancellation_of_what_has_no_request_is_ignored(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            assert (await client.ask("request", **READ))["result"] == 0
+            for number in (1, 4711):  # one that has ended, and one that never was
+                await client.say(method="cancel", params={"id": number})
+            assert (await client.ask("request", **READ))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_number_of_a_request_in_progress_is_not_used_for_another_of_any_kind(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        await Hcp2Controller(remote, 5).read(1)
+        [program] = line.service.clients
+
+        def say(method: str, params: dict[str, Any], **more: int) -> None:
+            message = {"jsonrpc": "2.0", "method": method, "params": params, **more}
+            program.take(decode_client_message(json.dumps(message)))
+
+        say("request", READ, id=70)  # the line has no turn before it is cancelled
+        for method, params in (("now", {}), ("request", READ), ("request", {}), ("plan", {}), ("erase", {})):
+            with pytest.raises(Malformed, match="request 70 is already in progress"):
+                say(method, params, id=70)
+        say("cancel", {"id": 70})
+        assert program.unfinished == ()
+
+    on_a_served_line(tmp_path, story)
 
 
 # checks and reports
