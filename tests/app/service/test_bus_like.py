@@ -268,6 +268,19 @@ def test_a_group_that_is_closed_before_it_was_accepted_does_not_begin(tmp_path: 
     on_a_served_line(tmp_path, story)
 
 
+def test_a_group_begins_although_the_program_waits_for_it_no_longer(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        group = remote.poll_group("mine", period=60, points=[Hcp2Controller(remote, 5).point("1")])
+        waiting = asyncio.ensure_future(group.ready())
+        await asyncio.sleep(0)
+        waiting.cancel()
+        await asyncio.wait([waiting])
+        await group.ready()
+        assert [own.name for own in line.bus.groups] == [group.owners_name]
+
+    on_a_served_line(tmp_path, story)
+
+
 @pytest.mark.slow
 def test_a_plan_of_a_remote_bus_is_that_of_its_owner(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:

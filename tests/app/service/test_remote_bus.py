@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import json
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -546,6 +548,45 @@ def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
         remote.link.received(said.replace('"id": 1', f'"id": {remote.link._count}'))
         with pytest.raises(WriteUnconfirmed, match="sent an invalid message"):
             await writing
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_an_event_of_a_node_whose_protocol_is_not_installed_is_ignored(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        await remote.statistics()
+        node = {"protocol": "of-a-plugin", "address": 1, "label": "node 1"}
+        body = {"event": "NodeChanged", **node, "before": "unknown", "after": "up", "returning": False}
+        params = {"stream": 0, "dropped": 0, "body": body}
+        remote.link.received(json.dumps({"jsonrpc": "2.0", "method": "event", "params": params}))
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+        event = await anext(events)
+        assert isinstance(event, NodeChanged)
+        assert event.node.address == 5
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_events_of_a_line_that_was_lost_before_it_replied_leave_no_error_that_nobody_hears(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        [connection] = line.service._clients.values()
+        connection.websocket.abort()
+        assert [event async for event in events] == []
+
+    on_a_served_line(tmp_path, story)
+    gc.collect()
+    assert not caplog.records
+
+
+def test_a_message_of_a_stream_that_has_ended_is_ignored(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        params = {"stream": 7, "dropped": 0, "body": {}}  # it was on its way when the stream ended
+        remote.link.received(json.dumps({"jsonrpc": "2.0", "method": "ended", "params": params}))
+        assert await Hcp2Controller(remote, 5).read(1) == 0
 
     on_a_served_line(tmp_path, story)
 
