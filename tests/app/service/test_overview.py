@@ -507,6 +507,24 @@ async def test_each_part_names_its_place_and_a_screen_that_joins_later_gets_all_
 
 
 @in_virtual_time
+async def test_a_picture_of_other_points_has_the_counts_of_their_groups() -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        for name in ("a", "b", "c", "d"):
+            polled(bus, name, "1", address=1, period=0.1)
+        pictures, screen = overview_of(bus), Screen()
+        pictures.join(screen, 1)
+        await asyncio.sleep(1.0)
+        for number, closed in enumerate(("a", "b", "c"), 2):
+            bus.group(closed).close()
+            while screen.latest["frame", 0]["set"] != number:  # noqa: ASYNC110  time is virtual
+                await asyncio.sleep(0.01)
+            [groups] = screen.parts("groups")
+            assert [group["name"] for group in groups["groups"]] == [group.name for group in bus.groups]
+        pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
 async def test_unchanged_values_and_rows_are_sent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
         group = polled(bus, "axes", "1", address=1, period=0.1)
@@ -610,6 +628,8 @@ def test_points_are_the_same_as_before_only_if_they_are_the_same_objects() -> No
     named: Any = SimpleNamespace(name="axes")
     points = (point, replace(point, encode=None))
     assert [overview._encode_point(named, one).writable for one in points] == [True, False]
+    row = overview._encode_point(named, replace(point, item="pull", unit="N"))
+    assert (row.group, row.key, row.node, row.item, row.unit) == ("axes", "1/pull", "node 1", "pull", "N")
 
 
 @pytest.mark.parametrize(
@@ -734,6 +754,7 @@ async def test_the_log_keeps_events_with_a_text_and_ends_when_it_is_closed() -> 
         for number in range(2 * KEPT_EVENTS):
             journal.note(f"event {number}")
         assert len(journal.entries) == KEPT_EVENTS
+        assert {when for when, _ in journal.entries} == {bus.now()}
         task = journal._task
         assert task is not None
         await journal.close()
@@ -785,7 +806,7 @@ def test_details_have_the_hint_of_an_error_and_the_limits_of_a_block() -> None:
         group: Any = SimpleNamespace(latest=SimpleNamespace(samples={point: sample}))
         details = overview.encode_details(bus, group, point)
         assert (details.hint, details.due) == (hint, 1.0)
-        assert [limit.maximum for limit in details.limits] == [7]
+        assert [(limit.name, limit.maximum) for limit in details.limits] == [("holding:10:3", 7)]
     assert overview.encode_details(bus, group, unit.point("holding:13")).limits == []
     precise = replace(point, meaning=Meaning(precision=2))
     named: Any = SimpleNamespace(name="axes")

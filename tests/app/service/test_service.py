@@ -71,6 +71,7 @@ def test_it_reports_the_line_and_what_was_refused_to_each_program(tmp_path: Path
         async with connect(line.address) as remote:
             about = remote.about
             endpoint = line.bus.endpoint
+            assert (about["name"], about["line"]) == (line.service.name, endpoint.name)
             assert endpoint.settings is not None
             assert (about["baudrate"], about["framing"]) == (endpoint.settings.baudrate, endpoint.settings.framing)
             assert (about["echo"], about["process"], about["tcp"]) == (endpoint.echo, os.getpid(), None)
@@ -171,6 +172,7 @@ def test_every_program_is_informed_of_stops_writes_groups_and_its_permission(tmp
             await until(lambda: all(remote.groups for remote in programs))
             line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
             await until(lambda: all(remote.about["read_only"] for remote in programs))
+            assert all(remote.about["name"] == line.service.name for remote in programs), "all else stays"
 
     on_a_served_line(tmp_path, story)
 
@@ -374,6 +376,29 @@ def test_a_line_whose_adapter_has_an_echo_says_so(tmp_path: Path) -> None:
             connect(service.address) as remote,
         ):
             assert remote.about["echo"] is True
+
+    asyncio.run(run())
+
+
+def test_what_is_refused_is_a_warning_in_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def story(line: Served) -> None:
+        line.authorisation.refusals.note_rate("user 4711")
+
+    on_a_line(tmp_path, story)
+    [record] = caplog.records
+    assert (record.name, record.levelname) == ("busmaster.app.service", "WARNING")
+    assert record.getMessage().endswith("connects again and again: 1 from user 4711")
+
+
+def test_the_address_of_a_socket_holds_in_another_folder_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        monkeypatch.chdir(tmp_path)
+        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, []))) as bus:
+            async with Service(bus, path="line.sock") as service:
+                monkeypatch.chdir("/")
+                async with connect(service.address) as remote:
+                    assert remote.about["clients"] == 1
+            assert os.listdir(tmp_path) == []
 
     asyncio.run(run())
 
