@@ -87,6 +87,16 @@ def test_handles_may_be_made_before_the_bus_is_entered(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
+def test_a_node_that_is_named_later_has_the_owners_label_too(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        ext.rename(Node.of(Hcp2Controller(line.bus, 5)), "winder")
+        controller = Hcp2Controller(remote, 5)
+        assert await controller.read(1) == 0
+        assert controller.node.label == "winder"
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_nodes_that_were_used_before_the_bus_was_entered_have_their_settings_and_labels_at_once(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         for address in (5, 6):
