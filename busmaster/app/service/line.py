@@ -6,6 +6,7 @@ from collections.abc import Collection, Hashable
 from functools import partial
 from math import inf, nextafter
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from busmaster import Bus, InvalidCommand, Node, Point, PollGroup, ext
 from busmaster.app.service.authorisation import Authorisation
@@ -34,7 +35,7 @@ class ServedLine:
         self.planner = Planner(bus)
         self.journal = EventLog(bus)
         """The events from now on, also before the line is served."""
-        self._demanded: dict[tuple[str, Role], float] = {}
+        self._demanded: WeakKeyDictionary[PollGroup, dict[Role, float]] = WeakKeyDictionary()
         """When a role's programs last had a group polled off its grid."""
         self.of_programs: set[PollGroup] = set()
         """Poll groups of connected programs, which choose the names of their points."""
@@ -86,9 +87,10 @@ class ServedLine:
     def demand(self, group: PollGroup, role: Role) -> None:
         """Poll a group now. If the programs of this role have demanded that recently, wait for the next cycle."""
         every, now = RIGHTS[role].demand_every, self.bus.now()
-        if now < self._demanded.get((group.name, role), -inf) + every * group.period:
+        demanded = self._demanded.setdefault(group, {})
+        if now < demanded.get(role, -inf) + every * group.period:
             return
-        self._demanded[group.name, role] = now
+        demanded[role] = now
         group.demand()
 
     def node(self, protocol: str, address: int) -> Node:
@@ -125,8 +127,6 @@ class ServedLine:
 
     def _forget_group(self, group: PollGroup) -> None:
         self._groups.pop(group, None)
-        for role in Role:
-            self._demanded.pop((group.name, role), None)
 
     def _end_events(self) -> None:
         self._events = None

@@ -67,7 +67,9 @@ class EventLog:
         self._task: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
-        """Record the events since this object was made, and from now on."""
+        """Record the events since this object was made, or since this call after `close`, and from now on."""
+        if self._task is not None:  # the line is served again, and its stream of events was closed
+            self._stream = self._bus.events()
         self._task = asyncio.ensure_future(self._listen())
 
     def note(self, text: str) -> None:

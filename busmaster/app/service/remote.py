@@ -562,7 +562,9 @@ class RemoteBus:
         stream: Stream[BusEvent] = Stream(self._events, EVENT_BUFFER)
         if not self._follows_events:
             self._follows_events = True
-            self.link.ask("events", StreamParams(0))
+            asked = self.link.ask("events", StreamParams(0))
+            # Nothing waits for the reply: a lost connection ends the streams.
+            asked.future.add_done_callback(lambda future: future.cancelled() or future.exception())
         return stream
 
     async def overview(self, receive: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
@@ -663,7 +665,10 @@ class RemoteBus:
                 for take in self.on_touched:
                     take(to_builtins(params))
             case StreamMessage() if method == "event":
-                event = event_of(params.body, self.find)
+                try:
+                    event = event_of(params.body, self.find)
+                except InvalidCommand:  # a node whose protocol is not installed here, as in `nodes`
+                    return
                 for stream in self._events:
                     stream.put(event)
             case StreamMessage():

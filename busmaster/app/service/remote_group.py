@@ -107,11 +107,20 @@ class RemoteGroup(Cycles):
                 self._set = body.set
                 # By its own points, a program gets the values that they decode.
                 if not self._own:
-                    self._points = tuple(owners_point_of(form, self._find) for form in body.points)
+                    self._take_points(body)
             case SnapshotBody() as body if body.set == self._set:
                 self._publish(snapshot_of(body, self.name, self._points))
             case NoBody():
                 self.close()
+
+    def _take_points(self, body: PointsBody) -> None:
+        """Use the owner's points. One of a protocol that is not installed here ends the group, and nothing else."""
+        try:
+            self._points = tuple(owners_point_of(form, self._find) for form in body.points)
+        except InvalidCommand as error:
+            self.end(error)
+            if self._stream is not None:
+                self._end_stream(self._stream)
 
     def end(self, cause: BusError | InvalidCommand | None = None) -> None:
         """End its consumers after the snapshots that they hold, with an error if that is the cause."""

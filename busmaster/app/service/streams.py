@@ -54,7 +54,8 @@ class Broadcast:
         """Remove a client."""
         if (reader, stream) in self.readers:
             self.readers.remove((reader, stream))
-        if not self.readers and self._task is not None:
+        # One that has ended has called `on_end` already: since then, another one may run for the same source.
+        if not self.readers and self._task is not None and not self._task.done():
             self._task.cancel()
             self._on_end()
 

@@ -132,6 +132,8 @@ def test_one_that_only_sends_the_safe_state_is_admitted_when_all_places_are_take
             await client.ask("hello", versions=[3], safe_only=True)
             # It comes as far as authorisation, which has no safe state of this line.
             assert "has no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
+            await client.say(method="cancel", params={"id": 1})  # a program whose own time is over sends it
+            assert "has no safe state" in (await client.ask("safe", writes={}))["error"]["message"]
         assert line.service.tcp_address is not None
         for address, token in ((line.address, None), (line.service.tcp_address, TOKENS["admin"])):
             async with connect(address, token=token, safe_only=True) as remote:  # entering requests nothing else

@@ -291,10 +291,11 @@ def test_a_version_that_is_not_spoken_is_said(tmp_path: Path) -> None:
                 "the service protocol has version 3 here, not [0, 99]; update the older of the two programs"
             )
             assert (said["id"], said["error"]["code"], "data" in said["error"]) == (None, -32602, False)
-        async with raw(line, hello=False) as client:
-            said = await client.ask("groups")
-            assert "the first message must be hello" in said["error"]["message"]
-            assert (said["id"], said["error"]["code"], "data" in said["error"]) == (None, -32600, False)
+        for method, params in (("groups", {}), ("hello", {}), ("hello", {"versions": 3})):
+            async with raw(line, hello=False) as client:
+                said = await client.ask(method, **params)
+                assert "the first message must be hello" in said["error"]["message"]
+                assert (said["id"], said["error"]["code"], "data" in said["error"]) == (None, -32600, False)
 
     on_a_line(tmp_path, story)
 

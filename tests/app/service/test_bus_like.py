@@ -141,6 +141,7 @@ def test_a_group_that_was_closed_here_can_be_read_again(tmp_path: Path) -> None:
                 theirs.close()
                 await until(lambda: not line.service.clients[0]._streams)
             assert len(line.bus.groups) == 1
+            await until(lambda: not line.bus.groups[0]._consumers_of_changes)
 
     on_a_line(tmp_path, story)
 
@@ -178,6 +179,25 @@ def test_a_service_that_ended_before_the_list_of_groups_was_sent_sends_it_when_i
             await until(lambda: [group.name for group in remote.groups] == ["first", "second"])
 
     on_a_line(tmp_path, story)
+
+
+def test_a_value_that_the_owner_reads_between_two_cycles_arrives_with_the_others_of_the_cycle(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        points = [replace(controller.point("1"), read_after_write=True), controller.point("2")]
+        group = line.bus.poll_group("axes", period=3600, points=points)
+        await until(lambda: remote.groups)
+        theirs = remote.group("axes")
+        consumer = theirs.subscribe(changes=True)
+        await theirs.ready()
+        group.demand()
+        cycle = await anext(consumer)
+        await points[0].write(7.5)
+        between = await anext(consumer)
+        assert ([point.key for point in between], between.cycle) == (["5/1", "5/2"], cycle.cycle)
+        assert [sample.value for sample in between.values()] == [7.5, 0]
+
+    on_a_served_line(tmp_path, story)
 
 
 async def first(group: RemoteGroup) -> object:
@@ -244,6 +264,19 @@ def test_a_group_that_is_closed_before_it_was_accepted_does_not_begin(tmp_path: 
             await remote.statistics()
             assert line.bus.groups == ()
             assert line.service.clients[0]._gathered == {}
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_begins_although_the_program_waits_for_it_no_longer(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        group = remote.poll_group("mine", period=60, points=[Hcp2Controller(remote, 5).point("1")])
+        waiting = asyncio.ensure_future(group.ready())
+        await asyncio.sleep(0)
+        waiting.cancel()
+        await asyncio.wait([waiting])
+        await group.ready()
+        assert [own.name for own in line.bus.groups] == [group.owners_name]
 
     on_a_served_line(tmp_path, story)
 

@@ -245,6 +245,18 @@ def test_a_link_local_address_is_one_of_its_interface() -> None:
         listening(("fe80::1%lo", 0))
 
 
+def test_a_service_that_serves_again_is_at_its_new_port(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path, listen=("127.0.0.1", 0)) as line:
+            await line.service.__aexit__(None, None, None)
+            await line.service.__aenter__()
+            assert line.service.tcp_address is not None
+            async with connect(line.service.tcp_address) as remote:
+                assert remote.about["tcp"] == line.service.tcp_address
+
+    asyncio.run(story())
+
+
 def test_without_tokens_whoever_is_on_this_machine_reads_and_writes_nothing(tmp_path: Path) -> None:
     async def story(line: Served, address: str) -> None:
         async with connect(address) as remote:

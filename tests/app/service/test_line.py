@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -70,7 +72,25 @@ def test_a_group_that_ended_leaves_no_demand_and_no_stream_to_a_later_one(monkey
             line.demand(group, role)
         line._forget_group(group)
         assert line.broadcast_of(group) is not source
-        assert [demanded.count(line, group, role, 0.1) for role in Role] == [1, 1, 1]
+        group.close()
+        later = bus.poll_group("axes", period=10.0, points=points)
+        assert [demanded.count(line, later, role, 0.1) for role in Role] == [1, 1, 1]
+
+    on_a_line(story)
+
+
+def test_a_program_that_leaves_the_stream_of_a_group_may_not_demand_it_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(line: ServedLine, bus: Bus) -> None:
+        group = bus.poll_group("axes", period=10.0, points=[Hcp2Controller(bus, 1).point("1")])
+        demanded = Demanded(bus, monkeypatch)
+        reader: Any = SimpleNamespace(notify_surely=lambda *_: None)
+        cycles = 0
+        for _ in range(3):
+            source = line.broadcast_of(group)
+            source.join(reader, 1)
+            cycles += demanded.count(line, group, Role.READ, 1000.0)
+            source.leave(reader, 1)
+        assert cycles == 1
 
     on_a_line(story)
 

@@ -179,11 +179,16 @@ async def test_a_request_ends_a_little_after_its_time_if_the_owner_does_not_repl
     assert caught.value.hint == "check whether that program is running"
     assert opened.way.methods == ["now", f"cancel{late.number}"]
     assert opened.link._pending == {}
+    began = loop.time()
+    with pytest.raises(NoReply):
+        await opened.link.answer(opened.ask("statistics"), 0.0)
+    assert loop.time() - began == pytest.approx(GRACE)
+    opened.way.sent.clear()
     prompt = opened.ask()
     loop.call_later(0.5, opened.reply, prompt.number, 5.0)
     assert await opened.link.answer(prompt, 1.0) == 5.0
     await asyncio.sleep(10.0)
-    assert opened.way.methods[2:] == ["now"]  # and no cancellation
+    assert opened.way.methods == ["now"]  # and no cancellation
 
 
 @pytest.mark.parametrize(

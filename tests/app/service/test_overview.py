@@ -513,6 +513,24 @@ async def test_each_part_names_its_place_and_a_screen_that_joins_later_gets_all_
 
 
 @in_virtual_time
+async def test_a_picture_of_other_points_has_the_counts_of_their_groups() -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        for name in ("a", "b", "c", "d"):
+            polled(bus, name, "1", address=1, period=0.1)
+        pictures, screen = overview_of(bus), Screen()
+        pictures.join(screen, 1)
+        await asyncio.sleep(1.0)
+        for number, closed in enumerate(("a", "b", "c"), 2):
+            bus.group(closed).close()
+            while screen.latest["frame", 0]["set"] != number:  # noqa: ASYNC110  time is virtual
+                await asyncio.sleep(0.01)
+            [groups] = screen.parts("groups")
+            assert [group["name"] for group in groups["groups"]] == [group.name for group in bus.groups]
+        pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
 async def test_unchanged_values_and_rows_are_sent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
         group = polled(bus, "axes", "1", address=1, period=0.1)
@@ -644,6 +662,8 @@ def test_points_are_the_same_as_before_only_if_they_are_the_same_objects() -> No
     named: Any = SimpleNamespace(name="axes")
     points = (point, replace(point, encode=None))
     assert [overview._encode_point(named, one).writable for one in points] == [True, False]
+    row = overview._encode_point(named, replace(point, item="pull", unit="N"))
+    assert (row.group, row.key, row.node, row.item, row.unit) == ("axes", "1/pull", "node 1", "pull", "N")
 
 
 @pytest.mark.parametrize(
@@ -680,6 +700,8 @@ async def test_details_have_only_the_limits_of_the_places_of_their_point() -> No
             (-1, 50, 5, True)
         ]
         assert (details.low, details.high, details.labels) == (-3.5, 40, {})
+        from_zero = overview.encode_details(bus, group, replace(point, meaning=Meaning(low=0)))
+        assert (from_zero.low, from_zero.high) == (0, None)
         sample = snapshot[point]
         assert details.sample is not None
         assert details.timeline is not None
@@ -738,6 +760,23 @@ async def test_values_are_sent_again_when_they_change_or_a_write_makes_them_stal
 
 
 @in_virtual_time
+async def test_a_value_that_is_read_after_a_write_is_shown_before_the_next_cycle() -> None:
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        point = replace(Hcp2Controller(bus, 1).point("2"), read_after_write=True)
+        await anext(aiter(bus.poll_group("slow", period=1000.0, points=[point])))
+        pictures = overview_of(bus)
+        pictures._regroup()
+        [part] = pictures._parts
+        part.send_values(1, bus)
+        await point.write(5.0)
+        assert part.send_values(1, bus)  # it is stale
+        await asyncio.sleep(1.0)
+        assert part.send_values(1, bus)
+        assert json.loads(part.values)["values"][0][:2] == [5.0, "good"]
+        await pictures._journal.close()
+
+
+@in_virtual_time
 async def test_the_log_keeps_events_with_a_text_and_ends_when_it_is_closed() -> None:
     bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)])))
     journal = EventLog(bus)
@@ -749,6 +788,7 @@ async def test_the_log_keeps_events_with_a_text_and_ends_when_it_is_closed() -> 
         for number in range(2 * KEPT_EVENTS):
             journal.note(f"event {number}")
         assert len(journal.entries) == KEPT_EVENTS
+        assert {when for when, _ in journal.entries} == {bus.now()}
         task = journal._task
         assert task is not None
         await journal.close()
@@ -800,7 +840,7 @@ def test_details_have_the_hint_of_an_error_and_the_limits_of_a_block() -> None:
         group: Any = SimpleNamespace(latest=SimpleNamespace(samples={point: sample}))
         details = overview.encode_details(bus, group, point)
         assert (details.hint, details.due) == (hint, 1.0)
-        assert [limit.maximum for limit in details.limits] == [7]
+        assert [(limit.name, limit.maximum) for limit in details.limits] == [("holding:10:3", 7)]
     assert overview.encode_details(bus, group, unit.point("holding:13")).limits == []
     precise = replace(point, meaning=Meaning(precision=2))
     named: Any = SimpleNamespace(name="axes")

@@ -67,7 +67,8 @@ def test_groups_and_nodes_that_are_gone_are_not_shown() -> None:
 def test_what_a_later_owner_says_besides_is_passed_over() -> None:
     picture = tell(Picture(), row(1, colour="red"), nodes=(node(1, mood="calm"),), weather="fine")
     picture.receive("forecast", {"set": 9})
-    assert [one.name for one in picture.rows] == ["node 1 outputs"]
+    picture.receive("values", {"set": 1, "first": 0, "values": [[7, "good", 1061.0, "", "", "mood"]]})
+    assert [(one.name, one.value) for one in picture.rows] == [("node 1 outputs", 7)]
 
 
 def test_a_point_that_stays_keeps_what_is_known_of_it_until_its_new_value_arrives() -> None:

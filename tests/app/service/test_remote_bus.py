@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import json
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +86,16 @@ def test_handles_may_be_made_before_the_bus_is_entered(tmp_path: Path) -> None:
                 assert controller.node.label == "winder"
 
     asyncio.run(run())
+
+
+def test_a_node_that_is_named_later_has_the_owners_label_too(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        ext.rename(Node.of(Hcp2Controller(line.bus, 5)), "winder")
+        controller = Hcp2Controller(remote, 5)
+        assert await controller.read(1) == 0
+        assert controller.node.label == "winder"
+
+    on_a_served_line(tmp_path, story)
 
 
 def test_nodes_that_were_used_before_the_bus_was_entered_have_their_settings_and_labels_at_once(tmp_path: Path) -> None:
@@ -260,6 +272,10 @@ def test_handles_of_one_node_agree_on_its_timings(tmp_path: Path) -> None:
             Hcp2Controller(remote, 5, timings=BRIEF)
         with pytest.raises(InvalidCommand, match="other timings or retries"):
             Hcp2Controller(remote, 5, timings=PATIENT, retries=7)
+        with pytest.raises(InvalidCommand, match="other timings or retries"):
+            Hcp2Controller(remote, 5, retries=0)
+        with pytest.raises(InvalidCommand, match="address 999 does not exist"):
+            Hcp2Controller(remote, 999)
         Hcp2Controller(remote, 5, timings=PATIENT)
         assert await first.read(1) == await Hcp2Controller(remote, 5).read(1) == 0
 
@@ -577,6 +593,45 @@ def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
         remote.link.received(said.replace('"id": 1', f'"id": {remote.link._count}'))
         with pytest.raises(WriteUnconfirmed, match="sent an invalid message"):
             await writing
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_an_event_of_a_node_whose_protocol_is_not_installed_is_ignored(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        await remote.statistics()
+        node = {"protocol": "of-a-plugin", "address": 1, "label": "node 1"}
+        body = {"event": "NodeChanged", **node, "before": "unknown", "after": "up", "returning": False}
+        params = {"stream": 0, "dropped": 0, "body": body}
+        remote.link.received(json.dumps({"jsonrpc": "2.0", "method": "event", "params": params}))
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+        event = await anext(events)
+        assert isinstance(event, NodeChanged)
+        assert event.node.address == 5
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_events_of_a_line_that_was_lost_before_it_replied_leave_no_error_that_nobody_hears(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        [connection] = line.service._clients.values()
+        connection.websocket.abort()
+        assert [event async for event in events] == []
+
+    on_a_served_line(tmp_path, story)
+    gc.collect()
+    assert not caplog.records
+
+
+def test_a_message_of_a_stream_that_has_ended_is_ignored(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        params = {"stream": 7, "dropped": 0, "body": {}}  # it was on its way when the stream ended
+        remote.link.received(json.dumps({"jsonrpc": "2.0", "method": "ended", "params": params}))
+        assert await Hcp2Controller(remote, 5).read(1) == 0
 
     on_a_served_line(tmp_path, story)
 

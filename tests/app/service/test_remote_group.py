@@ -10,10 +10,11 @@ from typing import Any, NoReturn
 import pytest
 
 from busmaster import Hcp2Controller, Point, Quality, RemoteBus
+from busmaster.app.service.fields import PointForm
 from busmaster.app.service.owner_messages import NoBody, PointsBody, SnapshotBody, StreamMessage
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.app.service.remote_group import RemoteGroup
-from busmaster.errors import GarbledReply
+from busmaster.errors import GarbledReply, InvalidCommand
 from tests.app.service.lines import Served, on_a_served_line
 
 
@@ -67,6 +68,21 @@ async def test_only_cycles_of_the_points_that_were_sent_last_are_taken() -> None
     assert [(await anext(consumer)).cycle for _ in range(2)] == [2, 2]
     assert consumer.dropped == 1, "it keeps two"
     await asyncio.gather(opening)
+
+
+@pytest.mark.asyncio
+async def test_a_group_with_a_point_of_a_protocol_that_is_not_installed_ends_with_the_reason() -> None:
+    opening = asyncio.ensure_future(asyncio.sleep(0))
+    ended: list[int] = []
+    group = RemoteGroup("axes", (), period=0.02, find=no_point, begin=lambda _: (1, opening), end=ended.append)
+    consumer = group.subscribe()
+    points = [PointForm("of-a-plugin", 1, {"command": "read"})]
+    group.receive("points", StreamMessage(1, 0, PointsBody(1, points)))
+    with pytest.raises(InvalidCommand, match="no such protocol 'of-a-plugin'"):
+        await anext(consumer)
+    with pytest.raises(InvalidCommand, match="no such protocol 'of-a-plugin'"):
+        await group.ready()
+    assert (group.over, ended) == (True, [1])
 
 
 def test_a_follower_of_exchanges_receives_exchanges_alone() -> None:

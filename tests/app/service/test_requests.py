@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import time
 from collections.abc import AsyncIterator
@@ -23,7 +24,7 @@ from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.client_requests import Reading, Writing, client_request_of
 from busmaster.app.service.encoding import protocol_of
 from busmaster.app.service.fields import OptionsForm, shortened
-from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, encode_value
+from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, Malformed, decode_client_message, encode_value
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.record import Outcome
 from busmaster.app.service.rights import RIGHTS, Role
@@ -245,6 +246,31 @@ def test_a_poll_group_that_cannot_be_followed_is_not_polled(tmp_path: Path) -> N
     on_a_line(tmp_path, story)
 
 
+def test_each_list_of_points_has_a_number_and_is_sent_before_the_cycles_of_these_points(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        group = line.bus.poll_group("axes", period=3600.0, points=[controller.point("1")])
+        heard: list[tuple[str, int, int]] = []
+        async with raw(line) as client:
+            await client.say(id=1, method="subscribe", params={"group": "axes", "stream": 7})
+
+            async def cycle() -> None:
+                group.demand()
+                while not (heard and heard[-1][0] == "snapshot" and heard[-1][2] == len(group.points)):
+                    said = await client.hear()
+                    if said.get("method") in ("points", "snapshot"):
+                        body = said["params"]["body"]
+                        heard.append((said["method"], body["set"], len(body.get("points", body.get("samples")))))
+
+            await cycle()
+            group.add(controller.point("2"))
+            await cycle()
+        expected = [("points", 0, 1), ("snapshot", 0, 1), ("points", 1, 2), ("snapshot", 1, 2)]
+        assert list(dict.fromkeys(heard)) == expected
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_program_polls_at_the_priority_of_a_poll_at_most(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
@@ -355,6 +381,36 @@ async def test_a_safe_state_that_could_not_be_sent_to_its_end_is_reported() -> N
         (2, ValueError),
     ]
     assert replies.answers == []
+
+
+def test_a_cancellation_of_what_has_no_request_is_ignored(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            assert (await client.ask("request", **READ))["result"] == 0
+            for number in (1, 4711):  # one that has ended, and one that never was
+                await client.say(method="cancel", params={"id": number})
+            assert (await client.ask("request", **READ))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_number_of_a_request_in_progress_is_not_used_for_another_of_any_kind(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        await Hcp2Controller(remote, 5).read(1)
+        [program] = line.service.clients
+
+        def say(method: str, params: dict[str, Any], **more: int) -> None:
+            message = {"jsonrpc": "2.0", "method": method, "params": params, **more}
+            program.take(decode_client_message(json.dumps(message)))
+
+        say("request", READ, id=70)  # the line has no turn before it is cancelled
+        for method, params in (("now", {}), ("request", READ), ("request", {}), ("plan", {}), ("erase", {})):
+            with pytest.raises(Malformed, match="request 70 is already in progress"):
+                say(method, params, id=70)
+        say("cancel", {"id": 70})
+        assert program.unfinished == ()
+
+    on_a_served_line(tmp_path, story)
 
 
 # checks and reports
@@ -595,6 +651,8 @@ def test_a_program_that_names_a_node_again_keeps_its_count_of_stops(tmp_path: Pa
             assert "result" in await client.ask("node", **naming)
             assert error_of(await client.ask("request", **write(2.0), stops_seen=0)) == "Superseded"
             assert (await client.ask("request", **write(3.0), stops_seen=1))["result"] is None
+            none = await client.ask("node", **{**naming, "retries": 0})
+            assert "other retries" in none["error"]["message"], "0 is a number of them, too"
 
     on_a_line(tmp_path, story)
 
@@ -805,6 +863,21 @@ def test_of_several_points_of_one_place_the_written_one_is_on_record_with_its_ow
             assert (await client.ask("request", **write(2.0)))["result"] is None
         known = [("5/%", 200.0), ("5/m", 4.0), ("5/mm", 4000.0)]
         assert (line.records[-1].point, line.records[-1].value) in known, "a raw command has no point of its own"
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_write_whose_value_the_owners_point_cannot_decode_is_on_record_as_a_command(tmp_path: Path) -> None:
+    def reject(_: object) -> Any:
+        raise ZeroDivisionError("no scale")
+
+    async def story(line: Served) -> None:
+        point = replace(Hcp2Controller(line.bus, 5).point("1"), decode=reject)
+        line.bus.poll_group("axes", period=3600.0, points=[point])
+        async with raw(line) as client:
+            assert (await client.ask("request", **write(2.5)))["result"] is None
+        [record] = line.records
+        assert (record.point, record.value, record.ok) == ("5/1", "'write element 1 = 2.5'", True)
 
     on_a_line(tmp_path, story)
 

@@ -159,6 +159,15 @@ def test_a_new_node_that_replies_is_read(tmp_path: Path) -> None:
     as_role(tmp_path, Role.READ, story)
 
 
+def test_r9_all_programs_of_one_user_have_one_part_of_the_line(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with connect(line.address):
+            one, other = line.service.clients
+            assert one.turn.account is other.turn.account
+
+    as_role(tmp_path, Role.WRITE, story)
+
+
 @pytest.mark.parametrize("role", Role)
 def test_programs_of_a_role_demand_a_group_so_often(tmp_path: Path, role: Role) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:

@@ -87,6 +87,10 @@ def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch
             with pytest.raises(NotStarted):
                 await room.wait(options, NODE, COMMAND)
             assert loop.time() - began == 0.5
+        for options in (RequestOptions(start_within=0.0), RequestOptions(finish_within=0.0)):
+            with pytest.raises(NotStarted):
+                await room.wait(options, NODE, COMMAND)
+            assert loop.time() - began == 0.5, "it does not wait at all"
         gone = asyncio.ensure_future(room.wait(ORDINARY, NODE, COMMAND))
         await asyncio.sleep(0)
         gone.cancel()
@@ -251,5 +255,7 @@ async def test_a_source_that_ends_or_fails_informs_all_its_readers(
     news.messages.put_nowait(end)
     await until(lambda: second.received)
     assert (first.received, second.received) == ([(1, "ended"), (2, "ended")], [(1, "ended")])
-    assert news.ended == 1
+    for reader, stream in ((first, 1), (first, 2), (second, 1)):
+        news.leave(reader, stream)
+    assert news.ended == 1, "another one may run for the same source by now"
     assert [record.getMessage() for record in caplog.records] == logged

@@ -169,6 +169,21 @@ def test_its_number_is_that_of_no_other_request(tmp_path: Path, monkeypatch: pyt
     on_a_line(tmp_path, TEXT + SAFE, story)
 
 
+def test_it_is_sent_although_it_is_cancelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        go_on = held_back(monkeypatch)
+        served: Any = service
+        async with raw(served) as client:
+            await client.say(id=7, method="safe", params={"writes": {"winder/speed": 0}})
+            await client.say(method="cancel", params={"id": 7})
+            assert "result" in await client.ask("now")
+            go_on.set()
+            assert (await client.hear()) == {"jsonrpc": "2.0", "id": 7, "result": {"winder/speed": None}}
+        assert [record.ok for record in records] == [True]
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
 def test_it_is_sent_again_when_it_is_requested_again_and_at_once_only_once(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         for count in (1, 2):

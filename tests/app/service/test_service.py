@@ -72,6 +72,7 @@ def test_it_reports_the_line_and_what_was_refused_to_each_program(tmp_path: Path
         async with connect(line.address) as remote:
             about = remote.about
             endpoint = line.bus.endpoint
+            assert (about["name"], about["line"]) == (line.service.name, endpoint.name)
             assert endpoint.settings is not None
             assert (about["baudrate"], about["framing"]) == (endpoint.settings.baudrate, endpoint.settings.framing)
             assert (about["echo"], about["process"], about["tcp"]) == (endpoint.echo, os.getpid(), None)
@@ -172,6 +173,7 @@ def test_every_program_is_informed_of_stops_writes_groups_and_its_permission(tmp
             await until(lambda: all(remote.groups for remote in programs))
             line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
             await until(lambda: all(remote.about["read_only"] for remote in programs))
+            assert all(remote.about["name"] == line.service.name for remote in programs), "all else stays"
 
     on_a_served_line(tmp_path, story)
 
@@ -371,6 +373,19 @@ def test_events_and_refusals_from_its_start_on_are_kept_for_those_who_look_later
     on_a_served_line(tmp_path, story)
 
 
+def test_events_are_kept_by_a_service_that_serves_again_too(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        point = replace(Hcp2Controller(line.bus, 5).point("11"), meaning=Meaning(high=5))
+        await line.service.__aexit__(None, None, None)
+        await line.service.__aenter__()
+        await point.write(6)
+        line.bus.poll_group("axes", period=60, points=[point]).demand()
+        await until(lambda: line.service.line.journal.entries)
+        assert [text for _, text in line.service.line.journal.entries] == ["5/11 = 6 is above its high of 5"]
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_line_whose_adapter_has_an_echo_says_so(tmp_path: Path) -> None:
     async def run() -> None:
         line = Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False, echo=Echo())
@@ -380,6 +395,29 @@ def test_a_line_whose_adapter_has_an_echo_says_so(tmp_path: Path) -> None:
             connect(service.address) as remote,
         ):
             assert remote.about["echo"] is True
+
+    asyncio.run(run())
+
+
+def test_what_is_refused_is_a_warning_in_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def story(line: Served) -> None:
+        line.authorisation.refusals.note_rate("user 4711")
+
+    on_a_line(tmp_path, story)
+    [record] = caplog.records
+    assert (record.name, record.levelname) == ("busmaster.app.service", "WARNING")
+    assert record.getMessage().endswith("connects again and again: 1 from user 4711")
+
+
+def test_the_address_of_a_socket_holds_in_another_folder_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        monkeypatch.chdir(tmp_path)
+        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, []))) as bus:
+            async with Service(bus, path="line.sock") as service:
+                monkeypatch.chdir("/")
+                async with connect(service.address) as remote:
+                    assert remote.about["clients"] == 1
+            assert os.listdir(tmp_path) == []
 
     asyncio.run(run())
 
