@@ -23,7 +23,7 @@ from busmaster.ext import Named
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from tests.app.outputs.brokers import Broker, needs_mosquitto
 from tests.app.outputs.cycles import NODE, cycle
-from tests.app.outputs.test_mqtt import emulated, heard, listening, publishing, settled
+from tests.app.outputs.test_mqtt import emulated, heard, heard_to_the_end, listening, publishing, settled
 
 OF_ALL = {
     *("availability", "availability_mode", "device", "device_class", "entity_category", "json_attributes_template"),
@@ -226,14 +226,6 @@ async def test_a_broker_that_has_lost_its_messages_gets_the_entities_again(broke
         async with listening(broker, "homeassistant/sensor/#") as client:
             kept = await heard(client, 2)
     assert sorted(topic.rpartition("-2f-")[2] for topic, _, _ in kept) == ["1/config", "2/config"]
-
-
-async def heard_to_the_end(client: Any) -> list[tuple[str, Any, bool]]:
-    """All messages up to the one by which the output takes its leave."""
-    found: list[tuple[str, Any, bool]] = []
-    while not (found and found[-1][:2] == ("line/status", "offline")):
-        found += await heard(client, 1)
-    return found
 
 
 @needs_mosquitto

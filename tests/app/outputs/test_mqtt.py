@@ -152,6 +152,58 @@ async def test_a_value_that_a_write_made_stale_is_published_if_its_group_is(brok
     assert (topic, payload["quality"]) == ("line/values/5/1", "stale")
 
 
+async def heard_to_the_end(client: Client) -> list[Heard]:
+    """All messages up to the one by which the output takes its leave."""
+    found: list[Heard] = []
+    while not (found and found[-1][:2] == ("line/status", "offline")):
+        found += await heard(client, 1)
+    return found
+
+
+@pytest.mark.asyncio
+async def test_a_value_is_published_as_it_is_now_if_it_is_of_the_latest_cycle_and_once_when_it_becomes_stale(
+    broker: Broker,
+) -> None:
+    async with emulated(Hcp2Controller, 5) as bus, listening(broker, "line/values/#", "line/status") as client:
+        controller = Hcp2Controller(bus, 5)
+        group = bus.poll_group("axes", period=1000.0, points=[controller.point("1")])
+        latest = await anext(aiter(group))
+        await controller.write(1, 5.0)
+        output = MqttOutput("mqtt", MqttSettings(port=broker.port, prefix="line"), bus)
+        for snapshot in (replace(latest, cycle=latest.cycle - 1), latest):
+            output.offer(snapshot)
+        output.start()
+        try:
+            found = await heard(client, 4)
+        finally:
+            await asyncio.to_thread(output.close, PATIENCE)
+        found += await heard_to_the_end(client)
+    old, *others = [payload["quality"] for topic, payload, _ in found if topic == "line/values/5/1"]
+    assert old != "stale", "a value of an earlier cycle is history"
+    assert others == ["stale", "stale"]
+
+
+@pytest.mark.asyncio
+async def test_where_a_cycle_is_one_message_no_value_has_one_of_its_own(broker: Broker) -> None:
+    async with emulated(Hcp2Controller, 5) as bus, listening(broker, "line/#") as client:
+        controller = Hcp2Controller(bus, 5)
+        async for _ in bus.poll_group("axes", period=1000.0, points=[controller.point("1")]):
+            break
+        await controller.write(1, 5.0)
+        async with publishing(broker, bus, messages="cycle"):
+            pass
+        topics = {topic for topic, *_ in await heard_to_the_end(client)}
+    assert topics == {"line/status", "line/line", "line/health/5"}
+
+
+@pytest.mark.asyncio
+async def test_values_that_are_offered_just_before_the_end_are_published(broker: Broker) -> None:
+    async with listening(broker, "line/status") as client, publishing(broker) as output:
+        await heard(client, 1)
+        output.offer(cycle(1, 12.5))
+    assert (output.written, output.dropped) == (1, 0)
+
+
 @pytest.mark.asyncio
 async def test_whoever_comes_later_is_not_told_an_event_as_if_it_were_new(broker: Broker) -> None:
     async with publishing(broker) as output:
