@@ -249,6 +249,11 @@ def test_a_folder_of_learned_times_that_is_not_there_is_reported_at_its_key(tmp_
     assert error.what.endswith(f"the folder {tmp_path}/none does not exist; create it, or use another path")
 
 
+def test_two_problems_of_the_file_as_a_whole_are_both_reported(tmp_path: Path) -> None:
+    found = problems(tmp_path, 'title = "Slitter"\n')
+    assert [error.what.partition(";")[0] for error in found] == ["'port' is missing", "the file has no nodes"]
+
+
 def test_nothing_is_opened_and_nothing_written(tmp_path: Path) -> None:
     outputs = f'[outputs.sqlite]\npath = "{tmp_path}/line.sqlite"\nspill = "{tmp_path}/spool"\n'
     path = written(tmp_path, f'{GOOD}{outputs}[outputs.csv]\npath = "{tmp_path}/line.csv"\n')

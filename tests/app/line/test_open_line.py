@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -101,6 +102,23 @@ def test_it_is_closed_when_it_is_left() -> None:
         # an output is closed last, and can still receive a command
         command = WriteRequest(interface="mqtt", by="hmi", name="winder/11", point=line.point("winder/11"), value=1)
         assert (await line.authorisation.write(command)).error == "the line is closing; nothing was sent"
+
+    run_in_virtual_time(main())
+
+
+def test_a_line_that_cannot_be_entered_is_closed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: object) -> None:
+        raise InvalidCommand("no thread can be started")
+
+    async def main() -> None:
+        before = asyncio.all_tasks()
+        line = opened()
+        monkeypatch.setattr(line.outputs, "start", fails)
+        with pytest.raises(InvalidCommand, match="no thread can be started"):
+            await line.__aenter__()
+        with pytest.raises(BusClosed):
+            await line.point("winder/11").read()
+        assert asyncio.all_tasks() == before
 
     run_in_virtual_time(main())
 
