@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from busmaster.app.config import FileError
+from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import Happening, OutputLine
 from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, MqttOutput
 from busmaster.app.outputs.mqtt_connection import topic_part, unread
@@ -34,6 +35,7 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from tests.app.outputs.brokers import Broker, needs_mosquitto
 from tests.app.outputs.cycles import BUS, cycle, until
+from tests.app.outputs.test_audit import WRITE
 from tests.patience import PATIENCE
 from tests.ports import free_port
 
@@ -641,6 +643,43 @@ async def test_who_does_not_own_the_line_publishes_its_values_and_nothing_of_its
     assert config[0].startswith("homeassistant/sensor/")
     assert [one["topic"] for one in config[1]["availability"]] == ["line/status", "line/values/5/1"]
     assert (second[0], second[1]["value"]) == ("line/values/5/1", 2)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("read_only", [False, True])
+async def test_a_line_writes_the_commands_that_its_file_permits_unless_it_is_read_only(
+    broker: Broker, read_only: bool
+) -> None:
+    keys = f'port = {broker.port}\nprefix = "line"\nallow_commands = "winder/10"\n'
+    file = read(Source("line.toml", f"{FILE}[outputs.mqtt]\n{keys}"))
+    async with (
+        listening(broker, "line/status", "line/result/#", "line/audit") as client,
+        ConfiguredLine(file, port=MemoryPort(emulated_line(file)), read_only=read_only) as line,
+    ):
+        assert [payload for _, payload, _ in await heard(client, 1)] == ["online"]
+        await client.publish("line/set/winder/10", "12.5", qos=1)
+        found = {topic: payload for topic, payload, _ in await heard(client, 2)}
+        assert found["line/result/winder/10"]["ok"] is not read_only
+        assert found["line/audit"]["outcome"] == ("refused" if read_only else "written")
+        assert await line.point("winder/10").read() == (0 if read_only else 12.5)
+
+
+@pytest.mark.asyncio
+async def test_a_process_that_only_writes_publishes_its_audit_entries_and_nothing_else(
+    broker: Broker, tmp_path: Path
+) -> None:
+    outputs = f'[outputs.mqtt]\nport = {broker.port}\nprefix = "line"\n[outputs.csv]\npath = "{tmp_path}/x.csv"\n'
+    metrics = f"[outputs.metrics]\nport = {free_port()}\n"
+    line = ConfiguredLine(read(Source("line.toml", f"{FILE}{outputs}{metrics}")), outputs=False)
+    async with listening(broker, "#") as client:
+        audit = line.audit()
+        assert [counts.kind for counts in audit.statistics()] == ["mqtt"], "the others keep no audit log"
+        audit.start(())
+        audit.record(WRITE)
+        await audit.close()
+        await client.publish("end", "now")
+        found = await heard(client, 2)
+    assert [(topic, retained) for topic, _, retained in found] == [("line/audit", False), ("end", False)]
 
 
 @pytest.mark.asyncio
