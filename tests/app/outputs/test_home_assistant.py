@@ -125,6 +125,26 @@ def test_entities_of_two_lines_and_two_nodes_are_different_and_a_node_belongs_to
     ]
 
 
+def test_entities_of_a_node_share_its_device_and_have_their_attributes() -> None:
+    home = HomeAssistant("homeassistant", "line", {})
+    [value] = home.value(NODE.point("1"), 1.5)
+    made_of = [value, home.alarm(NODE.point("1")), home.health("5"), home.line()]
+    entities = [json.loads(config.payload) for config in made_of]
+    assert [one["device"]["identifiers"] for one in entities] == [*3 * [["busmaster/line/5"]], ["busmaster/line"]]
+    of_line = ["line/status", "line/line"]
+    topics = [[one["topic"] for one in entity["availability"]] for entity in entities]
+    assert topics == [[*of_line, "line/values/5/1"], of_line, of_line, ["line/status"]]
+    payload = {"quality": "bad", "error": "no reply", "alarm": "high", "health": "down", "reason": "unplugged"}
+    attributes = [json.loads(shown(entity["json_attributes_template"], payload)) for entity in entities]
+    assert attributes == [
+        {"quality": "bad", "error": "no reply"},
+        {"alarm": "high"},
+        {"health": "down"},
+        {"reason": "unplugged"},
+    ]
+    assert all(entity["json_attributes_topic"] == entity["state_topic"] for entity in entities)
+
+
 def test_where_the_state_of_the_line_is_not_published_availability_does_not_depend_on_it() -> None:
     messages = {"line/status": "online", "line/values/5/1": {"quality": "good"}}
     for reports_line in (True, False):
