@@ -173,6 +173,19 @@ def test_a_point_that_is_not_writable_is_refused_under_its_name() -> None:
     assert callable(line.prepare_write("winder/force", [1]))
 
 
+def test_a_prepared_write_has_the_options_that_it_is_given() -> None:
+    async def main() -> list[int]:
+        async with opened(TEXT.partition("[groups.fast]")[0]) as line:
+            attempts = []
+            for value in (1.0, 2.0, 3.0):
+                await line.prepare_write("winder/force", [value], verify=value == 3.0)()
+                attempts.append(Node.of(line.nodes["winder"]).statistics().attempts)
+            return attempts
+
+    first, second, third = run_in_virtual_time(main())
+    assert (second - first, third - second) == (1, 2), "only the last one is read back"
+
+
 def test_the_plan_counts_each_group_once_whether_it_runs_or_not() -> None:
     async def main() -> None:
         line = opened()
