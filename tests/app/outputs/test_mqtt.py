@@ -126,6 +126,16 @@ async def test_values_and_events_are_published_each_under_its_name(broker: Broke
 
 
 @pytest.mark.asyncio
+async def test_a_value_has_its_unit_and_the_time_of_its_reply(broker: Broker) -> None:
+    found = cycle(1, 12.5)
+    samples = {replace(point, unit="mm"): sample._replace(wall=1e9) for point, sample in found.samples.items()}
+    async with listening(broker, "line/values/#") as client, publishing(broker) as output:
+        output.offer(replace(found, samples=samples))
+        [(_, payload, _)] = await heard(client, 1)
+    assert (payload["unit"], payload["time"]) == ("mm", 1e9)
+
+
+@pytest.mark.asyncio
 async def test_the_last_values_are_retained_and_a_cycle_may_be_one_message(broker: Broker) -> None:
     async with publishing(broker, messages="cycle") as output:
         output.offer(cycle(1, 1.0, 2.0))
@@ -266,8 +276,10 @@ async def test_health_of_line_and_nodes_is_retained_and_told_when_it_changes(bro
         {"line/line": "ready", "line/health/5": "up"},
     ]
     async with listening(broker, "line/line", "line/health/#") as later:  # the output has ended
-        found = {topic: payload.get("health", payload.get("line")) for topic, payload, _ in await heard(later, 2)}
+        left = await heard(later, 2)
+    found = {topic: payload.get("health", payload.get("line")) for topic, payload, _ in left}
     assert found == {"line/line": "offline", "line/health/5": "offline"}
+    assert all(abs(payload["time"] - BUS.wall_time()) < 600 for _, payload, _ in (*before, *after, *left))
 
 
 @pytest.mark.asyncio
