@@ -289,6 +289,9 @@ def test_each_reason_for_which_items_are_dropped_is_reported_and_an_entry_learns
     offer(output, 1, 3)
     output.offer_entry(WRITE, why_not.append)
     output.start()
+    until(lambda: len(reported) == 3)
+    counts = output.statistics()
+    assert (counts.dropped, counts.waiting) == (5, 0)
     output.close(PATIENCE)
     assert output.sent == [3]
     assert reported == [

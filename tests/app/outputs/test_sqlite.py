@@ -468,6 +468,19 @@ def test_a_new_file_is_for_its_owner_and_group(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o007 == 0
 
 
+def test_a_new_database_has_the_mode_of_its_settings(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    before = os.umask(0)
+    try:
+        output = SqliteOutput("sqlite", SqliteSettings(path=str(path), mode=0o604))
+        output.start()
+        output.offer(cycle(1, 1.0))
+        output.close(PATIENCE)
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o604
+
+
 @pytest.mark.parametrize("endings", [("",), ("", "-wal", "-shm")])
 def test_a_database_that_was_moved_keeps_what_it_has_and_another_is_begun(
     tmp_path: Path, endings: tuple[str, ...]
