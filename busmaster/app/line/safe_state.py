@@ -51,8 +51,6 @@ class SafeWrite:
                 f'add repeatable = ["{point.key}"]'
             )
         node = Node.of(point)
-        if node.address == node.profile.broadcast:
-            raise InvalidCommand(f"{point.key} is a broadcast, which no node confirms; write the point of each node")
         # No limit applies when the safe state is sent, so a mistyped value would be. 0 usually stops a drive, so it is
         # allowed below a minimum too.
         if value != 0:

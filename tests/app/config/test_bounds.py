@@ -96,6 +96,7 @@ def test_ranges_multiply_and_stand_for_a_thousand_names_at_most() -> None:
     for name in ("a1-99b1-99c1-99", "a1-10b1-10c1-11", "a1-1001", f"a{'1-1b' * 8000}1-1001"):
         with pytest.raises(InvalidCommand, match=r"too many|more than 1000 names"):
             next(expanded(name))
+    assert list(expanded(f"a{10**19}-{10**19 + 1}")) == [f"a{10**19}", f"a{10**19 + 1}"]
     with pytest.raises(InvalidCommand, match="at most 20 digits"):
         next(expanded(f"a1-{'9' * 5000}"))
     assert len(next(expanded("1-1b" * 8000))) == 2 * 8000

@@ -301,6 +301,7 @@ def test_values_of_every_kind_of_node_can_be_said() -> None:
         (node("mentor", 14, emulated="ripple = 2"), "line.toml:7: emulator.nodes.n.ripple: must be 0 to 1, not 2"),
         (node("mentor", 14, emulated="acceleration = 0"), "emulator.nodes.n.acceleration: must be above 0, not 0"),
         (node("dc104", None, emulated="read_only = [3, 'x']"), "read_only[2]: must be a whole number, 0 to"),
+        (node("dc104", None, emulated="read_only = [3, true]"), "read_only[2]: must be a whole number, 0 to"),
         (node("dc104", None, emulated="eeprom = [2, 1]"), "line.toml:6: emulator.nodes.n.eeprom: a reply delay is"),
         (
             node("mentor", 14, emulated="[emulator.nodes.n.parameters]\n'7.05' = { hihg = 5 }"),

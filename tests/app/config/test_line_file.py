@@ -372,6 +372,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (HEAD, "line.toml: the file has no nodes; define each in a table of its own, [nodes.NAME]"),
         (f"{HEAD}prot = 1", "line.toml:2: prot: no such key; did you mean 'port'?"),
         ("port = 5", "line.toml:1: port: must be a table: [port], not 5"),
+        ('[port]\npath = "/dev/ttyS0"', "line.toml:1: port: 'baudrate' is missing"),
         (f"{HEAD}{NODE}points.a = {{ factor = inf }}", "nodes.winder.points.a.factor: must be finite, not inf"),
         ('port = "rfc2217://h:1"', "line.toml:1: port: rfc2217://h:1: no baud rate given"),
         ('[port]\nhost = "h"\nport = 1\nparity = "E"', "line.toml:4: port.parity: no such key"),

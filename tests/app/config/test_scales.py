@@ -83,6 +83,12 @@ def test_a_factor_of_zero_is_refused_and_what_is_not_finite_is_left_for_the_prot
     assert Scale.of(0.1).write(float("inf")) == float("inf")
 
 
+def test_a_value_that_has_no_number_on_the_line_is_too_large() -> None:
+    with pytest.raises(InvalidCommand, match=r"^1e\+300 is too large$"):
+        Scale.of(1e-300).write(1e300)
+    assert Scale.of(1e-300, whole=True).write(1) == 10**300
+
+
 @pytest.mark.parametrize(
     ("name", "names"),
     [

@@ -6,11 +6,14 @@ import asyncio
 import grp
 import os
 import pwd
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from busmaster.app.bounds import SHORTEST_TOKEN
 from busmaster.app.config import FileError, LineFile
 from busmaster.app.config.sections import read
 from busmaster.app.config.service import read_tokens
@@ -93,6 +96,13 @@ def test_points_are_named_as_in_a_group_or_by_a_pattern_of_nodes() -> None:
     assert only("drive1/speed", "drive1/*", "drive1/22") == {("hcp2", 11): None}
     assert set(only("*/*")) == {("hcp2", 5), *speeds, ("hcp", 1)}
     assert role("").only is None
+
+
+def test_of_a_run_each_value_may_be_written() -> None:
+    text = 'port = "/dev/ttyUSB0"\n[nodes.press]\nprotocol = "modbus"\naddress = 1\n'
+    places = role('allow_writes = "press/holding:40:3"', text).only
+    assert places == role('allow_writes = "press/holding:40-42"', text).only
+    assert [len(allowed or ()) for allowed in (places or {}).values()] == [3]
 
 
 @pytest.mark.parametrize(
@@ -181,10 +191,35 @@ def test_tokens_that_others_may_read_or_change_are_refused(tmp_path: Path, mode:
     assert tokens(tmp_path, HMI, 0o640)
 
 
+def test_tokens_can_be_those_of_root_and_not_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def owned_by(user: int) -> Callable[[int], Any]:
+        def found(descriptor: int) -> Any:
+            status = fstat(descriptor)
+            return SimpleNamespace(st_mode=status.st_mode, st_size=status.st_size, st_uid=user)
+
+        return found
+
+    fstat = os.fstat
+    monkeypatch.setattr(os, "getuid", lambda: 1000)
+    for user in (0, 1000):
+        monkeypatch.setattr(os, "fstat", owned_by(user))
+        assert list(tokens(tmp_path, HMI)) == ["hmi"]
+    monkeypatch.setattr(os, "fstat", owned_by(1001))
+    with pytest.raises(FileError, match=r"other users can read or change .*; run chmod 600 .* as its owner"):
+        tokens(tmp_path, HMI)
+
+
+def test_a_token_has_as_many_characters_as_the_bound(tmp_path: Path) -> None:
+    assert list(tokens(tmp_path, f"hmi {SHORTEST_TOKEN * 'x'}\n")) == ["hmi"]
+    with pytest.raises(FileError, match=f"less than {SHORTEST_TOKEN} characters"):
+        tokens(tmp_path, f"hmi {(SHORTEST_TOKEN - 1) * 'x'}\n")
+
+
 def test_a_file_of_tokens_is_bounded_and_a_text(tmp_path: Path) -> None:
     path = tmp_path / "large"
-    path.write_text(HMI)
+    path.write_text(HMI + (LONGEST_FILE - len(HMI)) * "#")
     path.chmod(0o600)
+    assert list(read_tokens(str(path))) == ["hmi"]
     os.truncate(path, LONGEST_FILE + 1)
     with pytest.raises(InvalidCommand, match=f"large has more than {LONGEST_FILE} bytes; it is not a list of tokens"):
         read_tokens(str(path))

@@ -237,6 +237,23 @@ def test_problems_of_the_file_itself_are_before_those_of_its_templates(tmp_path:
     assert [(Path(error.file).name, error.line) for error in found] == [("line.toml", 7), ("ours.toml", 2)]
 
 
+def test_a_port_without_a_baud_rate_is_no_problem_where_the_protocol_is_the_one(tmp_path: Path) -> None:
+    head = 'port = "/dev/nothing-is-there"\n'
+    [error] = problems(tmp_path, head + NODE.replace("hcp2", "hcp3"))
+    assert error.key == "nodes.winder.protocol"
+
+
+def test_a_folder_of_learned_times_that_is_not_there_is_reported_at_its_key(tmp_path: Path) -> None:
+    [error] = problems(tmp_path, f'timing = "learned"\nlearned = "{tmp_path}/none/times"\n{GOOD}')
+    assert (error.line, error.key) == (2, "learned")
+    assert error.what.endswith(f"the folder {tmp_path}/none does not exist; create it, or use another path")
+
+
+def test_two_problems_of_the_file_as_a_whole_are_both_reported(tmp_path: Path) -> None:
+    found = problems(tmp_path, 'title = "Slitter"\n')
+    assert [error.what.partition(";")[0] for error in found] == ["'port' is missing", "the file has no nodes"]
+
+
 def test_nothing_is_opened_and_nothing_written(tmp_path: Path) -> None:
     outputs = f'[outputs.sqlite]\npath = "{tmp_path}/line.sqlite"\nspill = "{tmp_path}/spool"\n'
     path = written(tmp_path, f'{GOOD}{outputs}[outputs.csv]\npath = "{tmp_path}/line.csv"\n')

@@ -125,6 +125,15 @@ def test_what_was_learned_with_other_settings_is_forgotten(text: str, before: st
     assert run_for(changed if "reel" not in after else changed.replace("winder,", "reel,"), SHORT) == left
 
 
+def test_what_was_learned_at_another_port_is_forgotten(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_for(text, LONG)
+    for attribute, other in (("name", "/dev/ttyUSB1"), ("receive_latency", 0.001)):
+        with monkeypatch.context() as patch:
+            patch.setattr(MemoryPort, attribute, other)
+            assert run_for(text, SHORT) == set()
+    assert run_for(text, SHORT) == {"winder", "drive"}
+
+
 DAMAGED = [
     "",
     "{",
@@ -157,11 +166,15 @@ def test_a_file_that_is_damaged_is_told_once_and_begun_anew(text: str, kept: Pat
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("slowest", -1.0), ("heard", 1e400), ("pause", float("nan")), ("window", "5"), ("kind", []), ("packet", 1)],
+    [
+        *(("slowest", -1.0), ("received", -1.0), ("pause", float("nan")), ("window", "5"), ("window", 1e400)),
+        *(("kind", []), ("packet", 1), ("trusted", 1), ("slowest", True)),
+    ],
 )
 def test_no_time_that_cannot_be_is_taken(text: str, kept: Path, key: str, value: object) -> None:
     run_for(text, LONG)
     said = json.loads(kept.read_text())
+    assert key in said["nodes"]["winder"]["times"][0]
     said["nodes"]["winder"]["times"][0][key] = value
     kept.write_text(json.dumps(said))
     told: list[str] = []

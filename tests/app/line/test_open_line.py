@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 import busmaster
-from busmaster import BusClosed, InvalidCommand, MemoryPort, WriteUnconfirmed
+from busmaster import BusClosed, InvalidCommand, MemoryPort, NoReply, WriteUnconfirmed
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.service.authorisation import WriteRequest
+from busmaster.bus.node import Node
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing import run_in_virtual_time
 
@@ -102,6 +106,23 @@ def test_it_is_closed_when_it_is_left() -> None:
     run_in_virtual_time(main())
 
 
+def test_a_line_that_cannot_be_entered_is_closed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: object) -> None:
+        raise InvalidCommand("no thread can be started")
+
+    async def main() -> None:
+        before = asyncio.all_tasks()
+        line = opened()
+        monkeypatch.setattr(line.outputs, "start", fails)
+        with pytest.raises(InvalidCommand, match="no thread can be started"):
+            await line.__aenter__()
+        with pytest.raises(BusClosed):
+            await line.point("winder/11").read()
+        assert asyncio.all_tasks() == before
+
+    run_in_virtual_time(main())
+
+
 def test_a_long_run_of_an_msc_is_written_through_its_handle() -> None:
     text = """
 port = "/dev/ttyUSB0"
@@ -152,6 +173,19 @@ def test_a_point_that_is_not_writable_is_refused_under_its_name() -> None:
     assert callable(line.prepare_write("winder/force", [1]))
 
 
+def test_a_prepared_write_has_the_options_that_it_is_given() -> None:
+    async def main() -> list[int]:
+        async with opened(TEXT.partition("[groups.fast]")[0]) as line:
+            attempts = []
+            for value in (1.0, 2.0, 3.0):
+                await line.prepare_write("winder/force", [value], verify=value == 3.0)()
+                attempts.append(Node.of(line.nodes["winder"]).statistics().attempts)
+            return attempts
+
+    first, second, third = run_in_virtual_time(main())
+    assert (second - first, third - second) == (1, 2), "only the last one is read back"
+
+
 def test_the_plan_counts_each_group_once_whether_it_runs_or_not() -> None:
     async def main() -> None:
         line = opened()
@@ -161,6 +195,72 @@ def test_the_plan_counts_each_group_once_whether_it_runs_or_not() -> None:
         assert before == [("fast", 4), ("slow", 1)]
 
     run_in_virtual_time(main())
+
+
+def test_groups_run_with_the_phase_and_the_priority_by_which_they_are_planned() -> None:
+    text = TEXT.replace("period = 0.1", "period = 0.1\nphase = 0.03").replace("phase = 0.5", "phase = 0.03")
+    text = text.replace('points = "winder/inputs"', 'points = "winder/inputs"\npriority = "background"')
+    plans = []
+
+    async def main(text: str) -> None:
+        line = opened(text)
+        before = line.plan()
+        async with line:
+            assert line.plan() == before
+        plans.append(before)
+
+    for other in (text, text.replace("phase = 0.03\n", ""), text.replace('priority = "background"', "")):
+        run_in_virtual_time(main(other))
+    assert plans[0] not in plans[1:]
+
+
+def test_a_read_is_repeated_as_often_as_the_file_says() -> None:
+    async def main(retries: int) -> int:
+        text = TEXT.replace("address = 1\n", f"address = 1\nretries = {retries}\n")
+        async with opened(f"{text}[emulator.nodes.winder]\nfaults = {{ dead = 1 }}\n") as line:
+            line.groups["fast"].pause()
+            line.groups["slow"].pause()
+            with pytest.raises(NoReply):
+                await line.nodes["winder"].read(10)
+            return Node.of(line.nodes["winder"]).statistics().retries
+
+    assert [run_in_virtual_time(main(retries)) for retries in (0, 1)] == [0, 1]
+
+
+def test_a_strict_line_takes_longer_because_it_holds_ambiguous_replies() -> None:
+    async def main(text: str) -> float:
+        async with opened(text.partition("[groups.fast]")[0]) as line:
+            await line.nodes["winder"].read(10)
+            began = line.bus.now()
+            for _ in range(10):
+                await line.nodes["winder"].read(10)
+            return line.bus.now() - began
+
+    assert run_in_virtual_time(main(f"strict = true{TEXT}")) > run_in_virtual_time(main(TEXT))
+
+
+def test_a_tap_receives_the_bytes_of_a_line_that_is_opened() -> None:
+    received: list[bytes] = []
+    tap: Any = SimpleNamespace(
+        transmitted=lambda now, data, attempt: None,
+        received=lambda now, data, attempt: received.append(data),
+        attempted=lambda attempt: None,
+    )
+
+    async def main() -> None:
+        file = read(Source("line.toml", TEXT))
+        async with ConfiguredLine(file, port=MemoryPort(emulated_line(file)), tap=tap) as line:
+            await line.nodes["winder"].read(10)
+
+    run_in_virtual_time(main())
+    assert received
+
+
+def test_a_symbol_that_looks_like_a_range_is_one_point() -> None:
+    text = 'port = "/dev/ttyUSB0"\n[nodes.press]\nprotocol = "msc"\naddress = 1\nsymbols = { a1-3 = 3000 }\n'
+    group = '[groups.g]\nperiod = 1\npoints = "press/a1-3"\n'
+    line = ConfiguredLine(read(Source("line.toml", text + group)), outputs=False)
+    assert [point.key for point in line.members("g")] == ["press/a1-3"]
 
 
 def test_open_line_reads_a_file_and_says_where_it_is_wrong(tmp_path: Path) -> None:

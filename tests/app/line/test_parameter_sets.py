@@ -12,9 +12,9 @@ import pytest
 from busmaster import Bus, MemoryPort
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import FileError, Source
-from busmaster.app.line import ConfiguredLine
+from busmaster.app.line import ConfiguredLine, parameter_sets
 from busmaster.app.line.parameter_sets import PartFile, line_parameters, read_set, write_set
-from busmaster.bus.parameters import Entry, Found, Parameter, ParameterSet
+from busmaster.bus.parameters import LAST, Entry, Found, Parameter, ParameterSet
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand
 from busmaster.registry import find
@@ -196,6 +196,32 @@ def test_a_set_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+def test_a_save_whose_set_cannot_be_written_keeps_what_it_has_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = str(tmp_path / "a.toml")
+    with PartFile(path, EMPTY, WANTED[:1], KIND) as part:
+        part.add(Found(WANTED[0], -476))
+        with monkeypatch.context() as patch:
+            patch.setattr("os.fsync", full)
+            with pytest.raises(OSError, match="No space left"):
+                part.finish()
+    with PartFile(path, EMPTY, WANTED[:1], KIND) as part:
+        assert part.missing == ()
+        assert part.finish().entries["1.17"].value == -476
+
+
+def test_each_parameter_is_in_the_file_as_soon_as_it_is_read(tmp_path: Path) -> None:
+    """A save that is killed has lost nothing."""
+    with PartFile(str(tmp_path / "a.toml"), EMPTY, WANTED, KIND) as part:
+        for one in WANTED:
+            part.add(Found(one, 5))
+            assert f'\n"{one.item}" = ' in (tmp_path / "a.toml.part").read_text()
+
+
 def test_a_save_to_a_file_that_exists_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text("")
@@ -208,7 +234,8 @@ def test_a_save_of_another_node_is_not_continued(tmp_path: Path) -> None:
     path = str(tmp_path / "a.toml")
     with PartFile(path, replace(EMPTY, label="node 11"), WANTED, KIND):
         pass
-    for other in (replace(EMPTY, address=12), replace(EMPTY, identity={"11.15": 530})):
+    others = {"address": 12, "identity": {"11.15": 530}, "protocol": "ct-ansi"}
+    for other in (replace(EMPTY, **{key: value}) for key, value in others.items()):  # type: ignore[arg-type]
         with pytest.raises(InvalidCommand, match=r"started with another node \(node 11\); remove .*a.toml.part"):
             PartFile(path, other, WANTED, KIND)
 
@@ -291,6 +318,58 @@ def test_items_of_a_parameter_set_can_be_named_as_the_points_of_the_file() -> No
     line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
     found = line_parameters(line, "screw", line.nodes["screw"], ["ramp", "1.17"])
     assert [(one.item, one.unit) for one in found] == [("2.04", "s"), ("1.17", "%")]
+
+
+def test_a_point_of_the_file_keeps_what_the_document_says_of_its_parameter() -> None:
+    points = ("store = { item = '1.00' }", "address = { item = '11.11' }")
+    named = "ref = { item = 'speed_reference_1', factor = 2 }"
+    text = f"{TEXT.partition('points')[0]}[nodes.screw.points]\n" + "\n".join((*points, named))
+    line = ConfiguredLine(read(Source("line.toml", text)), outputs=False)
+    handle = line.nodes["screw"]
+    document = {one.item: one for one in handle.parameters()}
+    found = {one.item: one for one in line_parameters(line, "screw", handle)}
+    assert found.keys() == document.keys()
+    assert found["1.00"].stage == document["1.00"].stage == LAST, "the command that stores is written last"
+    assert found["11.11"].kept == document["11.11"].kept != "", "a load never writes the address"
+    assert (found["1.17"].name, found["1.17"].unit, found["1.17"].factor) == ("ref", "%", 2)
+
+
+def test_a_parameter_that_the_document_calls_read_only_stays_so_under_a_name_of_the_file() -> None:
+    head = 'port = "/dev/ttyUSB0"\n[nodes.one]\nprotocol = "ei-bisynch"\naddress = 1\n'
+    line = ConfiguredLine(read(Source("line.toml", head + 'points.version = { item = "V0" }\n')), outputs=False)
+    [found] = line_parameters(line, "one", line.nodes["one"], ["version"])
+    assert (found.name, found.access) == ("version", "read")
+
+
+def test_decimals_that_a_drive_sends_itself_are_not_those_of_its_parameter() -> None:
+    text = (
+        TEXT.replace('"mentor"', '"ct-ansi"').partition("points")[0] + 'points.ref = { item = "1.21", decimals = 1 }\n'
+    )
+    line = ConfiguredLine(read(Source("line.toml", text)), outputs=False)
+    [found] = line_parameters(line, "screw", line.nodes["screw"], ["ref"])
+    assert (found.item, found.decimals) == ("1.21", 0)
+
+
+def test_a_point_that_only_the_file_names_is_read_only_where_its_item_is() -> None:
+    text = 'port = "/dev/ttyUSB0"\n[nodes.one]\nprotocol = "modbus"\naddress = 1\n'
+    points = 'points = { a = { item = "input:1" }, b = { item = "holding:1" } }\n'
+    line = ConfiguredLine(read(Source("line.toml", text + points)), outputs=False)
+    found = line_parameters(line, "one", line.nodes["one"])
+    assert [(one.item, one.access) for one in found] == [("input:1", "read"), ("holding:1", "")]
+
+
+def test_a_set_has_as_many_parameters_as_the_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parameter_sets, "MOST_MEMBERS", 2)
+    line = ConfiguredLine(read(Source("line.toml", TEXT)), outputs=False)
+    handle = line.nodes["screw"]
+    assert len(line_parameters(line, "screw", handle, ["1.17", "1.18"])) == 2
+    with pytest.raises(InvalidCommand, match="must have at most 2 parameters"):
+        line_parameters(line, "screw", handle, ["1.17", "1.18", "1.19"])
+    for count in (2, 3):
+        path = str(tmp_path / str(count))
+        write_set(path, replace(EMPTY, entries={one.item: Entry(one, 1) for one in WANTED[:count]}), KIND)
+        with pytest.raises(FileError, match="must have at most 2 parameters") if count > 2 else nullcontext():
+            read_set(path)
 
 
 def test_points_that_are_not_in_the_document_follow_it_and_without_either_there_is_no_set() -> None:

@@ -187,6 +187,12 @@ def test_a_csv_is_taken_as_spreadsheets_write_it(delimiter: str, line_end: str, 
     assert (points["c"].unit, points["c"].writable, points["d"].unit) == ("°C", True, "m")
 
 
+def test_spaces_around_cells_and_capital_letters_of_columns_mean_nothing() -> None:
+    back = take(file(INLINE), " Node ,POINT,item,Maximum,writable", "w,c,12, 5 , FALSE ")
+    point = read(Source("line.toml", back.text)).nodes["w"].points["c"]
+    assert (point.item, point.maximum, point.writable) == ("12", 5, False)
+
+
 # what is written
 
 
@@ -332,7 +338,7 @@ def test_a_key_that_a_node_repeats_of_its_template_stays_in_its_section(tmp_path
         ('w,c,12,,"5\nx = 2"', "row 2, column maximum: must be a number, not '5"),
         ("w,c,12,5,", "row 2, column bits: must be a table of names"),
         ('w,c,12,"1\nx = 2",', "row 2, column bits: must be a table of names"),
-        ('w,c,"12', "not valid CSV: unexpected end of data"),
+        ('w,c,"12', "points.csv: line 2: not valid CSV: unexpected end of data"),
     ],
 )
 def test_a_bad_row_is_named_with_its_column(row: str, fault: str) -> None:
@@ -404,6 +410,12 @@ def test_a_form_that_cannot_be_changed_is_left_alone() -> None:
         take(held, "node,point,bits", "w,a,{ READY = 1 }")
     with pytest.raises(FileError, match=r"line.toml:7: nodes.w.points.a.bits: is not written as one pair"):
         take(held, "node,point,bits", "w,a,")
+
+
+def test_points_of_a_node_that_is_written_in_one_line_are_not_added() -> None:
+    held = read(Source("line.toml", 'port = "/dev/ttyUSB0"\n[nodes]\nw = { protocol = "hcp2", address = 5 }\n'))
+    with pytest.raises(FileError, match=r"line.toml:2: nodes: points have a form that cannot be changed automatically"):
+        take(held, "node,point,item", "w,c,12")
 
 
 # the file

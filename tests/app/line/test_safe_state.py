@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from busmaster import Hcp2Controller, MemoryPort
+from busmaster.app.bounds import LONGEST_SAFE_STATE
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import FileError, Source
 from busmaster.app.line import ConfiguredLine
@@ -16,8 +17,9 @@ from busmaster.app.service.record import Outcome, WriteRecord
 from busmaster.bus.node import Node
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
-from busmaster.errors import Refused, Superseded, WriteUnconfirmed
+from busmaster.errors import BusClosed, Refused, Superseded, WriteUnconfirmed
 from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 TEXT = """
@@ -125,6 +127,43 @@ def test_each_write_is_read_back_and_sent_again_until_it_reads_as_it_was_written
     on_a_line(story, "winder/speed", forgetful=3)
 
 
+def test_writes_to_any_of_its_nodes_that_were_decided_before_are_not_sent() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        nodes = [Node.of(line.nodes[name]) for name in ("gone", "winder")]
+        before = [node.stops for node in nodes]
+        await line.safe_state.enter(line.authorisation, "a test", leaving=False)
+        for node, stops in zip(nodes, before, strict=True):
+            with pytest.raises(Superseded):
+                await node.request(hcp2.Write(10, (5.0,)), stops_seen=stops)
+        assert [(record.interface, record.by) for record in records] == 2 * [("safe", "a test")]
+
+    on_a_line(story, "gone/speed", "winder/speed")
+
+
+def test_a_line_without_a_safe_state_takes_writes_as_before() -> None:
+    async def run() -> None:
+        file = read(Source("line.toml", TEXT))
+        devices: list[Device] = [EmulatedMint(2)]
+        port = MemoryPort(Line(Hcp2Controller.profile.line, devices, chance=random.Random(1)))
+        async with ConfiguredLine(file, port=port, outputs=False) as line:
+            assert await line.safe_state.enter(line.authorisation, "a test") == {}
+            await line.nodes["winder"].write(10, 5)
+            assert await line.nodes["winder"].read(10) == 5
+
+    run_in_virtual_time(run())
+
+
+def test_a_safe_state_ends_at_once_if_the_line_is_closed() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        await line.bus.__aexit__(None, None, None)
+        began = asyncio.get_running_loop().time()
+        outcomes = await line.safe_state.enter(line.authorisation, "a test")
+        assert isinstance(outcomes["winder/speed"], BusClosed)
+        assert asyncio.get_running_loop().time() - began < WITHIN / 2
+
+    on_a_line(story, "winder/speed")
+
+
 def test_what_waits_for_the_line_waits_until_the_safe_state_is_sent() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
         drive = line.nodes["winder"]
@@ -215,6 +254,30 @@ def test_a_safe_value_beyond_the_limits_of_its_point_is_rejected_when_the_file_i
         ConfiguredLine(file, outputs=False)
     assert str(rejected.value).startswith("line.toml:9: ")
     assert problem in str(rejected.value)
+
+
+def test_a_safe_state_may_take_as_long_as_the_bound() -> None:
+    text = LIMITED.replace("POINT", "force").replace("VALUE", "0")
+    assert read(Source("line.toml", f"{text}within = {LONGEST_SAFE_STATE}\n")).safe.within == LONGEST_SAFE_STATE
+    with pytest.raises(FileError, match=f"safe.within: must be more than 0 and at most {LONGEST_SAFE_STATE:g} seconds"):
+        read(Source("line.toml", f"{text}within = {LONGEST_SAFE_STATE + 0.1}\n"))
+
+
+def test_a_run_of_values_cannot_be_left_safely_in_one() -> None:
+    text = 'port = "/dev/ttyUSB0"\n[nodes.press]\nprotocol = "msc"\naddress = 1\naddress_step = 4\n'
+    points = 'points.profile = { item = "3000:40" }\n'
+    safe = '[safe]\nrepeatable = "press/profile"\nwrites = { "press/profile" = 0 }\n'
+    with pytest.raises(
+        FileError, match=r"line.toml:9: safe.writes.press/profile: .* is a run of values; write them one"
+    ):
+        ConfiguredLine(read(Source("line.toml", text + points + safe)), outputs=False)
+
+
+def test_a_quantity_is_left_at_one_value_only() -> None:
+    text = LIMITED.replace('"winder/POINT"]', '"winder/force", "winder/11"]')
+    text = text.replace('"winder/POINT" = VALUE', '"winder/force" = 0, "winder/11" = 20')
+    with pytest.raises(FileError, match=r"safe.writes.winder/11: is the same quantity as winder/force; remove one of"):
+        ConfiguredLine(read(Source("line.toml", text)), outputs=False)
 
 
 @pytest.mark.parametrize("value", ["0", "20"])

@@ -69,6 +69,22 @@ def test_everything_is_written_in_order() -> None:
     assert output.statistics().written == 40
 
 
+def test_a_batch_has_about_as_many_values_as_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "BATCH", 4)
+    output = Shelf()
+    commit, sizes = output.commit, list[int]()
+
+    def committed(batch: list[Item]) -> None:
+        sizes.append(len(batch))
+        commit(batch)
+
+    output.commit = committed  # type: ignore[method-assign]  # replaced here
+    offer(output, 1, 5)
+    output.start()
+    output.close(PATIENCE)
+    assert sizes == [2, 2, 1]  # cycles of two values
+
+
 def test_one_that_is_stuck_drops_the_oldest_and_counts_what_it_drops() -> None:
     output = Shelf(buffer=10)
     output.let.clear()
@@ -273,6 +289,9 @@ def test_each_reason_for_which_items_are_dropped_is_reported_and_an_entry_learns
     offer(output, 1, 3)
     output.offer_entry(WRITE, why_not.append)
     output.start()
+    until(lambda: len(reported) == 3)
+    counts = output.statistics()
+    assert (counts.dropped, counts.waiting) == (5, 0)
     output.close(PATIENCE)
     assert output.sent == [3]
     assert reported == [

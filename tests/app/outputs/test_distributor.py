@@ -123,7 +123,24 @@ async def test_an_output_gets_the_groups_that_it_asked_for_and_all_events(tmp_pa
             break
     objects = [json.loads(text) for text in (tmp_path / "x.jsonl").read_text().splitlines()]
     assert {found["group"] for found in objects if "group" in found} == {"slow"}
-    assert "away is down, was unknown" in [found.get("event") for found in objects]
+    assert ("away is down, was unknown", "away") in [(found.get("event"), found.get("node")) for found in objects]
+
+
+@pytest.mark.asyncio
+async def test_each_output_of_a_line_reports_why_it_is_down(tmp_path: Path) -> None:
+    text = TEXT.partition("[outputs.sqlite]")[0]
+    for kind in ("csv", "jsonl", "sqlite"):
+        (tmp_path / kind).mkdir()
+        text += f'[outputs.{kind}]\npath = "FOLDER/{kind}"\n'
+    reported: list[str] = []
+    line = opened(tmp_path, text)
+    line.outputs.report = reported.append
+    async with line, asyncio.timeout(PATIENCE):
+        while len(reported) < 3:  # noqa: ASYNC110  threads report it
+            await asyncio.sleep(0.01)
+    assert sorted(reported[:3]) == [
+        f"{kind} is down: {tmp_path}/{kind}: Is a directory" for kind in ("csv", "jsonl", "sqlite")
+    ]
 
 
 @pytest.mark.asyncio

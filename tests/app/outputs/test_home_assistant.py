@@ -23,7 +23,7 @@ from busmaster.ext import Named
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from tests.app.outputs.brokers import Broker, needs_mosquitto
 from tests.app.outputs.cycles import NODE, cycle
-from tests.app.outputs.test_mqtt import emulated, heard, listening, publishing, settled
+from tests.app.outputs.test_mqtt import emulated, heard, heard_to_the_end, listening, publishing, settled
 
 OF_ALL = {
     *("availability", "availability_mode", "device", "device_class", "entity_category", "json_attributes_template"),
@@ -123,6 +123,26 @@ def test_entities_of_two_lines_and_two_nodes_are_different_and_a_node_belongs_to
     assert [config["device"]["via_device"] in of_line["device"]["identifiers"] for config in configs] == [
         *(True, True, False, False)
     ]
+
+
+def test_entities_of_a_node_share_its_device_and_have_their_attributes() -> None:
+    home = HomeAssistant("homeassistant", "line", {})
+    [value] = home.value(NODE.point("1"), 1.5)
+    made_of = [value, home.alarm(NODE.point("1")), home.health("5"), home.line()]
+    entities = [json.loads(config.payload) for config in made_of]
+    assert [one["device"]["identifiers"] for one in entities] == [*3 * [["busmaster/line/5"]], ["busmaster/line"]]
+    of_line = ["line/status", "line/line"]
+    topics = [[one["topic"] for one in entity["availability"]] for entity in entities]
+    assert topics == [[*of_line, "line/values/5/1"], of_line, of_line, ["line/status"]]
+    payload = {"quality": "bad", "error": "no reply", "alarm": "high", "health": "down", "reason": "unplugged"}
+    attributes = [json.loads(shown(entity["json_attributes_template"], payload)) for entity in entities]
+    assert attributes == [
+        {"quality": "bad", "error": "no reply"},
+        {"alarm": "high"},
+        {"health": "down"},
+        {"reason": "unplugged"},
+    ]
+    assert all(entity["json_attributes_topic"] == entity["state_topic"] for entity in entities)
 
 
 def test_where_the_state_of_the_line_is_not_published_availability_does_not_depend_on_it() -> None:
@@ -226,14 +246,6 @@ async def test_a_broker_that_has_lost_its_messages_gets_the_entities_again(broke
         async with listening(broker, "homeassistant/sensor/#") as client:
             kept = await heard(client, 2)
     assert sorted(topic.rpartition("-2f-")[2] for topic, _, _ in kept) == ["1/config", "2/config"]
-
-
-async def heard_to_the_end(client: Any) -> list[tuple[str, Any, bool]]:
-    """All messages up to the one by which the output takes its leave."""
-    found: list[tuple[str, Any, bool]] = []
-    while not (found and found[-1][:2] == ("line/status", "offline")):
-        found += await heard(client, 1)
-    return found
 
 
 @needs_mosquitto

@@ -24,6 +24,10 @@ from typing import Any
 import pytest
 
 from busmaster import Priority, ext
+from busmaster.app.config import emulated_line
+from busmaster.app.config.sections import read
+from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs import metrics as metrics_module
 from busmaster.app.outputs import scrapes
 from busmaster.app.outputs.base import OutputStatistics
@@ -37,7 +41,7 @@ from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
-from busmaster.errors import LineDown, NoReply
+from busmaster.errors import LineDown, NoReply, Refused
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.msc.status import ProgramStatus
@@ -116,6 +120,7 @@ async def count_and_scrape() -> None:
     assert of(metrics, "group_missed_total", group="axes") == group.statistics().missed
     assert of(metrics, "group_period_seconds", group="axes") == 0.02
     assert of(metrics, "group_achieved_period_seconds", group="axes") == achieved > 0.019
+    assert of(metrics, "line_backlog") == line.backlog
     assert of(metrics, "line_quiet_seconds_total") == line.quiet_time != line.busy
     waits = {priority.name.lower(): line.waits[priority].p99 for priority in Priority}
     assert {name: of(metrics, "line_wait_p99_seconds", priority=name) for name in waits} == waits
@@ -487,6 +492,7 @@ async def test_values_and_alarms_on_both_sides_are_served() -> None:
             await controller.write(item, value)
         meanings = {"1": Meaning(high=5.0), "3": Meaning(low=-5.0), "4": Meaning(high=5.0)}
         points = [replace(controller.point(item), meaning=meaning) for item, meaning in meanings.items()]
+        points.append(replace(controller.point("2"), decode=lambda _: "a text"))
         group = bus.poll_group("axes", period=1000.0, points=points)
         async for _ in group:
             break
@@ -496,7 +502,55 @@ async def test_values_and_alarms_on_both_sides_are_served() -> None:
         await asyncio.to_thread(output.close, PATIENCE)
     found = {dict(labels)["item"]: value for (name, labels), value in metrics.items() if name == "busmaster_value"}
     assert found == {"1": 10, "3": -10, "4": 0}
+    assert "2" not in {dict(labels).get("item") for _, labels in metrics}, "a text is no gauge"
     assert [of(metrics, "alarm", node="5", item=item) for item in ("1", "3", "4")] == [1, -1, 0]
+
+
+@pytest.mark.asyncio
+async def test_a_node_that_is_down_is_not_up_and_exchanges_are_counted_by_their_outcome() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)], paced=False)))
+    controller, absent = Hcp2Controller(bus, 5), Hcp2Controller(bus, 6)
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus)
+    async with bus:
+        await controller.read(1)
+        with pytest.raises(Refused):
+            await controller.write(100, 1.0)
+        await Node.of(absent).probe()
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    for handle, is_up in ((controller, 1), (absent, 0)):
+        node = Node.of(handle)
+        assert of(metrics, "node_up", node=node.label) == is_up
+        for outcome in metrics_module.OUTCOMES:
+            counted = of(metrics, "node_exchanges_total", node=node.label, outcome=outcome)
+            assert counted == getattr(node.statistics(), outcome)
+    assert Node.of(controller).statistics().refused > Node.of(absent).statistics().refused == 0
+
+
+def answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), PATIENCE).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.asyncio
+async def test_metrics_of_a_line_have_its_other_outputs_and_its_refusals(tmp_path: Path) -> None:
+    port = free_port()
+    text = (
+        'port = "/dev/ttyUSB0?baudrate=57600"\n[nodes.winder]\nprotocol = "hcp2"\naddress = 5\n'
+        f'[outputs.csv]\npath = "{tmp_path}/x.csv"\n[outputs.metrics]\nport = {port}\n'
+    )
+    file = read(Source("line.toml", text))
+    async with ConfiguredLine(file, port=MemoryPort(emulated_line(file))) as line:
+        line.authorisation.refusals.logins.update(web=2)
+        await asyncio.to_thread(until, lambda: answers(port))
+        metrics = await asyncio.to_thread(scraped, port)
+    assert [of(metrics, "output_up", output=output) for output in ("csv", "metrics")] == [1, 1]
+    assert of(metrics, "logins_failed_total", interface="web") == 2
 
 
 @pytest.mark.asyncio

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from busmaster.app.config import FileError
+from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
+from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import Happening, OutputLine
 from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, MqttOutput
 from busmaster.app.outputs.mqtt_connection import topic_part, unread
@@ -34,6 +35,7 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from tests.app.outputs.brokers import Broker, needs_mosquitto
 from tests.app.outputs.cycles import BUS, cycle, until
+from tests.app.outputs.test_audit import WRITE
 from tests.patience import PATIENCE
 from tests.ports import free_port
 
@@ -124,6 +126,16 @@ async def test_values_and_events_are_published_each_under_its_name(broker: Broke
 
 
 @pytest.mark.asyncio
+async def test_a_value_has_its_unit_and_the_time_of_its_reply(broker: Broker) -> None:
+    found = cycle(1, 12.5)
+    samples = {replace(point, unit="mm"): sample._replace(wall=1e9) for point, sample in found.samples.items()}
+    async with listening(broker, "line/values/#") as client, publishing(broker) as output:
+        output.offer(replace(found, samples=samples))
+        [(_, payload, _)] = await heard(client, 1)
+    assert (payload["unit"], payload["time"]) == ("mm", 1e9)
+
+
+@pytest.mark.asyncio
 async def test_the_last_values_are_retained_and_a_cycle_may_be_one_message(broker: Broker) -> None:
     async with publishing(broker, messages="cycle") as output:
         output.offer(cycle(1, 1.0, 2.0))
@@ -150,6 +162,58 @@ async def test_a_value_that_a_write_made_stale_is_published_if_its_group_is(brok
             await controller.write(1, 5.0)
             [(topic, payload, _)] = await heard(client, 1)
     assert (topic, payload["quality"]) == ("line/values/5/1", "stale")
+
+
+async def heard_to_the_end(client: Client) -> list[Heard]:
+    """All messages up to the one by which the output takes its leave."""
+    found: list[Heard] = []
+    while not (found and found[-1][:2] == ("line/status", "offline")):
+        found += await heard(client, 1)
+    return found
+
+
+@pytest.mark.asyncio
+async def test_a_value_is_published_as_it_is_now_if_it_is_of_the_latest_cycle_and_once_when_it_becomes_stale(
+    broker: Broker,
+) -> None:
+    async with emulated(Hcp2Controller, 5) as bus, listening(broker, "line/values/#", "line/status") as client:
+        controller = Hcp2Controller(bus, 5)
+        group = bus.poll_group("axes", period=1000.0, points=[controller.point("1")])
+        latest = await anext(aiter(group))
+        await controller.write(1, 5.0)
+        output = MqttOutput("mqtt", MqttSettings(port=broker.port, prefix="line"), bus)
+        for snapshot in (replace(latest, cycle=latest.cycle - 1), latest):
+            output.offer(snapshot)
+        output.start()
+        try:
+            found = await heard(client, 4)
+        finally:
+            await asyncio.to_thread(output.close, PATIENCE)
+        found += await heard_to_the_end(client)
+    old, *others = [payload["quality"] for topic, payload, _ in found if topic == "line/values/5/1"]
+    assert old != "stale", "a value of an earlier cycle is history"
+    assert others == ["stale", "stale"]
+
+
+@pytest.mark.asyncio
+async def test_where_a_cycle_is_one_message_no_value_has_one_of_its_own(broker: Broker) -> None:
+    async with emulated(Hcp2Controller, 5) as bus, listening(broker, "line/#") as client:
+        controller = Hcp2Controller(bus, 5)
+        async for _ in bus.poll_group("axes", period=1000.0, points=[controller.point("1")]):
+            break
+        await controller.write(1, 5.0)
+        async with publishing(broker, bus, messages="cycle"):
+            pass
+        topics = {topic for topic, *_ in await heard_to_the_end(client)}
+    assert topics == {"line/status", "line/line", "line/health/5"}
+
+
+@pytest.mark.asyncio
+async def test_values_that_are_offered_just_before_the_end_are_published(broker: Broker) -> None:
+    async with listening(broker, "line/status") as client, publishing(broker) as output:
+        await heard(client, 1)
+        output.offer(cycle(1, 12.5))
+    assert (output.written, output.dropped) == (1, 0)
 
 
 @pytest.mark.asyncio
@@ -212,8 +276,10 @@ async def test_health_of_line_and_nodes_is_retained_and_told_when_it_changes(bro
         {"line/line": "ready", "line/health/5": "up"},
     ]
     async with listening(broker, "line/line", "line/health/#") as later:  # the output has ended
-        found = {topic: payload.get("health", payload.get("line")) for topic, payload, _ in await heard(later, 2)}
+        left = await heard(later, 2)
+    found = {topic: payload.get("health", payload.get("line")) for topic, payload, _ in left}
     assert found == {"line/line": "offline", "line/health/5": "offline"}
+    assert all(abs(payload["time"] - BUS.wall_time()) < 600 for _, payload, _ in (*before, *after, *left))
 
 
 @pytest.mark.asyncio
@@ -589,6 +655,43 @@ async def test_who_does_not_own_the_line_publishes_its_values_and_nothing_of_its
     assert config[0].startswith("homeassistant/sensor/")
     assert [one["topic"] for one in config[1]["availability"]] == ["line/status", "line/values/5/1"]
     assert (second[0], second[1]["value"]) == ("line/values/5/1", 2)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("read_only", [False, True])
+async def test_a_line_writes_the_commands_that_its_file_permits_unless_it_is_read_only(
+    broker: Broker, read_only: bool
+) -> None:
+    keys = f'port = {broker.port}\nprefix = "line"\nallow_commands = "winder/10"\n'
+    file = read(Source("line.toml", f"{FILE}[outputs.mqtt]\n{keys}"))
+    async with (
+        listening(broker, "line/status", "line/result/#", "line/audit") as client,
+        ConfiguredLine(file, port=MemoryPort(emulated_line(file)), read_only=read_only) as line,
+    ):
+        assert [payload for _, payload, _ in await heard(client, 1)] == ["online"]
+        await client.publish("line/set/winder/10", "12.5", qos=1)
+        found = {topic: payload for topic, payload, _ in await heard(client, 2)}
+        assert found["line/result/winder/10"]["ok"] is not read_only
+        assert found["line/audit"]["outcome"] == ("refused" if read_only else "written")
+        assert await line.point("winder/10").read() == (0 if read_only else 12.5)
+
+
+@pytest.mark.asyncio
+async def test_a_process_that_only_writes_publishes_its_audit_entries_and_nothing_else(
+    broker: Broker, tmp_path: Path
+) -> None:
+    outputs = f'[outputs.mqtt]\nport = {broker.port}\nprefix = "line"\n[outputs.csv]\npath = "{tmp_path}/x.csv"\n'
+    metrics = f"[outputs.metrics]\nport = {free_port()}\n"
+    line = ConfiguredLine(read(Source("line.toml", f"{FILE}{outputs}{metrics}")), outputs=False)
+    async with listening(broker, "#") as client:
+        audit = line.audit()
+        assert [counts.kind for counts in audit.statistics()] == ["mqtt"], "the others keep no audit log"
+        audit.start(())
+        audit.record(WRITE)
+        await audit.close()
+        await client.publish("end", "now")
+        found = await heard(client, 2)
+    assert [(topic, retained) for topic, _, retained in found] == [("line/audit", False), ("end", False)]
 
 
 @pytest.mark.asyncio

@@ -78,7 +78,9 @@ class Plant:
 
 
 @asynccontextmanager
-async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncIterator[Plant]:
+async def plant(
+    broker: Broker, *topics: str, read_only: bool = False, report: Callable[[str], None] = lambda _: None
+) -> AsyncIterator[Plant]:
     import aiomqtt
 
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)))
@@ -87,7 +89,7 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
     controller.element(1).limit(maximum=500)
     settings = MqttSettings(port=broker.port, prefix="line")
     commands = {"5/1": controller.point("1"), "5/a+b": controller.point("3")}
-    output = MqttOutput("mqtt", settings, bus, commands=commands, authorisation=interface)
+    output = MqttOutput("mqtt", settings, bus, report, commands=commands, authorisation=interface)
     async with bus, aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
         await client.subscribe("line/status", qos=1)
         output.start()
@@ -294,12 +296,15 @@ async def test_a_flood_of_commands_that_are_not_allowed_is_refused_to_the_last(
     monkeypatch.setattr(mqtt_forbidden, "REST", 0.0)
     monkeypatch.setattr(mqtt_commands, "BREATH", PATIENCE)  # from the first refusal that is answered to the next
     monkeypatch.setattr(mqtt, "LAST_ANSWERS", 0.0)
-    async with plant(broker) as there:
+    reported: list[str] = []
+    async with plant(broker, report=reported.append) as there:
         for number in range(1000):
             await there.client.publish("line/set/5/2", str(number), qos=0)
         await asyncio.to_thread(outside_until, lambda: there.output._arriving.refused == 1000)
-        assert there.output._arriving.unanswered > 500
+        unanswered = there.output._arriving.unanswered
+        assert unanswered > 500
         assert len(there.records) < 500
+    assert reported == [f"mqtt: {unanswered} refused commands got neither a reply nor an audit entry"]
 
 
 @pytest.mark.asyncio
@@ -378,6 +383,31 @@ async def test_that_commands_are_not_heard_any_more_is_noticed_on_their_own_conn
         connection.shutdown(socket.SHUT_RDWR)
         await forbidden.lost
     forbidden.close()
+
+
+@pytest.mark.asyncio
+async def test_if_the_connection_of_the_other_commands_is_lost_both_are_made_again(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Forbidden] = []
+
+    class Noted(Forbidden):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            made.append(self)
+
+    monkeypatch.setattr(mqtt, "Forbidden", Noted)
+    reported: list[str] = []
+    async with plant(broker, report=reported.append) as there:
+        there.output._retry = 0.01
+        connection = made[0]._client.socket()
+        assert isinstance(connection, socket.socket)
+        connection.shutdown(socket.SHUT_RDWR)
+        await asyncio.to_thread(outside_until, lambda: "mqtt is up again" in reported)
+        assert (await there.ask("7", "5/2"))["ok"] is False
+        assert (await there.ask("7"))["ok"]
+    assert reported[0].endswith("ended the connection")
+    assert len(made) == 2
 
 
 @pytest.mark.slow
@@ -556,7 +586,7 @@ def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
         commands.arrive(cast("Message", Arrived(b"1")))
 
     class Unread(bytes):
-        def __getitem__(self, _: object) -> Any:
+        def __bytes__(self) -> bytes:
             raise AssertionError("it was read")
 
     commands.arrive(cast("Message", Arrived(Unread(b"1"))))
@@ -628,6 +658,31 @@ def test_a_command_is_kept_as_it_came_up_to_the_longest_one() -> None:
     commands.close(lambda request, _: kept.append(request))
     assert kept[0].value == LONGEST_COMMAND * "x"
     assert kept[1].value == f"{100 * 'x'}... ({LONGEST_COMMAND + 1} bytes)"
+
+
+@pytest.mark.parametrize(
+    ("payload", "interval", "expires"),
+    [
+        (b'{"value": 1, "expires": 0}', None, 0),
+        (b"1", 0, pytest.approx(time.time(), abs=600)),
+        (b"1", None, None),
+    ],
+)
+def test_an_end_at_zero_is_an_end(payload: bytes, interval: int | None, expires: float | None) -> None:
+    commands = commands_of(one="1")
+    properties = SimpleNamespace() if interval is None else SimpleNamespace(MessageExpiryInterval=interval)
+    commands.arrive(cast("Message", Arrived(payload, properties=properties)))
+    [request] = commands.queued
+    assert request.expires == expires
+
+
+def test_a_name_is_as_long_as_the_bound_in_the_topic_of_a_reply() -> None:
+    commands = commands_of(one="1")
+    for size in (LONGEST_NAME, LONGEST_NAME + 1):
+        commands.arrive(cast("Message", Arrived(b"1", topic="line/set/" + size * "y")))
+    kept: list[str] = []
+    commands.close(lambda request, _: kept.append(request.name))
+    assert kept == [LONGEST_NAME * "y", 40 * "y"]
 
 
 def test_an_answer_has_the_id_of_its_command_and_an_error_only_if_it_failed() -> None:

@@ -314,9 +314,10 @@ async def test_no_values_are_reported_to_stay_in_a_spool_that_is_empty(tmp_path:
     assert reported == []
 
 
-def test_cycles_that_wait_on_disk_are_counted_by_their_values(tmp_path: Path) -> None:
+@pytest.mark.parametrize("messages", ["point", "cycle"])
+def test_cycles_that_wait_on_disk_are_counted_by_their_values(tmp_path: Path, messages: Any) -> None:
     pytest.importorskip("aiomqtt", reason="the extra mqtt is not installed")
-    settings = MqttSettings(port=free_port(), messages="cycle", spill=str(tmp_path / "spool"))
+    settings = MqttSettings(port=free_port(), messages=messages, spill=str(tmp_path / "spool"))
     output = MqttOutput("mqtt", settings, BUS)
 
     async def start() -> None:

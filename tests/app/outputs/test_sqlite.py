@@ -204,6 +204,27 @@ def test_what_is_too_old_is_deleted_from_the_oldest_on(tmp_path: Path, monkeypat
     assert query(path, "select text from events order by rowid") == [("event 3",), ("event 4",), ("event 5",)]
 
 
+def test_a_database_above_its_limit_in_megabytes_forgets_the_oldest(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with recording(path, keep_mb=0.001) as output:  # less than an empty one has
+        for number in range(3):
+            output.offer(cycle(number, number))
+            until(lambda: settled(output))
+    assert query(path, "select value from samples") == [(2,)]
+
+
+def test_why_nothing_is_deleted_is_reported_by_the_output(tmp_path: Path) -> None:
+    path, reported = tmp_path / "x.db", list[str]()
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0, at=time.monotonic() - 10 * DAY))
+    output = SqliteOutput("sqlite", SqliteSettings(path=str(path), keep_days=2), reported.append)
+    output.start()
+    output.offer(cycle(2, 2.0))
+    output.close(PATIENCE)
+    assert reported == ["sqlite: by the clock all values are older than 2 days; nothing is deleted for a day"]
+    assert query(path, "select value from samples order by time") == [(1.0,), (2.0,)]
+
+
 class Clocks:
     """Clocks that are set by hand."""
 
@@ -445,6 +466,19 @@ def test_a_new_file_is_for_its_owner_and_group(tmp_path: Path) -> None:
     with recording(path) as output:
         output.offer(cycle(1, 1.0))
     assert path.stat().st_mode & 0o007 == 0
+
+
+def test_a_new_database_has_the_mode_of_its_settings(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    before = os.umask(0)
+    try:
+        output = SqliteOutput("sqlite", SqliteSettings(path=str(path), mode=0o604))
+        output.start()
+        output.offer(cycle(1, 1.0))
+        output.close(PATIENCE)
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o604
 
 
 @pytest.mark.parametrize("endings", [("",), ("", "-wal", "-shm")])

@@ -8,12 +8,14 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from busmaster.app.outputs.base import Output
 from busmaster.app.outputs.files import JsonlOutput
 from busmaster.app.outputs.settings import FileSettings, SqliteSettings
+from busmaster.app.outputs.spool import Spool
 from busmaster.app.outputs.sqlite import SqliteOutput
 from busmaster.app.service.record import Outcome, WriteRecord
 from tests.app.outputs.cycles import cycle, until
@@ -135,7 +137,14 @@ def test_each_entry_of_a_batch_is_reported(tmp_path: Path) -> None:
     assert found == [(1, ""), (2, ""), (3, "")]
 
 
-def test_an_entry_that_is_spilled_is_durable_in_the_spool(tmp_path: Path) -> None:
+def test_an_entry_that_is_spilled_is_durable_in_the_spool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    strict: list[bool] = []
+
+    def noted(*arguments: Any, **options: Any) -> Spool:
+        strict.append(options.get("strict", False))
+        return Spool(*arguments, **options)
+
+    monkeypatch.setattr("busmaster.app.outputs.spilling.Spool", noted)
     (tmp_path / "folder").mkdir()
     path = tmp_path / "folder" / "x.jsonl"
     output = JsonlOutput("jsonl", FileSettings(path=str(path), spill=str(tmp_path / "spool"), audit="strict"))
@@ -148,5 +157,6 @@ def test_an_entry_that_is_spilled_is_durable_in_the_spool(tmp_path: Path) -> Non
 
     closed_after(output, does)
     assert found == [""]
+    assert strict == [True]
     with closing(sqlite3.connect(tmp_path / "spool")) as database:
         assert database.execute("select count(*) from waiting").fetchall() == [(1,)]
