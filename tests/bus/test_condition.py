@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort
+from busmaster.arbiter.events import PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.bus.condition import PRESENT, LossLog
 from busmaster.bus.polling import PollGroup
@@ -18,6 +20,7 @@ from busmaster.emulator.memory import MemoryTransport
 from busmaster.errors import LineDown, WriteUnconfirmed
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport.identity import Identity
 
 SLOW = 1000.0
 """Seconds of a period in which no second poll comes."""
@@ -123,3 +126,44 @@ def test_a_loss_has_its_first_time_its_latest_reason_and_all_seconds() -> None:
     losses.found(15.0)
     losses.lost(20.0, "")
     assert (losses.condition.since, losses.seconds(21.0)) == (20.0, 6.0)
+
+
+class Missing(MemoryPort):
+    """A port that cannot be opened so often, each time for another reason."""
+
+    def __init__(self, on_wire: Line, *errors: Exception) -> None:
+        super().__init__(on_wire)
+        object.__setattr__(self, "errors", list(errors))
+        object.__setattr__(self, "reasons", [])
+
+    errors: list[Exception]
+    reasons: list[str]
+    bus: Bus
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
+        self.reasons.append(self.bus.condition.reason)
+        if self.errors:
+            raise self.errors.pop(0)
+        return await super().open(protocol_factory, only)
+
+
+def test_a_bus_that_waits_for_its_port_has_the_latest_reason_and_reports_it() -> None:
+    async def wait() -> None:
+        bug = ValueError("odd")
+        port = Missing(line(), LineDown("it does not exist", hint="plug it in"), bug)
+        bus = Bus(port, wait_for_port=True)
+        object.__setattr__(port, "bus", bus)
+        events = bus.events()
+        async with bus:
+            assert bus.condition.is_lost
+            while is_lost(bus):  # noqa: ASYNC110  nobody tells it
+                await asyncio.sleep(0.01)
+        odd = "cannot open the emulated line: ValueError: odd"
+        assert port.reasons == ["its port is not open yet", "it does not exist", odd]
+        failed = [event async for event in events if isinstance(event, PortFailed)]
+        assert [(event.cause, event.bug) for event in failed] == [("it does not exist", None), (odd, bug)]
+        assert failed[0].hint == "plug it in"
+
+    run_in_virtual_time(wait())

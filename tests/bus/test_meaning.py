@@ -33,7 +33,7 @@ def test_a_number_with_a_name_counts_and_is_stored_as_the_number() -> None:
         (WORD, 9.0, "9 READY|FAULT"),
         (WORD, 16, "16"),
         (WORD, -1, "-1 READY|FAULT"),
-        (WORD, StatusWord.ENABLED, str(StatusWord.ENABLED)),
+        (Meaning(bits={"ON": 7}), StatusWord.ENABLED, str(StatusWord.ENABLED)),
         (Meaning(labels={128: "enabled"}), StatusWord.ENABLED, "128 enabled"),
         (WORD, frozenset({3}), "frozenset({3})"),
         (Meaning(labels={0: "off", 1: "on"}), 1.0, "1 on"),
