@@ -12,6 +12,7 @@ from busmaster import Bus, Hcp2Controller, MemoryPort
 from busmaster.arbiter.events import PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.bus.condition import PRESENT, LossLog
+from busmaster.bus.handle import Handle
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.samples import Quality
 from busmaster.emulator.faults import Faults
@@ -62,6 +63,16 @@ def test_a_write_makes_all_that_read_the_same_stale_until_it_is_read_again() -> 
             group.demand()
             await anext(stream)
             assert qualities(bus, group) == [Quality.GOOD] * 3
+
+    run_in_virtual_time(write())
+
+
+def test_a_write_of_several_items_makes_their_values_stale_and_no_others() -> None:
+    async def write() -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            group = await read_once(bus)
+            await Handle.write(Hcp2Controller(bus, 5), "9", 7.0, 8.0)
+            assert qualities(bus, group) == [Quality.STALE, Quality.STALE, Quality.GOOD]
 
     run_in_virtual_time(write())
 

@@ -537,3 +537,18 @@ async def test_a_write_of_the_safe_state_is_not_limited_and_needs_no_current_val
         await drive.write(10, 100, safe=True)
         assert Node.of(drive).statistics().attempts == 1, "the value before was not read"
         assert await drive.read(10) == 100
+
+
+def test_a_limit_allows_for_the_rounding_of_the_protocol_and_steps_begin_at_the_nearest_limit() -> None:
+    drive = Hcp2Controller(bus_of(Hcp2Controller), 5)
+    limit = drive.element(10).limit(minimum=10.1, maximum=20.1, max_step=0.3)
+    for value in (10.1, 10.0999999, 20.1, 20.1000001):
+        limit.check(value)
+    for value, text in ((10.099, "below its minimum of 10.1"), (20.101, "above its maximum of 20.1")):
+        with pytest.raises(InvalidCommand, match=text):
+            limit.check(value)
+    for before, value in ((10.1, 10.1 + 0.1 + 0.1 + 0.1), (0.0, 10.4), (99.0, 19.8)):
+        limit.check_step(before, value)
+    for before, value in ((10.1, 10.401), (0.0, 10.401), (99.0, 19.799)):
+        with pytest.raises(InvalidCommand, match="is too far from"):
+            limit.check_step(before, value)
