@@ -659,24 +659,6 @@ def test_the_reply_time_in_plans_is_that_of_the_drive_whatever_its_exchanges_are
     on_a_bus(story, make_device(kind, address, delay=Delay(0.02), **options), settings=found.profile.line)
 
 
-def test_a_reply_to_a_repeated_request_does_not_count_for_the_reply_time_in_plans() -> None:
-    device = EmulatedMint(1, delay=Delay(0.005))
-
-    async def story(bus: Bus) -> None:
-        point = Hcp2Controller(bus, 1).point("7")
-        group = bus.poll_group("g", period=1.0, points=[point])
-        due = (await cycles(group, 2))[-1].due
-        device.faults.dead = 1.0
-        await asyncio.sleep(due + 1.05 - bus.now())
-        device.faults.dead = 0.0
-        [snapshot] = await cycles(group, 1)
-        assert snapshot[point].error is None
-        assert Node.of(point).statistics().retries == 1
-        assert (Node.of(point).planned().reply_time or 1.0) < 0.01
-
-    on_a_bus(story, device)
-
-
 def test_a_seed_makes_the_times_of_probes_repeatable() -> None:
     async def story(seed: int | None, sent: list[float]) -> None:
         line = Line(LineSettings(57600), [EmulatedMint(1)], chance=random.Random(1))

@@ -278,19 +278,3 @@ def test_the_longest_wait_counts_each_queued_write_once_though_writes_to_one_nod
         assert waits[0] == waits[1] > bus.worst_case_wait(Priority.COMMAND)
 
     on_a_bus(story)
-
-
-def test_the_longest_wait_does_not_count_the_queued_writes_of_another_program() -> None:
-    async def story(bus: Bus) -> None:
-        axis = Hcp2Controller(bus, 1)
-        await axis.write(1, 1.0)
-        await axis.read(1)
-        client = ext.line_of(bus).add_client(1.0)
-        before = bus.worst_case_wait(Priority.COMMAND)
-        requests = [ext.Request(hcp2.Write(element, (1.0,)), client=client) for element in range(1, 7)]
-        writing = [asyncio.ensure_future(ext.run(Node.of(axis), request)) for request in requests]
-        await asyncio.sleep(0)
-        assert bus.worst_case_wait(Priority.COMMAND) == before
-        await asyncio.gather(*writing)
-
-    on_a_bus(story)
