@@ -173,13 +173,12 @@ class PollGroup(Cycles):
         # A flag, and not a removal from the schedule: the poll keeps its phase, and `resume` continues on the same
         # grid.
         self._poll.paused = True
+        # The period that spans the pause is not measured, nor the time until a cycle that is demanded during it.
+        self._tally.last = None
 
     def resume(self) -> None:
         """Continue on the grid. The paused time does not count as a period."""
-        if self._poll.paused:
-            self._poll.paused = False
-            # The period that spans the pause is not measured.
-            self._tally.last = None
+        self._poll.paused = False
 
     def demand(self) -> None:
         """Run one cycle now, outside the grid. If a cycle is running, that one is used."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort
+from busmaster.arbiter.events import PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.bus.condition import PRESENT, LossLog
+from busmaster.bus.handle import Handle
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.samples import Quality
 from busmaster.emulator.faults import Faults
@@ -18,6 +21,7 @@ from busmaster.emulator.memory import MemoryTransport
 from busmaster.errors import LineDown, WriteUnconfirmed
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport.identity import Identity
 
 SLOW = 1000.0
 """Seconds of a period in which no second poll comes."""
@@ -59,6 +63,16 @@ def test_a_write_makes_all_that_read_the_same_stale_until_it_is_read_again() -> 
             group.demand()
             await anext(stream)
             assert qualities(bus, group) == [Quality.GOOD] * 3
+
+    run_in_virtual_time(write())
+
+
+def test_a_write_of_several_items_makes_their_values_stale_and_no_others() -> None:
+    async def write() -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            group = await read_once(bus)
+            await Handle.write(Hcp2Controller(bus, 5), "9", 7.0, 8.0)
+            assert qualities(bus, group) == [Quality.STALE, Quality.STALE, Quality.GOOD]
 
     run_in_virtual_time(write())
 
@@ -123,3 +137,44 @@ def test_a_loss_has_its_first_time_its_latest_reason_and_all_seconds() -> None:
     losses.found(15.0)
     losses.lost(20.0, "")
     assert (losses.condition.since, losses.seconds(21.0)) == (20.0, 6.0)
+
+
+class Missing(MemoryPort):
+    """A port that cannot be opened so often, each time for another reason."""
+
+    def __init__(self, on_wire: Line, *errors: Exception) -> None:
+        super().__init__(on_wire)
+        object.__setattr__(self, "errors", list(errors))
+        object.__setattr__(self, "reasons", [])
+
+    errors: list[Exception]
+    reasons: list[str]
+    bus: Bus
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
+        self.reasons.append(self.bus.condition.reason)
+        if self.errors:
+            raise self.errors.pop(0)
+        return await super().open(protocol_factory, only)
+
+
+def test_a_bus_that_waits_for_its_port_has_the_latest_reason_and_reports_it() -> None:
+    async def wait() -> None:
+        bug = ValueError("odd")
+        port = Missing(line(), LineDown("it does not exist", hint="plug it in"), bug)
+        bus = Bus(port, wait_for_port=True)
+        object.__setattr__(port, "bus", bus)
+        events = bus.events()
+        async with bus:
+            assert bus.condition.is_lost
+            while is_lost(bus):  # noqa: ASYNC110  nobody tells it
+                await asyncio.sleep(0.01)
+        odd = "cannot open the emulated line: ValueError: odd"
+        assert port.reasons == ["its port is not open yet", "it does not exist", odd]
+        failed = [event async for event in events if isinstance(event, PortFailed)]
+        assert [(event.cause, event.bug) for event in failed] == [("it does not exist", None), (odd, bug)]
+        assert failed[0].hint == "plug it in"
+
+    run_in_virtual_time(wait())

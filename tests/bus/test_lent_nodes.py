@@ -8,6 +8,7 @@ import pytest
 
 from busmaster import Bus, BusError, Hcp2Controller, MemoryPort, Node
 from busmaster.arbiter.events import NodeChanged
+from busmaster.arbiter.health import Health
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.hcp2.codec import Write
@@ -97,6 +98,20 @@ def test_another_protocol_may_be_lent_once_the_nodes_of_two_have_left() -> None:
             for lent in [bus._lend_node(find(name).profile, 5) for name in ("hcp", "hcp2")]:
                 bus._give_back(lent)
             assert [bus._lend_node(find("modbus").profile, 5)] == list(bus.nodes)
+
+    run_in_virtual_time(run())
+
+
+def test_r11_only_a_node_that_is_new_to_the_line_is_lent_within_the_probe_budget() -> None:
+    async def run() -> None:
+        async with bus_with(5, 6) as bus:
+            own = Node.of(Hcp2Controller(bus, 5))
+            lent = bus._lend_node(PROFILE, 6)
+            for node in (own, lent):
+                await node.request(PROFILE.probe)
+                assert bus._lend_node(PROFILE, node.address, budgeted=True) is node
+                assert node.health is Health.UP
+            assert bus._lend_node(PROFILE, ABSENT, budgeted=True).health is Health.DOWN
 
     run_in_virtual_time(run())
 

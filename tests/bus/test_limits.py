@@ -480,14 +480,24 @@ async def test_a_step_counts_from_what_is_read_after_a_write_to_all_because_no_n
         assert await drive.read("1.17") == 150
 
 
-@pytest.mark.parametrize("option", ["start_within", "finish_within"])
+@pytest.mark.parametrize(
+    "times",
+    [
+        {"start_within": 0.05},
+        {"finish_within": 0.05},
+        {"start_within": 0.05, "finish_within": 5.0},
+        {"start_within": 5.0, "finish_within": 0.05},
+    ],
+)
 @in_virtual_time
-async def test_a_write_is_not_sent_if_the_value_from_which_it_steps_is_not_read_within_its_time(option: str) -> None:
+async def test_a_write_is_not_sent_if_the_value_from_which_it_steps_is_not_read_within_its_time(
+    times: dict[str, float],
+) -> None:
     async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(0.09))) as bus:
         in_use(bus)
         drive = Hcp2Controller(bus, 5)
         drive.element(10).limit(max_step=20)
-        began, options = bus.now(), cast("WriteOptions", {option: 0.05})
+        began, options = bus.now(), cast("WriteOptions", times)
         with pytest.raises(NotStarted, match="the current value was not read in time"):
             await drive.write(10, 20, **options)
         assert bus.now() - began == pytest.approx(0.05, abs=0.001)
@@ -502,3 +512,43 @@ async def test_a_message_about_a_limit_has_the_unit_of_the_point() -> None:
             await drive.write(10, 501)
         with pytest.raises(InvalidCommand, match=r"10 = 51 m/min is too far from 0 m/min: its max_step is 50 m/min$"):
             await drive.write(10, 51)
+
+
+@in_virtual_time
+async def test_the_time_in_which_a_write_must_be_sent_counts_from_before_its_current_value_is_read() -> None:
+    slow = 0.03
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(slow, slow))) as bus:
+        in_use(bus)
+        drive = Hcp2Controller(bus, 5)
+        await drive.read(10)
+        drive.element(10).limit(max_step=20)
+        writing = asyncio.ensure_future(drive.write(10, 20, start_within=1.5 * slow))
+        await asyncio.sleep(0.001)
+        reading = asyncio.ensure_future(drive.read(10))  # goes before the write, which waits for its value
+        with pytest.raises(NotStarted):
+            await writing
+        assert await reading == 0
+
+
+@in_virtual_time
+async def test_a_write_of_the_safe_state_is_not_limited_and_needs_no_current_value() -> None:
+    async with controller() as drive:
+        drive.element(10).limit(maximum=50, max_step=5)
+        await drive.write(10, 100, safe=True)
+        assert Node.of(drive).statistics().attempts == 1, "the value before was not read"
+        assert await drive.read(10) == 100
+
+
+def test_a_limit_allows_for_the_rounding_of_the_protocol_and_steps_begin_at_the_nearest_limit() -> None:
+    drive = Hcp2Controller(bus_of(Hcp2Controller), 5)
+    limit = drive.element(10).limit(minimum=10.1, maximum=20.1, max_step=0.3)
+    for value in (10.1, 10.0999999, 20.1, 20.1000001):
+        limit.check(value)
+    for value, text in ((10.099, "below its minimum of 10.1"), (20.101, "above its maximum of 20.1")):
+        with pytest.raises(InvalidCommand, match=text):
+            limit.check(value)
+    for before, value in ((10.1, 10.1 + 0.1 + 0.1 + 0.1), (0.0, 10.4), (99.0, 19.8)):
+        limit.check_step(before, value)
+    for before, value in ((10.1, 10.401), (0.0, 10.401), (99.0, 19.799)):
+        with pytest.raises(InvalidCommand, match="is too far from"):
+            limit.check_step(before, value)

@@ -143,3 +143,25 @@ def test_r14_each_limit_of_a_point_and_each_end_of_its_alarm_is_logged_by_itself
         ("WARNING", "line: 5/1 = 5 is below its low of 10"),
         ("INFO", "line: 5/1 is back at 15, was below its low of 10"),
     ]
+
+
+def test_r14_each_node_state_and_point_is_limited_by_itself(lines: pytest.LogCaptureFixture) -> None:
+    logbook, bench = Logbook("line"), Bench()
+    nodes = [bench.node(address) for address in (1, 2)]
+    events: list[BusEvent] = []
+    for node in nodes:
+        events += [
+            NodeChanged(node, Health.UP, Health.DOWN, False),
+            NodeChanged(node, Health.DOWN, Health.UP, True),
+            MaxReplyDelayRaised(node, 0.14, 0.224),
+            MaxReplyDelayLowered(node, 0.15),
+            RepliesLate(node, 0.14, 0.1),
+        ]
+    events += [LineChanged(change) for change in (LineChange.DOWN, LineChange.UP, LineChange.NOISY)]
+    events += [AlarmChanged(point(item), "high", 20.0, 25.0, True) for item in ("1", "2")]
+    for event in events:
+        logbook.note(event, 0.0)
+    assert len(lines.messages) == len(set(lines.messages)) == len(events)
+    for event in events:
+        logbook.note(event, 1.0)
+    assert len(lines.messages) == len(events)

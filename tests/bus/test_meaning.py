@@ -33,7 +33,7 @@ def test_a_number_with_a_name_counts_and_is_stored_as_the_number() -> None:
         (WORD, 9.0, "9 READY|FAULT"),
         (WORD, 16, "16"),
         (WORD, -1, "-1 READY|FAULT"),
-        (WORD, StatusWord.ENABLED, str(StatusWord.ENABLED)),
+        (Meaning(bits={"ON": 7}), StatusWord.ENABLED, str(StatusWord.ENABLED)),
         (Meaning(labels={128: "enabled"}), StatusWord.ENABLED, "128 enabled"),
         (WORD, frozenset({3}), "frozenset({3})"),
         (Meaning(labels={0: "off", 1: "on"}), 1.0, "1 on"),
@@ -115,9 +115,10 @@ def test_bits_are_points_of_their_own_that_cost_no_exchange() -> None:
     async def story(bus: Bus) -> None:
         drive = Hcp2Controller(bus, 1)
         await drive.write(11, 9)
-        word = replace(drive.point("11"), meaning=WORD)
+        word = replace(drive.point("11"), unit="rpm", meaning=WORD)
         ready, fault = word.bits
         assert (ready.item, fault.key) == ("11.READY", "1/11.FAULT")
+        assert (ready.unit, fault.unit) == ("", "")
         group = bus.poll_group("axes", period=0.1, points=[word, *word.bits])
         [snapshot] = await cycles(group, 1)
         assert len(group.poll.results) == 1

@@ -27,7 +27,7 @@ from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
-from tests.stories import on_a_bus
+from tests.stories import cycles, on_a_bus
 
 SLOW = 0.09
 
@@ -143,6 +143,18 @@ def test_a_write_that_was_given_up_makes_older_samples_stale(limited: bool) -> N
         assert bus.latest(other) is not None
 
     on_a_bus(story, slow())
+
+
+def test_a_read_that_was_given_up_makes_no_sample_stale() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=1000.0, points=[point])
+        await cycles(group, 1)
+        with pytest.raises(NoReply):
+            await point.read(finish_within=0.01)
+        assert bus.latest(point) is not None
+
+    on_a_bus(story, EmulatedMint(1, delay=Delay(0.05)))
 
 
 def test_a_call_of_several_exchanges_has_one_time_for_all_of_them() -> None:

@@ -309,6 +309,25 @@ async def test_an_acknowledged_write_that_is_not_stored_is_reported_and_not_repe
 
 
 @in_virtual_time
+async def test_a_repeated_write_that_is_acknowledged_and_not_stored_is_reported_and_not_repeated_again() -> None:
+    device = OddDrive()
+    device.lost = device.ignored = frozenset({4})
+    results, reasons = await outcomes(device, 3, 4, 5, retries=0)
+    assert results == [Result.WRITTEN, Result.DIFFERS, Result.WRITTEN]
+    assert reasons[1] == "it reads 0 after 100 was written"
+    assert device.writes == 4
+
+
+@in_virtual_time
+async def test_values_that_differ_only_by_the_conversion_of_a_unit_are_equal() -> None:
+    async with bus_of(ModbusUnit, make_device("modbus", 17)) as bus:
+        saved = await ModbusUnit(bus, 17).save_parameters([Parameter(item="holding:0:float64")])
+    one, other, third = (changed(saved, **{"pholding:0:float64": value}) for value in (0.3, 0.1 + 0.2, 0.3000001))
+    assert ModbusUnit.differences(one, other) == ()
+    assert len(ModbusUnit.differences(one, third)) == 1
+
+
+@in_virtual_time
 async def test_reads_and_writes_of_a_load_go_in_the_background_of_other_traffic() -> None:
     async with bus_of(Dc104Drive, EmulatedDc104()) as bus:
         drive = Dc104Drive(bus)

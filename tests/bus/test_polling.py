@@ -614,6 +614,24 @@ def test_the_last_periods_are_kept_without_a_pause_and_until_a_reset() -> None:
     on_a_bus(story)
 
 
+def test_the_time_between_cycles_that_are_demanded_during_a_pause_is_no_period() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        await cycles(group, 2)
+        assert len(group.recent_periods) == 1
+        group.pause()
+        for _ in range(2):
+            await asyncio.sleep(5.0)
+            group.demand()
+            await cycles(group, 1)
+        group.resume()
+        await cycles(group, 3)
+        assert group.recent_periods == pytest.approx((0.1,) * 3, abs=0.001)
+        assert group.statistics().achieved == pytest.approx(0.1, abs=0.001)
+
+    on_a_bus(story)
+
+
 def test_missed_cycles_are_counted_until_a_reset() -> None:
     async def story(bus: Bus) -> None:
         group = bus.poll_group("g", period=0.003, points=[Hcp2Controller(bus, 1).point("7")])
@@ -820,7 +838,9 @@ def test_periods_are_measured_by_the_times_at_which_cycles_were_due_if_nothing_c
         [*_, snapshot] = await cycles(group, 4)
         assert (snapshot.started, isinstance(snapshot[point].error, NodeDown)) == (None, True)
         assert group.recent_periods == pytest.approx((0.1,) * 3)
-        assert group.statistics().achieved == pytest.approx(0.1)
+        counts = group.statistics()
+        assert counts.achieved == pytest.approx(0.1)
+        assert (counts.exchanges_ahead, counts.quiet_time_ahead) == (0.0, 0.0), "none waited: nothing was sent"
 
     on_a_bus(story)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
 from busmaster.bus.bus import Bus
+from busmaster.bus.handle import Handle
 from busmaster.bus.node import Node, Priority
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt
@@ -30,6 +32,8 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.protocols.modbus.handle import ModbusUnit
+from busmaster.registry import find, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.rs485 import Rs485
 from busmaster.transport.serial_port import SerialPort
@@ -543,3 +547,142 @@ def test_a_plan_has_the_period_the_phase_and_the_class_of_each_running_group() -
         assert other.worst_wait - other.period > one.worst_wait - one.period
 
     on_a_bus(story)
+
+
+def test_r9_the_worst_case_includes_queued_polls_and_the_longest_period_of_a_group() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        hold = bus.worst_case_wait(Priority.COMMAND) / (1 + 4 + 3)  # with three exchanges before each (R15)
+        alone = {priority: bus.worst_case_wait(priority) for priority in (Priority.POLL, Priority.BACKGROUND)}
+        for priority, before in alone.items():
+            reading = [asyncio.ensure_future(axis.read(element, priority=priority)) for element in range(1, 7)]
+            await asyncio.sleep(0)
+            assert bus.worst_case_wait(priority) >= before + 4 * 5 * hold
+            await asyncio.gather(*reading)
+            assert bus.worst_case_wait(priority) == before
+
+    def with_groups(*periods: float) -> float:
+        waits: list[float] = []
+
+        async def story(bus: Bus) -> None:
+            axis = Hcp2Controller(bus, 1)
+            groups = [bus.poll_group(str(n), period=p, points=[axis.point(str(n))]) for n, p in enumerate(periods, 1)]
+            bus.poll_group("empty", period=0.95, points=[])
+            await asyncio.gather(*(cycles(group, 1) for group in groups))
+            waits.append(bus.worst_case_wait(Priority.POLL))
+
+        on_a_bus(story)
+        return waits[0]
+
+    on_a_bus(story)
+    assert with_groups(0.5, 0.8) - with_groups(0.5, 0.5) == pytest.approx(0.3)
+    assert with_groups(0.8, 0.5) == with_groups(0.5, 0.8)
+
+
+def test_r9_the_worst_case_is_that_of_the_slowest_node_and_of_the_longest_read_of_a_kind() -> None:
+    slow = Timings.uniform(replace(hcp2.PROFILE.timings.read, window=0.4, max_reply_delay=0.6))
+
+    async def nodes(bus: Bus) -> None:
+        quick, other = Hcp2Controller(bus, 1), Hcp2Controller(bus, 2, timings=slow)
+        group = PlannedGroup("g", 1.0, [(Node.of(quick).planned(), hcp2.Read(1))])
+        await quick.read(1)
+        before, planned = bus.worst_case_wait(Priority.URGENT), (await bus.plan(group)).worst_waits
+        await other.read(1)
+        assert bus.worst_case_wait(Priority.URGENT) > before + 0.3
+        assert (await bus.plan(group)).worst_waits[Priority.URGENT] > planned[Priority.URGENT] + 0.3
+        Hcp2Controller(bus, 3)  # a node to which nothing was sent
+        await quick.read(1)
+        assert bus.worst_case_wait(Priority.URGENT) > before + 0.3
+
+    async def slow_first(bus: Bus) -> None:
+        other, quick = Hcp2Controller(bus, 2, timings=slow), Hcp2Controller(bus, 1)
+        await other.read(1)
+        before = bus.worst_case_wait(Priority.URGENT)
+        await quick.read(1)
+        assert bus.worst_case_wait(Priority.URGENT) == before
+
+    async def reads(bus: Bus) -> None:
+        unit = ModbusUnit(bus, 17)
+        short = bus.poll_group("short", period=1.0, points=[unit.point(f"holding:{place}") for place in range(2)])
+        await cycles(short, 1)
+        before = bus.worst_case_wait(Priority.URGENT)
+        long = bus.poll_group("long", period=1.0, points=[unit.point(f"holding:{place}") for place in range(90)])
+        await cycles(long, 1)
+        assert bus.worst_case_wait(Priority.URGENT) > before + 2 * 80 * bus._byte_time
+
+    on_a_bus(nodes)
+    on_a_bus(slow_first)
+    on_a_bus(reads, make_device("modbus", 17), settings=ModbusUnit.profile.line)
+
+
+def test_r9_the_bounds_include_the_programs_that_share_the_line_and_the_time_for_which_a_port_holds_bytes() -> None:
+    async def shared(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        bus.poll_group("g", period=1.0, points=[axis.point("1")])
+        alone = (await bus.plan()).worst_waits[Priority.COMMAND]
+        ext.line_of(bus).add_client(1.0)
+        assert (await bus.plan()).worst_waits[Priority.COMMAND] > alone
+
+    def hold(latency: float) -> float:
+        bus = Bus(SerialPort("/dev/none", baudrate=57600, receive_latency=latency))
+        Node.of(Hcp2Controller(bus, 1))._kinds[hcp2.Read] = hcp2.Read(1)
+        return bus.worst_case_wait(Priority.URGENT)
+
+    on_a_bus(shared)
+    assert hold(0.02) >= hold(0.0) + 0.02
+
+
+@pytest.mark.parametrize(
+    ("kind", "item", "options"),
+    [
+        ("modbus", "holding:0", {}),
+        ("mentor", "1.17", {}),
+        ("mentor", "1.18:2", {}),
+        ("msc", "2000", {"packet_delay": Delay(0.02)}),
+        ("msc", "2004:3", {"packet_delay": Delay(0.02)}),
+    ],
+)
+def test_the_reply_time_in_plans_is_that_of_the_drive_whatever_its_exchanges_are(
+    kind: str, item: str, options: dict[str, Any]
+) -> None:
+    found = find(kind)
+    address = 11
+
+    async def story(bus: Bus) -> None:
+        handle: Callable[..., Handle] = found.handle
+        point = handle(bus, address).point(item)
+        [*_, snapshot] = await cycles(bus.poll_group("g", period=1.0, points=[point]), 3)
+        assert snapshot[point].error is None
+        assert Node.of(point).planned().reply_time == pytest.approx(0.02, abs=1e-6)
+
+    on_a_bus(story, make_device(kind, address, delay=Delay(0.02), **options), settings=found.profile.line)
+
+
+def test_a_seed_makes_the_times_of_probes_repeatable() -> None:
+    async def story(seed: int | None, sent: list[float]) -> None:
+        line = Line(LineSettings(57600), [EmulatedMint(1)], chance=random.Random(1))
+        async with Bus(MemoryPort(line), seed=seed) as bus:
+            with pytest.raises(NoReply):
+                await bus.node(hcp2.PROFILE, 9).request(hcp2.Read(1), retries=0)
+            tap = Sent()
+            ext.add_tap(bus, tap)
+            await asyncio.sleep(30.0)
+            sent += tap.times
+
+    times: list[list[float]] = [[], [], []]
+    for seed, sent in zip((1, 1, 2), times, strict=True):
+        run_in_virtual_time(story(seed, sent))
+    assert times[0] == times[1] != times[2]
+    assert len(times[0]) > 3
+
+
+class Sent(Counted):
+    """A tap that keeps the times of sent bytes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.times: list[float] = []
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self.times.append(now)

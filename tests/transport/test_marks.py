@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
-from busmaster import Bus, GarbledReply, Hcp2Controller, MscController, SerialPort
+from busmaster import Bus, GarbledReply, Hcp2Controller, MscController, SerialPort, ext
 from busmaster.arbiter.counters import Mark
+from busmaster.contract.tap import Attempt
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
 from busmaster.protocols.msc import codec as msc
@@ -241,6 +242,20 @@ def reply(value: int, element: bytes = b"01") -> bytes:
     return b"\x02" + body + bytes([xor(body)])
 
 
+class Tap:
+    """Keeps the received bytes."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None: ...
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self.heard += data
+
+    def attempted(self, attempt: Attempt, /) -> None: ...
+
+
 @pytest.mark.asyncio
 async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(pty_master: PtyMaster) -> None:
     """Two flipped bits in two bytes pass any exclusive-or: only the UART knows."""
@@ -259,9 +274,11 @@ async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(pty_
         assert transport is not None
         set_input_flags(transport.get_extra_info("serial").fileno(), 0)
         answering = asyncio.ensure_future(node())
-        axis = Hcp2Controller(bus, 1)
+        axis, tap = Hcp2Controller(bus, 1), Tap()
+        ext.add_tap(bus, tap)
         with pytest.raises(GarbledReply, match="parity"):
             await axis.read(1, retries=0)
+        assert tap.heard.startswith(reply(234)[:4]), "the damaged byte is recorded too"
         assert await axis.read(1) == 234
         line = await bus.statistics()
         assert (line.damaged, line.breaks, line.driver) == (1, 0, None)

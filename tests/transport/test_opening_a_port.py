@@ -410,8 +410,28 @@ def locked_elsewhere(pty_master: PtyMaster) -> Iterator[int]:
 
 @pytest.mark.asyncio
 async def test_a_second_opening_says_which_other_program_has_it(pty_master: PtyMaster, locked_elsewhere: int) -> None:
-    with pytest.raises(LineDown, match=rf"is in use by python\S* -ISc \(process {locked_elsewhere}\)"):
-        await opened(pty_master.path)
+    mine = os.open(pty_master.path, os.O_RDWR | os.O_NOCTTY)  # this one has it open too, and has not locked it
+    try:
+        with pytest.raises(LineDown, match=rf"is in use by python\S* -ISc \(process {locked_elsewhere}\)"):
+            await opened(pty_master.path)
+    finally:
+        os.close(mine)
+
+
+@pytest.mark.asyncio
+async def test_a_busy_port_that_no_program_has_locked_is_said_to_be_in_use_by_the_program_that_has_it_open(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: serial.Serial) -> None:
+        raise serial.SerialException(errno.EBUSY, "busy")
+
+    monkeypatch.setattr(serial.Serial, "open", refuse)
+    mine = os.open(pty_master.path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        with pytest.raises(LineDown, match="is in use by this program; end that first"):
+            await opened(pty_master.path)
+    finally:
+        os.close(mine)
 
 
 # -- what only some drivers have -------------------------------------------------------------------------------------
@@ -471,8 +491,10 @@ async def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
     ("error", "says"),
     [
         (serial.SerialException(errno.EACCES, "denied"), r"no permission to open .*; (join|its) "),
+        (PermissionError(errno.EPERM, "not permitted"), r"no permission to open .*; (join|its) "),
         (serial.SerialException(errno.EBUSY, "busy"), "is in use by another program"),
         (serial.SerialException(errno.ENXIO, "nothing"), "there is no hardware behind"),
+        (serial.SerialException(errno.ENODEV, "nothing"), "there is no hardware behind"),
         (termios.error(errno.EIO, "Input/output error"), "there is no hardware behind"),
         (ValueError("Failed to set custom baud rate"), "does not take 57600 baud, 8N1"),
         (OSError(errno.EMFILE, "too many"), "Too many open files"),

@@ -76,6 +76,7 @@ class Ledger:
         self.is_over = False
         self.due = inf
         self.events: list[object] = []
+        self.causes: list[str] = []
 
     # the port
 
@@ -112,7 +113,8 @@ class Ledger:
 
     def line_up(self, now: float, *, paced: bool) -> None: ...
 
-    def line_down(self, _cause: str, _now: float) -> None: ...
+    def line_down(self, cause: str, _now: float) -> None:
+        self.causes.append(cause)
 
     def line_due(self, _now: float) -> bool:
         return self.is_due
@@ -301,6 +303,27 @@ def test_a_port_that_comes_back_may_hold_its_output_as_long_as_the_one_before(le
     ledger.time = 2 * STUCK_AFTER
     pump._on_time()
     assert ("aborted",) in ledger.notes
+
+
+def test_each_loss_has_its_own_cause_and_a_port_that_comes_back_holds_nothing(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    ledger.has, ledger.is_due = 2, True
+    pump.pause_writing()
+    pump._on_time()
+    ledger.time = STUCK_AFTER
+    pump._on_time()
+    pump.connection_lost(None)
+    ledger.has, ledger.is_due = 0, False
+    pump.connection_made(ledger)  # type: ignore[arg-type]  # it stands for the port
+    ledger.notes.clear()
+    ledger.out = b"05\x05"
+    pump.turn()
+    assert [note[0] for note in ledger.notes] == ["written", "transmitted", "tapped"]
+    pump.connection_lost(OSError(5, "Input/output error"))
+    assert ledger.causes == [
+        "no byte has left the port for 5 s: the port does not take it; open it again",
+        "Input/output error",
+    ]
 
 
 async def in_sync(axis: Hcp2Controller) -> None:

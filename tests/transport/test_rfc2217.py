@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from busmaster import Bus, GarbledReply, Hcp2Controller, MscController
+from busmaster import Bus, GarbledReply, Hcp2Controller, MscController, ext
 from busmaster.arbiter.counters import DriverErrors, Mark
 from busmaster.contract.profile import LineSettings
+from busmaster.contract.tap import Attempt
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.registry import make_device
@@ -263,6 +264,20 @@ async def test_output_that_the_server_suspends_is_held_and_sent_in_order() -> No
         await closed(transport, recorder)
 
 
+class Chunks:
+    """A tap that keeps what was received at a time."""
+
+    def __init__(self) -> None:
+        self.heard: list[bytes] = []
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None: ...
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        self.heard.append(data)
+
+    def attempted(self, attempt: Attempt, /) -> None: ...
+
+
 @pytest.mark.asyncio
 async def test_a_reply_with_a_remote_parity_error_fails_the_attempt_and_is_counted() -> None:
     line = Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)
@@ -275,9 +290,11 @@ async def test_a_reply_with_a_remote_parity_error_fails_the_attempt_and_is_count
 
         server.spoil = spoil
         async with Bus(Rfc2217Port("127.0.0.1", server.number, baudrate=57600)) as bus:
-            axis = Hcp2Controller(bus, 5)
+            axis, tap = Hcp2Controller(bus, 5), Chunks()
+            ext.add_tap(bus, tap)
             with pytest.raises(GarbledReply, match="parity"):
                 await axis.read(1, retries=0)
+            assert all(tap.heard), "an error without a byte is no received byte"
             assert await axis.read(1) == 0
             counts = await bus.statistics()
             assert (counts.damaged, counts.breaks) == (1, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import termios
 import threading
 from collections.abc import Iterator
@@ -211,6 +212,21 @@ async def test_a_hang_up_is_reported_at_once_and_once(pty_master: PtyMaster) -> 
     transport.abort()
     await asyncio.sleep(0.01)
     assert len(recorder.losses) == 1
+
+
+@pytest.mark.asyncio
+async def test_another_error_than_a_hang_up_is_the_reason_of_the_loss(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_descriptor: int, _data: bytes) -> int:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    transport, recorder = await opened(pty_master.path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", fail)
+        transport.write(b"x")
+    await recorder.lost()
+    assert str(recorder.losses[0]) == f"{pty_master.path} was lost: Cannot allocate memory"
 
 
 @pytest.mark.asyncio

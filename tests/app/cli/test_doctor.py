@@ -33,6 +33,7 @@ from busmaster.app.diagnostics import adapters, diagnosis, examination
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
 from busmaster.app.diagnostics.probing import Outcome, Prober, opened
+from busmaster.arbiter.counters import Mark
 from busmaster.capture.pcapng import read_packets
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt, Tap
@@ -274,6 +275,33 @@ def test_an_echo_is_found_and_what_was_declared_is_checked(present: bool, declar
     assert findings.on("node 1").ok
     if present and not declared:
         assert "--echo" in findings.on("echo").advice
+
+
+@dataclass(frozen=True)
+class Holding(MemoryPort):
+    """A port that holds received bytes for a third of a second."""
+
+    @property
+    def receive_latency(self) -> float:
+        return 0.3
+
+
+def test_an_echo_is_found_behind_a_port_that_holds_bytes() -> None:
+    line = line_of("hcp2", [hcp2(1)], echo=Echo(0.25))
+    assert examined(line, (1,), port=Holding(line)).on("echo").what.startswith("the adapter receives its own")
+
+
+def test_bytes_that_are_damaged_by_the_opening_of_a_port_are_not_faults_of_the_line() -> None:
+    class Spoilt(MemoryPort):
+        async def open(self, protocol_factory: Any, only: Any = None) -> MemoryTransport:
+            protocol: Any = protocol_factory()
+            transport = await super().open(lambda: protocol, only)
+            for mark in (Mark.DAMAGED, Mark.BREAK):
+                protocol.byte_marked(b"\0", mark)
+            return transport
+
+    line = line_of("hcp2", [hcp2(1)])
+    assert examined(line, (1,), port=Spoilt(line)).wrong == set()
 
 
 def test_an_echo_that_differs_from_what_was_sent_is_shown() -> None:

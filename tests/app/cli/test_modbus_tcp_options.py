@@ -91,6 +91,15 @@ def test_units_are_read_without_being_written(
     assert served.line.read_only is ("--read-only" in options)
 
 
+def test_units_are_written_from_the_named_addresses_alone_without_any_point(
+    busmaster: Command, served: type[Served]
+) -> None:
+    options = ("--pass-through", "--allow-unit", "3", "--allow-from", "10.0.0.1", "--bind", "0.0.0.0:502")
+    assert busmaster(*LINE, *options).status == 0
+    peers = (ipaddress.ip_network("10.0.0.1/32"),)
+    assert served.rules == Rules(units=frozenset({3}), peers=peers, pass_through=True)
+
+
 def test_type_and_last_are_those_of_the_automatic_map(busmaster: Command, served: type[Served]) -> None:
     assert busmaster(*LINE, "--type", "int16", "--last").status == 0
     assert served.values == {"fixed": None, "type_": "int16", "last": True}

@@ -25,7 +25,7 @@ from pymodbus.client import ModbusTcpClient
 
 from busmaster import Priority, Quality, Snapshot
 from busmaster.app import bounds
-from busmaster.app.interfaces import modbus_tcp
+from busmaster.app.interfaces import modbus_tcp, reported_refusals
 from busmaster.app.interfaces.following import Connected, Following, Lost
 from busmaster.app.interfaces.modbus_tcp import (
     UNIT_REFUSED,
@@ -1014,6 +1014,50 @@ def test_the_addresses_of_an_ipv6_network_have_few_requests_on_the_line_together
         await asyncio.gather(*replies)
 
     asyncio.run(run())
+
+
+def test_refused_writes_and_connections_of_the_server_are_reported_to_the_owner(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reported_refusals, "REPORT_EVERY", 0.0)
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_PER_PEER", 1)
+    reported: asyncio.Queue[tuple[str, str, dict[str, int]]] = asyncio.Queue()
+
+    class Told(Owner):
+        def report_refusals(self, interface: str, kind: str, peers: Any) -> None:
+            reported.put_nowait((interface, kind, dict(peers)))
+
+    async def story() -> list[tuple[str, str, dict[str, int]]]:
+        line = connected(Told())
+        opened: asyncio.Queue[str] = asyncio.Queue()
+
+        async def follow() -> None:
+            await asyncio.Event().wait()
+
+        line.follow = follow  # type: ignore[method-assign,assignment]  # replaced here
+        values = values_of(line, row_of("1"))
+        serving = asyncio.ensure_future(
+            modbus_tcp.serve(values, Rules(), ("127.0.0.1", 0), opened.put_nowait, lambda _: None)
+        )
+        found = []
+        async with asyncio.timeout(PATIENCE):
+            port = int((await opened.get()).rpartition(":")[2])
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(frame(bytes.fromhex("06 0000 0007"), unit=1))
+            assert (await reader.readexactly(9))[-2:] == bytes.fromhex("86 01")
+            found.append(await reported.get())
+            _, beyond = await asyncio.open_connection("127.0.0.1", port)
+            found.append(await reported.get())
+            for one in (writer, beyond):
+                one.close()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        return found
+
+    assert asyncio.run(story()) == [
+        ("modbus-tcp", "requests", {"127.0.0.1": 1}),
+        ("modbus-tcp", "connections", {"127.0.0.1": 1}),
+    ]
 
 
 @pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")

@@ -863,6 +863,15 @@ async def test_who_guesses_tokens_is_told_how_many_whole_seconds_to_wait() -> No
 
 
 @pytest.mark.asyncio
+async def test_a_write_without_a_token_is_no_failed_login() -> None:
+    of = Local(secrets={"hmi": digest_of(TOKEN)})
+    for _ in range(100):
+        assert (await of.put()).status_code == 401
+    assert (await of.put(authorization=f"Bearer {TOKEN}")).status_code == 200
+    assert of.reports == ["winder/10 = 1, from token hmi from 127.0.0.1: written"]
+
+
+@pytest.mark.asyncio
 async def test_who_waits_as_long_as_the_reply_advises_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
     monkeypatch.setattr(web, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
