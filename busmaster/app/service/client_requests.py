@@ -272,7 +272,8 @@ class Writing:
         try:
             if refusal := self._line.authorisation.refusal(request):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
-            if (age := self._line.bus.now() - self._asked) > FRESH:
+            # A stop is sent however late it comes: without it, the drive would go on.
+            if (age := self._line.bus.now() - self._asked) > FRESH and not self._stop:
                 raise _arrived_late(age, self.node, self.command)
             self._request.options = ext.checked_options(
                 self.node, _left(self._options, self._line.bus.now() - self._asked, self.node, self.command)

@@ -125,6 +125,27 @@ def test_a_request_that_came_after_its_time_is_not_sent_on_an_idle_line_either(
     on_a_line(tmp_path, story)
 
 
+def test_a_stop_is_sent_however_late_it_comes_unless_its_program_has_set_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.client_requests.FRESH", FRESH)
+
+    async def story(line: Served) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        await controller.write(1, 7)
+        async with raw(line) as client:
+            late: dict[str, Any] = {"requested": line.bus.now() - 10 * FRESH}
+            assert error_of(await client.ask("request", **write(0.0), **late)) == "NotStarted"
+            late["stop"] = True
+            limited = await client.ask("request", **write(0.0), **late, options={"finish_within": FRESH})
+            assert error_of(limited) == "NotStarted"
+            assert await controller.read(1) == 7
+            assert (await client.ask("request", **write(0.0), **late))["result"] is None
+            assert await controller.read(1) == 0
+
+    on_a_line(tmp_path, story)
+
+
 @pytest.mark.parametrize("request_", [READ, write(1.0)], ids=["read", "write"])
 def test_a_request_of_the_future_has_no_more_time_than_one_of_now(request_: dict[str, Any], tmp_path: Path) -> None:
     async def story(line: Served) -> None:
