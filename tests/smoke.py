@@ -1,4 +1,5 @@
-"""Does an installation work at all? Each command and interface once, as processes, with nothing but what is installed.
+"""Does an installation work at all? Its main commands and each interface, as processes, with nothing but what is
+installed.
 
 `python -m tests.smoke` is run by .ci/run with the lowest versions that pyproject.toml lets in. It needs no pytest: the
 lowest versions of that are not our users' affair. It prints each step, and ends with 1 at the first that fails.
@@ -137,6 +138,7 @@ def smoke(folder: Path) -> None:
     ran("no-such-command", status=2, shows="no-such-command")
     ran("run", status=2, shows="LINE.toml")
     ran("read", "--no-such-option", status=2, shows="--no-such-option")
+    ran("check", file)
     ran("plan", file)
     ran("points", file)
     ran("demo", "--seconds", "2")
@@ -146,6 +148,9 @@ def smoke(folder: Path) -> None:
             ran("write", address, "--protocol", "hcp2", "--node", "1", "1=12.5", "--verify", shows="ok")
             if "12.5" not in ran("read", address, "--protocol", "hcp2", "--node", "1", "1"):
                 raise Failed("the value that was written is not read")
+            polled = ("--nodes", "1", "--items", "1", "--period", "0.2", "--seconds", "1")
+            if "12.5" not in ran("poll", address, "--protocol", "hcp2", *polled):
+                raise Failed("the value that was written is not polled")
             if "busmaster_line_up" not in fetched(f"http://127.0.0.1:{metrics}/metrics"):
                 raise Failed("there are no metrics")
             with runs("web", address, "--bind", "127.0.0.1:0", until=r"the page is at (\S+)") as url:
@@ -157,6 +162,8 @@ def smoke(folder: Path) -> None:
                 followed(url)
             with runs("opcua", address, "--bind", f"127.0.0.1:{opcua}", until="opc.tcp://"):
                 browsed(opcua)
+            with runs("modbus-tcp", address, "--bind", "127.0.0.1:0", until=r"serving Modbus TCP at (\S+)") as modbus:
+                exchanged(modbus)
             remote(address)
         ran("safe", file)
     if not (folder / "smoke.sqlite").stat().st_size:
@@ -185,6 +192,18 @@ def browsed(port: int) -> None:
 
     step("a client of OPC UA")
     asyncio.run(browse())
+
+
+def exchanged(address: str) -> None:
+    """A client of Modbus TCP gets a reply."""
+    import socket
+
+    step("a client of Modbus TCP")
+    host, _, port = address.rpartition(":")
+    with socket.create_connection((host, int(port)), WITHIN) as client:
+        client.sendall(bytes.fromhex("000100000006010300000001"))
+        if client.recv(2) != bytes.fromhex("0001"):
+            raise Failed("the reply is not to this request")
 
 
 def remote(address: str) -> None:
