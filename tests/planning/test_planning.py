@@ -387,6 +387,21 @@ def test_r9_other_programs_and_their_sequences_lengthen_the_waits() -> None:
     assert planned(group("a", 0.5, 4), sharing=Sharing()).worst_waits == alone.worst_waits
 
 
+def test_r9_the_receive_latency_of_an_adapter_counts_in_every_wait() -> None:
+    read = hcp2.Read(1)
+    slow = planned(group("a", 0.5, 4), receive_latency=0.016)
+    bound = bounds([(NODE, read)], TAU, 0.016, polls=4)
+    assert bound.urgent_hold == longest_hold(NODE.open(read), TAU, 0.016)
+    assert slow.worst_waits == {priority: pytest.approx(bound.wait(priority)) for priority in Priority}
+
+
+def test_r9_the_bounds_of_a_shared_line_are_those_of_its_plan() -> None:
+    bound = bounds([(NODE, hcp2.Read(1))], TAU, polls=4, sharing=Sharing(2, 0.7))
+    assert (bound.clients, bound.held) == (2, 0.7)
+    shared = planned(group("a", 0.5, 4), sharing=Sharing(2, 0.7))
+    assert shared.worst_waits == {priority: pytest.approx(bound.wait(priority)) for priority in Priority}
+
+
 def test_r9_while_the_line_is_held_each_command_may_wait_for_one_of_a_lower_class() -> None:
     free, held = Bounds(hold=1.0, urgent_hold=1.0), Bounds(hold=0.5, urgent_hold=1.0, held=0.5)
     each, ahead = 1 + MOST_BEFORE, 2 * SHARE - 1
