@@ -292,6 +292,29 @@ def test_a_listener_tells_requests_from_replies() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("request_", "reply", "heard"),
+    [
+        ("11 01 0013 000a", "11 01 02 cd 01", ("read coil:19:10", "coil:19:10 = 1,0,1,1,0,0,1,1,1,0")),
+        ("11 02 00c4 0003", "11 02 01 05", ("read discrete:196:3", "discrete:196:3 = 1,0,1")),
+        ("11 02 00c4 0001", "11 02 01 01", ("read discrete:196", "discrete:196 = 1")),
+        (
+            "11 02 0000 0009",
+            "11 02 01 05",
+            ("read discrete:0:9", "discrete:0:9 = 1,0,1,0,0,0,0,0,0 [1 bytes of data, not 2]"),
+        ),
+        ("11 04 0008 0002", "11 04 04 000a ffff", ("read input:8:2", "input:8:2 = 10,65535")),
+        ("11 05 00ac ff00", "11 05 00ac ff00", ("write coil:172 = 1", "ACK")),
+        ("11 05 00ac 0000", "11 05 00ac 0000", ("write coil:172 = 0", "ACK")),
+        ("11 10 0001 0002 04 000a 0102", "11 10 0001 0002", ("write holding:1:2 = 10,258", "ACK")),
+    ],
+)
+def test_a_listener_reads_each_function(request_: str, reply: str, heard: tuple[str, str]) -> None:
+    decoder = Decoder(find("modbus").protocol.dialect())
+    frames = [*decoder.feed(frame(request_), 0.0, HOST), *decoder.feed(frame(reply), 0.01, NODE)]
+    assert said(frames) == [f"host 17 {heard[0]}", f"node 17 {heard[1]}"]
+
+
 def test_a_listener_says_what_is_wrong_with_a_frame() -> None:
     request = "11 03 0064 0001"
     assert said(hear("modbus", frame(request).hex(), "11 03 02 00 01 00 00", "|"))[1].endswith("[bad CRC]")
