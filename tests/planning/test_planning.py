@@ -305,6 +305,16 @@ def test_r9_each_step_can_last_its_max_reply_delay() -> None:
     assert three == pytest.approx(one + 2 * (step + tau))
 
 
+def test_r9_the_line_is_held_until_a_driver_releases_it_and_the_closing_bytes_have_left() -> None:
+    read = hcp2.Read(1)
+    slow = Timings.uniform(replace(hcp2.PROFILE.timings.read, driver_release_time=0.4))
+    assert longest_hold(read.open(1, slow), TAU) == pytest.approx(longest_hold(NODE.open(read), TAU) + 0.4)
+    closed, open_ = (msc.DataRead(2000).open(1, msc.PROFILE.timings) for _ in range(2))
+    open_.closing = 0
+    assert closed.closing == 1
+    assert longest_hold(closed, TAU) == pytest.approx(longest_hold(open_, TAU) + TAU)
+
+
 def test_r9_the_receive_latency_of_an_adapter_counts_once_a_step_and_in_every_silence() -> None:
     read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
     assert longest_hold(read, TAU, 0.016) == pytest.approx(longest_hold(read, TAU) + (1 + 25 + 1) * 0.016)
