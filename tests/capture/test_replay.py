@@ -194,6 +194,7 @@ def test_the_outcome_of_a_request_that_no_command_sends_is_not_that_of_the_next_
         assert (first.recorded.outcome, second.recorded.outcome) == (outcome, Outcome.OK)
         assert (first.packet, second.packet) == (1, 2 + max(1, len(replies)))
         assert (first.micros, second.micros) == (0, 1_000_000 * (1 + len(replies)))
+    assert [one.packet for one in replay_packets(overheard(*READ, wrong, (NODE, NAK)))] == [1, 3]
 
 
 def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
