@@ -108,7 +108,7 @@ def _check_hash(command: Command[Any], twin: Command[Any]) -> Iterator[str]:
 
 def _check_immutable(command: Command[Any]) -> Iterator[str]:
     slots = (name for kind in type(command).__mro__ for name in getattr(kind, "__slots__", ()))
-    for name in (*slots, *vars(type(command)).get("__annotations__", ()), "something_new"):
+    for name in (*slots, "something_new"):
         try:
             setattr(command, name, None)
         except (AttributeError, TypeError):

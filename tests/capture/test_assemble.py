@@ -261,9 +261,19 @@ def test_a_broadcast_is_over_when_it_is_sent() -> None:
     tape.asked(1.0, mentor.PROFILE, mentor.Write(1, 17, 0), 0)
     tape.over(1.1, Verdict.OK, None)
     assert tape.lines() == [(HOST, everybody, OK, "write 01.17 = +0000: ok")]
-    assert tape.packets[0].protocol == "mentor"
+    assert (tape.packets[0].protocol, tape.packets[0].notes) == ("mentor", ())
     overheard.assembler.overheard(1.0, everybody, HOST)
     assert overheard.lines() == [(HOST, everybody, OK, "")]
+
+
+def test_the_packet_of_a_broadcast_has_its_outcome_and_why_it_was_sent() -> None:
+    tape = Tape()
+    stop = tape.asked(1.0, mentor.PROFILE, mentor.Write(1, 17, 0), 0, purpose="safe state", number=2)
+    stop.heard = False
+    tape.over(1.1, Verdict.OK, None)
+    [(*_, comment)] = tape.lines()
+    assert comment == "write 01.17 = +0000: ok"
+    assert tape.packets[0].notes == ("safe state, attempt 2", "cancelled")
 
 
 def test_a_read_of_several_steps_is_closed_by_what_comes_with_the_next_request() -> None:

@@ -187,6 +187,16 @@ def test_a_request_that_no_command_sends_is_a_change_if_it_was_answered() -> Non
     assert one.changed
 
 
+def test_the_outcome_of_a_request_that_no_command_sends_is_not_that_of_the_next_exchange() -> None:
+    wrong = (WRITE, "07 30 30 02 30 30 05 07")
+    for replies, outcome in (((), Outcome.NO_REPLY), (((NODE, NAK), (NODE, "FF")), Outcome.REFUSED)):
+        first, second = replay_packets(overheard(wrong, *replies, *READ))
+        assert (first.recorded.outcome, second.recorded.outcome) == (outcome, Outcome.OK)
+        assert (first.packet, second.packet) == (1, 2 + max(1, len(replies)))
+        assert (first.micros, second.micros) == (0, 1_000_000 * (1 + len(replies)))
+    assert [one.packet for one in replay_packets(overheard(*READ, wrong, (NODE, NAK)))] == [1, 3]
+
+
 def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
     with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
         exchanges = list(replay_packets(read_packets(file)))

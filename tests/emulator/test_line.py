@@ -174,6 +174,17 @@ def test_a_device_may_speak_unexpected_when_its_own_timer_runs_out() -> None:
     assert ask(line, "00", 0.95, 0.2) == ""
 
 
+def test_each_device_has_a_timer_of_its_own() -> None:
+    """The second one's is due while the first one's has been set again, and before the first one's is due again."""
+    devices = [Insister(1), Insister(2), Insister(3)]
+    for device, due in zip(devices, (0.005, 0.008, 0.011), strict=True):
+        device.wakeup = due
+    line = line_of(*devices)
+    line.prompt = False
+    found = [round(when - 4 * TAU, 6) for when, _ in arrivals(line, 0.024)]
+    assert found == [0.005, 0.008, 0.011, 0.015, 0.018, 0.021]
+
+
 # Collisions
 
 
@@ -306,6 +317,12 @@ def test_a_corrupt_echo_differs_by_one_bit() -> None:
     assert sum((a ^ b).bit_count() for a, b in zip(echo, READ_2, strict=True)) == 1
 
 
+def test_an_echo_is_corrupt_as_often_as_is_set() -> None:
+    line = line_of(echo=Echo(corrupt=0.2))
+    intact = sum(ask(line, hexed(READ_2), now, 0.5) == hexed(READ_2) for now in range(200))
+    assert 140 < intact < 180
+
+
 def test_a_device_that_holds_the_line_after_its_reply_garbles_the_next_request() -> None:
     first = mint(2)
     first.driver_release_time = 2 * TAU
@@ -349,6 +366,15 @@ def test_a_request_that_was_cut_in_the_middle_is_forgotten_at_the_next_reset_byt
     line.cut(5.5 * TAU)
     line.restore(0.5)
     assert ask(line, hexed(READ_2), 1.0) == REPLY
+
+
+def test_a_device_hears_a_request_up_to_the_cut_and_one_that_is_not_cut_off_hears_all_of_it_once() -> None:
+    line = line_of(near := Ear(), far := Ear())
+    line.send(WRITE_2, 0.0)
+    line.cut(5.5 * TAU, far)
+    line.receive(1.0)
+    assert bytes(byte for _, byte in near.heard) == WRITE_2
+    assert bytes(byte for _, byte in far.heard) == WRITE_2[:5]
 
 
 def test_a_request_across_a_short_cut_is_not_heard() -> None:
@@ -636,6 +662,24 @@ def test_a_device_that_restarts_takes_back_its_own_reply_alone() -> None:
     assert bytes.fromhex(replies) == b"\x02011\x03\x33" + b"\x02013\x03\x31"
 
 
+@pytest.mark.parametrize("cut", [False, True])
+def test_the_transmissions_that_are_left_after_a_cut_or_a_restart_begin_in_order_of_time(cut: bool) -> None:
+    """The transmission that is lost is the first of those that wait."""
+    devices = [mint(address, delay) for address, delay in ((1, 0.05), (2, 0.2), (3, 0.12), (4, 0.07))]
+    for device in devices:
+        device.comms[1] = device.address
+    line = line_of(*devices)
+    for number, device in enumerate(devices):
+        line.send(hcp2.Read(1).open(device.address, hcp2.PROFILE.timings).request, number * 0.01)
+    if cut:
+        line.cut(0.045, devices[3])
+    else:
+        line.restart(devices[3], 0.045)
+    replies = "".join(data for _, data in arrivals(line, 1.0)).replace(" ", "")
+    assert bytes.fromhex(replies) == b"\x02011\x03\x33" + b"\x02013\x03\x31" + b"\x02012\x03\x30"
+    assert line.collisions == 0
+
+
 class Low:
     """A source of chance by which a low level always wins."""
 
@@ -654,13 +698,14 @@ def test_after_a_byte_without_a_stop_bit_the_next_start_bit_begins_a_byte() -> N
     assert heard[1][0] == pytest.approx(20 * bit)
 
 
-def test_all_devices_of_a_route_hear_a_frame_that_none_of_them_takes() -> None:
-    ears = [Ear(), Ear()]
-    for ear in ears:
+def test_all_devices_hear_a_frame_that_none_of_its_route_takes() -> None:
+    routed, others = [Ear(), Ear()], [Ear(), Ear()]
+    for ear in routed:
         ear.attentive = False
         ear.routes = (READ_2[:3],)
-    ask(line_of(*ears), hexed(READ_2))
-    assert [bytes(byte for _, byte in ear.heard) for ear in ears] == [READ_2, READ_2]
+    others[0].attentive = False
+    ask(line_of(*routed, *others), hexed(READ_2))
+    assert [bytes(byte for _, byte in ear.heard) for ear in (*routed, *others)] == [READ_2] * 4
 
 
 def test_a_device_sends_one_transmission_after_another_until_it_restarts() -> None:

@@ -380,6 +380,12 @@ def test_a_drive_has_the_same_acceleration_after_a_restart() -> None:
     assert drive.value(302, 7.0) == pytest.approx(100, abs=2)
 
 
+def test_the_feedback_of_a_lively_drive_has_a_ripple_unless_it_is_given_as_0() -> None:
+    assert [make_device(14, lively=lively).ripple for lively in (True, False)] == [0.01, 0.0]
+    assert make_device(14, lively=True, ripple=0.0).ripple == 0
+    assert make_device(14, lively=False, ripple=0.5).ripple == 0.5
+
+
 # Properties
 
 

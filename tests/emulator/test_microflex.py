@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -194,6 +195,57 @@ def test_it_reports_firmware_bus_voltage_and_a_temperature_that_rises_under_load
     assert AMBIENT < warm < read(line, 242, 100)
     write(line, 108, "0", 101)
     assert read(line, 242, 2000) == pytest.approx(AMBIENT, abs=0.01)
+
+
+def test_a_drive_has_the_acceleration_the_ripple_and_the_firmware_of_its_options() -> None:
+    drive = make_device(7, lively=False, acceleration=200.0, firmware=6000)
+    line = line_of(drive)
+    for now in (0.0, 20.0):  # and again after a restart
+        write(line, 108, "128", now)
+        write(line, 118, "100", now)
+        assert read(line, 120, now + 0.25) == pytest.approx(50, abs=2)
+        line.restart(drive, now + 10)
+    assert read(line, 239, 40) == 6000
+    assert make_device(7, lively=True).ripple == 0.01
+    assert make_device(7, lively=True, ripple=0.0).ripple == 0
+    assert make_device(7, lively=False).ripple == 0
+
+
+def test_a_drive_in_current_control_forgets_its_torque_reference_in_a_restart() -> None:
+    drive = EmulatedMicroFlex(7, current_control=True)
+    line = line_of(drive)
+    write(line, 116, "40", 0)
+    line.restart(drive, 1.0)
+    assert read(line, 116, 2) == 0
+    write(line, 108, "128", 3)
+    assert read(line, 120, 9) == 0
+
+
+def test_the_currents_of_the_phases_and_the_hall_sensors_turn_with_the_shaft() -> None:
+    """120 degrees lie between two phases, 60 between two codes; a turn has 4096 counts."""
+    seen = []
+    for twelfth in range(12):
+        drive = EmulatedMicroFlex(7, current_control=True)
+        drive.preset("116", 40)
+        drive.preset("108", 128)
+        drive.preset("100", 4096 / 12 * (twelfth + 0.5))
+        angle = math.radians(30 * twelfth + 15)
+        line = line_of(drive)
+        assert read(line, 128, 0.0) == pytest.approx(1.2 * math.sqrt(2) * math.sin(angle), abs=0.01)
+        assert read(line, 129, 0.0) == pytest.approx(1.2 * math.sqrt(2) * math.sin(angle - math.radians(120)), abs=0.01)
+        seen.append(round(read(line, 130, 0.0)))
+    assert seen == [code for code in (1, 3, 2, 6, 4, 5) for _ in range(2)]
+
+
+def test_the_demanded_position_is_ahead_of_the_measured_one_by_the_following_error(
+    drive: EmulatedMicroFlex, line: Line
+) -> None:
+    for now, speed, ahead in ((0.0, "50", 100), (10.0, "-50", -100)):
+        write(line, 108, "128", now)
+        write(line, 118, speed, now + 0.1)
+        position, error, demanded = (drive.read_element(element, now + 9) for element in (100, 107, 111))
+        assert error == ahead
+        assert demanded == pytest.approx((position or 0) + ahead, abs=1)
 
 
 def test_a_restart_disables_it_and_forgets_its_references(drive: EmulatedMicroFlex, line: Line) -> None:

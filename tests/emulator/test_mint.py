@@ -517,6 +517,29 @@ def test_a_controller_that_cannot_be_is_refused(options: dict[str, Any], reason:
     make_mint(HCP2, 1, lively=False, axes=2, program="command_handshake", statement=0.0001)
 
 
+def test_a_controller_of_a_file_has_all_of_its_options() -> None:
+    options: dict[str, Any] = {
+        "axes": 3,
+        "firmware": 6000,
+        "jogs_on_comms1": True,
+        "fixed_decimals": True,
+        "all_or_nothing": True,
+    }
+    mint = make_mint(HCP2, 1, lively=False, refuse_reserved=True, single_precision=True, **options)
+    line = line_of(mint)
+    assert value(ask(line, read(1, 239), 0.0)) == "6000.0000"
+    assert ask(line, read(1, 145), 1.0) == NAK, "there are three axes"
+    assert ask(line, write(1, 99, "7,8"), 2.0) == NAK
+    assert value(ask(line, read(1, 99), 3.0)) == "0.0000"
+    assert ask(line, write(1, 6, "16777217"), 4.0) == ACK
+    assert value(ask(line, read(1, 6), 5.0)) == "16777216.0000"
+    ask(line, write(1, 1, "-25"), 6.0)
+    assert value(ask(line, read(1, 101), 8.0)) == "-25.0000"
+    plain = line_of(make_mint(HCP2, 1, lively=False))
+    ask(plain, write(1, 1, "-25"))
+    assert value(ask(plain, read(1, 101), 2.0)) == "0"
+
+
 # The traceable
 
 

@@ -129,6 +129,13 @@ def test_it_says_nak_to_what_is_unsound_unknown_or_not_there(text: str, bytewise
     assert not any(controller.value(address) for address in range(0, 0x7FFC, 4))
 
 
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_it_has_as_many_data_addresses_as_are_given(step: int) -> None:
+    line = line_of(EmulatedMsc(1, addresses=100, address_step=step))
+    assert answer(line, request(1, "DREAD", 100 - step), 0.0).startswith(ACK)
+    assert answer(line, request(1, "DREAD", 101 - step), 20.0) == NAK
+
+
 @pytest.mark.parametrize(("model", "known"), [("MSC-250", True), ("MSC-850/32", True), ("MSC-850", False)])
 def test_only_two_models_know_rflags(model: str, known: bool) -> None:
     heard = answer(line_of(EmulatedMsc(1, model=model)), request(1, "RFLAGS"), 0.0)

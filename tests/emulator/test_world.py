@@ -10,12 +10,13 @@ import pytest
 from busmaster.arbiter.events import CameUnexpected, Event, LineChange, LineChanged, Polled
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.tap import Attempt
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.emulator.world import StuckWorldError, World
-from busmaster.errors import LineDown, NoReply
+from busmaster.errors import BacklogFull, LineDown, NoReply
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.emulator.lines import SETTINGS, TAU, hexed
@@ -49,6 +50,24 @@ def test_a_node_that_is_not_there_fails_after_its_attempts() -> None:
     assert isinstance(read.error, NoReply)
     assert read.attempts == 3
     assert world.now < IN_SYNC + (3 + 1) * 0.16  # a check behind the first (R15)
+
+
+def test_a_node_has_the_timings_and_the_retries_that_are_given() -> None:
+    world = world_of()
+    quick = Timings.uniform(ReplyTiming(0.01, 0.02, 0.03, 0.005))
+    read = world.request(world.node(hcp2.PROFILE, 2, timings=quick, retries=0), hcp2.Read(1))
+    assert world.run_until(lambda: read.ended_at > 0, 5.0)
+    assert read.attempts == 1
+    assert str(read.error).startswith("node 2: no reply within 30 ms, 1 attempt ")
+
+
+def test_a_world_begins_at_its_time_and_takes_as_many_requests_as_it_has_room_for() -> None:
+    world = World(Line(SETTINGS), now=100.0, capacity=1)
+    node = world.node(hcp2.PROFILE, 2)
+    reads = [world.request(node, hcp2.Read(1)) for _ in range(2)]
+    assert [type(read.error) for read in reads] == [type(None), BacklogFull]
+    world.run(100.5)
+    assert world.now == 100.5
 
 
 def test_a_reply_that_lies_in_an_adapter_is_waited_for_as_long_as_the_line_holds_bytes_back() -> None:

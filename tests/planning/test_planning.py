@@ -87,9 +87,10 @@ def test_a_lone_group_takes_its_line_time_and_misses_nothing() -> None:
 
 
 def test_groups_that_are_due_together_wait_for_each_other() -> None:
-    both = planned(group("a", 0.1, 5, phase=0.0), group("b", 0.2, 5, phase=0.0)).groups
-    assert both[0].longest_cycle == pytest.approx(5 * EXCHANGE)
-    assert both[1].longest_cycle == pytest.approx(10 * EXCHANGE)
+    quick, slow = group("a", 0.1, 5, phase=0.0), group("b", 0.2, 5, phase=0.0)
+    for groups in ((quick, slow), (slow, quick)):
+        longest = {one.name: one.longest_cycle for one in planned(*groups).groups}
+        assert longest == {"a": pytest.approx(5 * EXCHANGE), "b": pytest.approx(10 * EXCHANGE)}
 
 
 def test_the_group_that_misses_is_named_with_what_it_will_achieve() -> None:
@@ -304,6 +305,16 @@ def test_r9_each_step_can_last_its_max_reply_delay() -> None:
     assert three == pytest.approx(one + 2 * (step + tau))
 
 
+def test_r9_the_line_is_held_until_a_driver_releases_it_and_the_closing_bytes_have_left() -> None:
+    read = hcp2.Read(1)
+    slow = Timings.uniform(replace(hcp2.PROFILE.timings.read, driver_release_time=0.4))
+    assert longest_hold(read.open(1, slow), TAU) == pytest.approx(longest_hold(NODE.open(read), TAU) + 0.4)
+    closed, open_ = (msc.DataRead(2000).open(1, msc.PROFILE.timings) for _ in range(2))
+    open_.closing = 0
+    assert closed.closing == 1
+    assert longest_hold(closed, TAU) == pytest.approx(longest_hold(open_, TAU) + TAU)
+
+
 def test_r9_the_receive_latency_of_an_adapter_counts_once_a_step_and_in_every_silence() -> None:
     read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
     assert longest_hold(read, TAU, 0.016) == pytest.approx(longest_hold(read, TAU) + (1 + 25 + 1) * 0.016)
@@ -385,6 +396,39 @@ def test_r9_other_programs_and_their_sequences_lengthen_the_waits() -> None:
         assert waits == {priority: pytest.approx(expected.wait(priority)) for priority in Priority}
         assert waits[COMMAND] > alone.worst_waits[COMMAND]
     assert planned(group("a", 0.5, 4), sharing=Sharing()).worst_waits == alone.worst_waits
+
+
+def test_r9_the_receive_latency_of_an_adapter_counts_in_every_wait() -> None:
+    read = hcp2.Read(1)
+    slow = planned(group("a", 0.5, 4), receive_latency=0.016)
+    bound = bounds([(NODE, read)], TAU, 0.016, polls=4)
+    assert bound.urgent_hold == longest_hold(NODE.open(read), TAU, 0.016)
+    assert slow.worst_waits == {priority: pytest.approx(bound.wait(priority)) for priority in Priority}
+
+
+def test_r9_the_bounds_of_a_shared_line_are_those_of_its_plan() -> None:
+    bound = bounds([(NODE, hcp2.Read(1))], TAU, polls=4, sharing=Sharing(2, 0.7))
+    assert (bound.clients, bound.held) == (2, 0.7)
+    shared = planned(group("a", 0.5, 4), sharing=Sharing(2, 0.7))
+    assert shared.worst_waits == {priority: pytest.approx(bound.wait(priority)) for priority in Priority}
+
+
+def test_r9_each_other_program_goes_before_a_request_twice() -> None:
+    """With two others, each request waits for five in place of one."""
+    shared = Bounds(hold=1.0, urgent_hold=0.5, polls=10, clients=2)
+    assert [shared.wait(URGENT, ahead=n) for n in (0, 1)] == [0.5 * (1 + 4 * 4), 0.5 * (1 + 4 * 9)]
+    assert [shared.wait(COMMAND, ahead=n) for n in (0, 1)] == [1 + 4 * (4 + 1) + 3, 1 + 4 * (9 + 2) + 3]
+    assert shared.wait(POLL, patience=0.25) == 0.25 + 4 * 8 * 50
+    held = replace(shared, held=0.5, background=3)
+    assert held.wait(URGENT) == shared.wait(URGENT)
+    assert held.wait(COMMAND) == 1.5 * (1 + 4 * (4 + 5) + 3)
+    assert held.wait(POLL, patience=0.25) == 0.25 + 4 * 16 * 50 * 1.5
+    assert held.wait(BACKGROUND, patience=2.0) == 2.0 + 4 * 16 * 15 * 1.5
+
+
+def test_r9_a_poll_has_a_bound_also_where_none_is_counted() -> None:
+    assert Bounds(hold=1.0, urgent_hold=1.0).wait(POLL) == 1.0 + 4 * 8
+    assert Bounds(hold=1.0, urgent_hold=1.0).wait(BACKGROUND, patience=0.0) == 4 * 16
 
 
 def test_r9_while_the_line_is_held_each_command_may_wait_for_one_of_a_lower_class() -> None:

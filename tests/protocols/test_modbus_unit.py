@@ -11,7 +11,7 @@ import pytest
 
 from busmaster.capture.decode import Decoder
 from busmaster.contract.frames import Kind
-from busmaster.emulator.traceable import TraceableMemory
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.modbus.codec import PROFILE, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus, make_device
@@ -66,7 +66,9 @@ def test_damaged_requests_are_not_answered(bits: tuple[int, int]) -> None:
         ("11 05 03e8 ff00", "11 85 02"),
         ("11 06 03e8 0000", "11 86 02"),
         ("11 0f 0000 0009 01 ff", "11 8f 03"),
+        ("11 0f 0000 0000 00", "11 8f 03"),
         ("11 10 0000 0002 02 0001", "11 90 03"),
+        ("11 10 0000 0000 00", "11 90 03"),
         ("11 10 03e7 0002 04 0001 0002", "11 90 02"),
     ],
 )
@@ -117,6 +119,24 @@ def test_each_function_has_its_own_table(request_: str, answer: str) -> None:
         assert unit.coils[2:5] == [False, False, True]
     if request_.startswith("11 0f"):
         assert unit.coils[2:6] == [False, True, False, False]
+
+
+@pytest.mark.parametrize("function", ["01", "02", "03", "04"])
+def test_each_table_has_the_size_that_is_given(function: str) -> None:
+    unit = make_device(UNIT, size=7)
+    [last, beyond] = heard_by(unit, (0.0, frame(f"11 {function} 0006 0001")), (1.0, frame(f"11 {function} 0007 0001")))
+    assert last[:2] == bytes.fromhex(f"11 {function}")
+    assert beyond == frame(f"11 8{function[1]} 02")
+
+
+def test_with_an_oracle_each_register_tells_its_place_and_its_writes() -> None:
+    traceable = TraceableMemory(UNIT, 2**16)
+    unit = EmulatedModbus(UNIT, traceable=traceable)
+    sent = [traceable_value(UNIT, place, 0, 2**16) for place in (2, 3)]
+    heard_by(unit, (0.0, WriteRegisters(2, tuple(sent)).open(UNIT, PROFILE.timings).request))
+    assert (dict(traceable.writes), traceable.foreign_writes) == ({2: 1, 3: 1}, 0)
+    data = b"".join(traceable_value(UNIT, place, int(place < 4), 2**16).to_bytes(2, "big") for place in (2, 3, 4))
+    assert heard_by(unit, (1.0, frame("11 03 0002 0003")))[-1] == frame(f"11 03 06 {data.hex()}")
 
 
 @pytest.mark.parametrize(("request_", "size"), [("11 03 0000 007d", 250), ("11 01 0000 03e8", 125)])
@@ -270,6 +290,29 @@ def test_a_listener_tells_requests_from_replies() -> None:
         "host 0 write holding:1 = 3",
         "host 0 write holding:1 = 3",
     ]
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply", "heard"),
+    [
+        ("11 01 0013 000a", "11 01 02 cd 01", ("read coil:19:10", "coil:19:10 = 1,0,1,1,0,0,1,1,1,0")),
+        ("11 02 00c4 0003", "11 02 01 05", ("read discrete:196:3", "discrete:196:3 = 1,0,1")),
+        ("11 02 00c4 0001", "11 02 01 01", ("read discrete:196", "discrete:196 = 1")),
+        (
+            "11 02 0000 0009",
+            "11 02 01 05",
+            ("read discrete:0:9", "discrete:0:9 = 1,0,1,0,0,0,0,0,0 [1 bytes of data, not 2]"),
+        ),
+        ("11 04 0008 0002", "11 04 04 000a ffff", ("read input:8:2", "input:8:2 = 10,65535")),
+        ("11 05 00ac ff00", "11 05 00ac ff00", ("write coil:172 = 1", "ACK")),
+        ("11 05 00ac 0000", "11 05 00ac 0000", ("write coil:172 = 0", "ACK")),
+        ("11 10 0001 0002 04 000a 0102", "11 10 0001 0002", ("write holding:1:2 = 10,258", "ACK")),
+    ],
+)
+def test_a_listener_reads_each_function(request_: str, reply: str, heard: tuple[str, str]) -> None:
+    decoder = Decoder(find("modbus").protocol.dialect())
+    frames = [*decoder.feed(frame(request_), 0.0, HOST), *decoder.feed(frame(reply), 0.01, NODE)]
+    assert said(frames) == [f"host 17 {heard[0]}", f"node 17 {heard[1]}"]
 
 
 def test_a_listener_says_what_is_wrong_with_a_frame() -> None:

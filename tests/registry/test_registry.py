@@ -173,6 +173,14 @@ def test_what_was_written_down_is_checked_again(written: dict[str, object], comp
         find("hcp").protocol.read_back(written)
 
 
+def test_each_option_of_a_command_is_true_or_false() -> None:
+    protocol = find("mentor").protocol
+    written = protocol.write_down(mentor.Write(1, 17, 5))
+    for name in ("high_resolution", "wide", "idempotent"):
+        with pytest.raises(InvalidCommand, match=f"mentor: write: {name} is true or false, not 1"):
+            protocol.read_back({**written, name: 1})
+
+
 TEXTS = st.text(max_size=5) | st.sampled_from(["holding", "coil", "1", "a"])
 SCALARS = st.none() | st.booleans() | st.integers(-3, 300) | st.integers() | st.floats() | TEXTS
 VALUES = st.recursive(SCALARS, lambda some: st.lists(some, max_size=33) | st.dictionaries(TEXTS, some, max_size=2))

@@ -6,7 +6,7 @@ import asyncio
 import json
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +15,10 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, NoReply
+from busmaster import Bus, Hcp2Controller, MemoryPort, MentorDrive, NoReply
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.node import Node
-from busmaster.contract.profile import Profile
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Echo, Line
 from busmaster.errors import InvalidCommand
@@ -179,9 +179,28 @@ def test_an_open_bus_is_measured_by_its_own_handles() -> None:
             return await measure(bus, handles, Workload(seconds=2, items=("1",)))
 
     report = run_in_virtual_time(main())
+    assert report.line == {"protocol": "hcp2", "port": "the emulated line", "baudrate": 57600, "framing": "8N1"}
     assert list(report.nodes) == ["3", "4"]
     assert report.share == pytest.approx(1, abs=0.02), "the reply delay is observed, not known"
-    assert "virtual" not in report.line
+
+
+def test_an_item_that_is_named_and_refused_is_an_error_and_not_left_out() -> None:
+    async def main() -> BenchReport:
+        device = EmulatedMint(3, axes=0, refuse_reserved=True)
+        async with Bus(MemoryPort(Line(find("hcp2").profile.line, [device]))) as bus:
+            return await measure(bus, [Hcp2Controller(bus, 3)], Workload(seconds=1, items=("1", "105")))
+
+    report = run_in_virtual_time(main())
+    assert set(report.errors) == {"Refused"}
+    assert report.values > 0
+
+
+def test_callers_with_a_period_begin_spread_over_it() -> None:
+    """Of four at once, three would wait for the others."""
+    report = bench("hcp2", range(1, 5), virtual=True, seconds=2, every=0.2)
+    assert report.total.count == 40
+    assert report.total.figures["max"] == pytest.approx(report.total.figures["p50"], rel=0.3)
+    assert sorted(round(at % 0.2, 2) for at, _, _ in report.samples[::10]) == [0.0, 0.05, 0.1, 0.15]
 
 
 def test_the_bytes_of_the_echo_take_no_further_time_on_the_wire() -> None:
@@ -213,6 +232,20 @@ def test_a_real_pseudo_terminal_is_served_by_another_process() -> None:
     assert report.line["virtual"] is False
 
 
+def test_the_port_of_a_pseudo_terminal_has_all_settings_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Other(EmulatedLine):
+        def settings(self) -> LineSettings:
+            return LineSettings(4800, 7, "O", 2)
+
+    monkeypatch.setattr("busmaster.testing.bench.in_own_process", lambda line: nullcontext("/dev/pts/99"))
+    with (
+        pytest.warns(UserWarning, match="mentor is meant for 7E1, but /dev/pts/99 is 7O2"),
+        emulated(Other("mentor", (11,)), Workload(), handle=MentorDrive) as measurement,
+    ):
+        assert measurement.bus.endpoint.settings == LineSettings(4800, 7, "O", 2)
+        assert measurement.bus.endpoint.name == "/dev/pts/99"
+
+
 # reads alone
 
 
@@ -221,6 +254,17 @@ def test_a_command_that_writes_is_refused() -> None:
     handle: Any = SimpleNamespace(node=SimpleNamespace(profile=profile, label="node 1"))
     with pytest.raises(InvalidCommand, match=r"node 1: .* is a write, and a bench only reads"):
         reads_of(handle)
+
+
+def test_all_items_that_are_named_are_read_and_of_the_profiles_own_reads_four_at_most() -> None:
+    async def reads(*items: str) -> list[Any]:
+        axis = Hcp2Controller(Bus(MemoryPort(Line(find("hcp2").profile.line))), 1)
+        axis.use_sync_reads(probe="1", sync_reads=[str(element) for element in range(2, 9)])
+        return list(reads_of(axis, items))
+
+    assert run_in_virtual_time(reads()) == [Read(1), Read(2), Read(3), Read(4)]
+    several = [str(element) for element in range(9, 15)]
+    assert run_in_virtual_time(reads(*several, "9")) == [Read(element) for element in range(9, 15)]
 
 
 @pytest.mark.parametrize("name", kinds())
@@ -261,6 +305,15 @@ def test_a_bench_that_cannot_be_is_refused(arguments: dict[str, Any], complaint:
     nodes = arguments.pop("nodes", [1])
     with pytest.raises(InvalidCommand, match=complaint):
         bench("hcp2", nodes, virtual=True, **arguments)
+
+
+def test_a_workload_at_its_bounds_is_accepted_and_a_share_below_0_is_not() -> None:
+    for callers in (0, 1000):
+        assert Workload(seconds=3600, callers=callers).callers == callers
+    with pytest.raises(InvalidCommand, match=r"more than 0 s, and 3600 s at most, not 3600\.1 s"):
+        Workload(seconds=3600.1)
+    with pytest.raises(InvalidCommand, match="each share of a priority is 0 or more"):
+        Workload(priorities={Priority.COMMAND: 2, Priority.URGENT: -1})
 
 
 def test_shares_of_priorities_are_read() -> None:
@@ -343,6 +396,17 @@ def test_a_report_is_the_same_after_json() -> None:
     assert again.samples == ()
 
 
+def test_every_field_of_a_report_is_in_its_json() -> None:
+    times = iter(Times.of([0.01 * number, 0.5]) for number in range(1, 20))
+    report = BenchReport(
+        {"port": "COM1"}, {"nodes": [5]}, 2.0, 7, 30.0, 0.25, next(times), {"5": next(times)}, {"urgent": next(times)},
+        {"position": next(times)}, next(times), 3, {"NoReply": 2, "Refused": 1}, ((0.1, 4), (0.2, 3)),
+    )  # fmt: skip
+    again = BenchReport.from_json(report.to_json())
+    assert again == report
+    assert json.loads(report.to_json())["rate"] == report.rate == 3.5
+
+
 def test_a_report_from_json_is_plotted_with_the_counts_of_its_histogram(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -367,6 +431,13 @@ def test_a_report_from_json_is_plotted_with_the_counts_of_its_histogram(
     for bar in whole.axes[0].patches:
         tops[bar.get_x()] = max(tops.get(bar.get_x(), 0), bar.get_y() + bar.get_height())
     assert dict(bars) == tops
+    for panel in (whole.axes[0], counts.axes[0]):
+        marks = {line.get_label(): line.get_xdata()[0] for line in panel.lines}
+        assert [label.partition(" ")[0] for label in marks] == ["p50", "p99", "max"]
+        assert list(marks.values()) == [1000 * report.total.figures[name] for name in ("p50", "p99", "max")]
+    [course] = whole.axes[1].lines
+    assert [tuple(dot) for dot in course.get_xydata()] == [(at, 1000 * latency) for at, latency, _ in report.samples]
+    assert course.get_label() == "command"
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"layout": 2}', '{"layout": 1}', "\xff"])
@@ -412,6 +483,24 @@ def test_a_node_that_refuses_some_reads_is_measured_by_the_others_and_one_that_r
     assert some.errors == {}
     assert some.values > 50
     assert (set(every.errors), every.values) == ({"Refused"}, 0)
+
+
+def test_a_measurement_that_fails_leaves_the_bus_as_it_was() -> None:
+    async def application(bus: Bus, timed: Stopwatch) -> None:
+        await asyncio.sleep(0.5)
+        raise ZeroDivisionError
+
+    async def main() -> float:
+        async with Bus(MemoryPort(Line(find("hcp2").profile.line, [make_device("hcp2", 3)]))) as bus:
+            axis = Hcp2Controller(bus, 3)
+            measurement = Measurement(bus, [axis], Workload(seconds=1, period=0.1), application=application)
+            with pytest.raises(ZeroDivisionError):
+                await measurement.run_open()
+            assert (bus.groups, bus._pump.tap) == ((), None)
+            await asyncio.sleep(5.0)
+            return measurement.report().elapsed
+
+    assert run_in_virtual_time(main()) == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_measurement_leaves_the_bus_as_it_was() -> None:
@@ -537,6 +626,8 @@ def test_a_plot_that_cannot_be_written_is_refused_before_anything_is_measured(tm
         check_plot("latency.txt")
     with pytest.raises(InvalidCommand, match="there is no folder"):
         check_plot(str(tmp_path / "nowhere" / "latency.png"))
+    with pytest.raises(InvalidCommand, match="no plot has the suffix 'txt'"):
+        plot(bench("hcp2", [1], virtual=True, seconds=0.1), str(tmp_path / "latency.txt"))
 
 
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,14 @@ class FindsFaultWithRequests(HcpDialect):
         return frame
 
 
+class FindsFaultWithReplies(HcpDialect):
+    def explain(self, raw: bytes, sender: Direction, /) -> Frame:
+        frame = super().explain(raw, sender)
+        if frame.answers:
+            frame.fault = "bad checksum"
+        return frame
+
+
 class ReadsTheNextNode(HcpDialect):
     def node(self, field: bytes) -> int | None:
         return (super().node(field) or 0) + 1
@@ -106,6 +114,7 @@ def test_a_dialect_that_reads_rightly_passes() -> None:
         (SwallowsWhatFollowsNoise, "after noise it is"),
         (TakesWritesForReads, "not a write of the host"),
         (FindsFaultWithRequests, "[bad checksum], not a read of the host"),
+        (FindsFaultWithReplies, "[bad checksum], which does not end the request"),
         (ReadsTheNextNode, "its request is decoded as one to 3"),
         (SpeaksOfTheNextElement, "is decoded as read element 2, which sends"),
         (SpeaksOfNothing, "gives no command"),

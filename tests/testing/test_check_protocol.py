@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import count
 from typing import Any, ClassVar
 
@@ -125,6 +125,32 @@ class SearchingForItsUnit(Asking):
         return super().feed(data)
 
 
+class CheckingOneChunkAlone(Asking):
+    """A reply in several chunks is accepted whatever its CRC."""
+
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        self.chunks = getattr(self, "chunks", 0) + 1
+        return super().feed(data)
+
+    def sound(self, frame: bytes) -> bool:
+        return self.chunks > 1 or super().sound(frame)
+
+
+class RefusedByAForeignByte(Asking):
+    """A NAK, which is not in `starts`, ends it like an exception."""
+
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        if not self.buffer and data == b"\x15":
+            raise Refused
+        return super().feed(data)
+
+
+class CrashingAtAnEmptyChunk(Asking):
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        self.first = data[0]
+        return super().feed(data)
+
+
 class BeginningElsewhere(Asking):
     def __init__(self, request: bytes, timing: ReplyTiming) -> None:
         super().__init__(request, timing)
@@ -189,6 +215,9 @@ class NumberingItsRequests(Asking):
         (AskingForEver, "Endless"),
         (TurningForEver, "Endless"),
         (SearchingForItsUnit, "00, which is not in starts, and then the reply gives the value 555"),
+        (CheckingOneChunkAlone, "11 03 02 03 2b 38 f8 in place of 11 03 02 02 2b 38 f8 gives the value 811"),
+        (RefusedByAForeignByte, r"15, which is not in starts, and then the reply gives Refused"),
+        (CrashingAtAnEmptyChunk, "IndexError"),
         (BeginningElsewhere, "its reply begins with 11, which is not in starts"),
         (SmallerThanItSays, "a step of 7 bytes is longer than the 5 announced"),
         (SizedBackwards, "typically 9 and at most 8 bytes"),
@@ -302,6 +331,33 @@ def test_a_bug_in_a_command_is_found(command: Command[Any], finding: str) -> Non
     assert re.search(finding, find(replace(READING, command=command), names=lambda command, address: None))
 
 
+@dataclass(slots=True, unsafe_hash=True)
+class OfRegister:
+    register: int
+
+
+class Changeable(OfRegister):
+    """A command like a value, but its register can be changed."""
+
+    __slots__ = ()
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __str__(self) -> str:
+        return f"read register {self.register}"
+
+    def open(self, address: int, timings: Timings, /) -> Asking:
+        return ReadRegister(self.register).open(address, timings)
+
+
+def test_a_command_of_which_a_field_can_be_changed_is_found_and_stays_as_it_is() -> None:
+    case = replace(READING, command=Changeable(7))
+    with pytest.raises(NotConformant) as found:
+        check_protocol(MODBUS, [case])
+    assert found.value.findings == ("Changeable.register can be changed: make it a frozen dataclass with slots",)
+    assert case.command == Changeable(7)
+
+
 def refuse_all() -> None:
     raise ValueError("not an InvalidCommand")
 
@@ -352,6 +408,29 @@ def test_bugs_in_a_listener_are_found() -> None:
     findings = find(READING, profile=replace(MODBUS, listen=DeafListener))
     assert "the listener raises KeyError" in findings
     assert "the listener has no end" in find(READING, profile=replace(MODBUS, listen=EndlessListener))
+
+
+class Noting(EndlessListener):
+    """Notes what it hears."""
+
+    heard: ClassVar[list[bytes]] = []
+
+    def feed(self, data: bytes, /) -> Done[None]:
+        self.heard.append(data)
+        return Done(None)
+
+    def expired(self) -> Done[None]:
+        return Done(None)
+
+
+def test_the_garbage_is_as_much_as_is_wanted_and_of_the_seed_that_is_wanted() -> None:
+    def garbage(seed: int) -> list[bytes]:
+        Noting.heard.clear()
+        tally = check_protocol(replace(MODBUS, listen=Noting), [READING], garbage=7, seed=seed)
+        assert tally["garbage"] == 7
+        return Noting.heard.copy()
+
+    assert garbage(1) == garbage(1) != garbage(2)
 
 
 # round trips
@@ -443,6 +522,30 @@ def test_the_device_hears_each_further_step_of_the_host() -> None:
     check_protocol(MODBUS, CASES, names=named, round_trips=[trip], device=device)
     write, read = checked(17, 6, 0, 7, 0, 3), checked(17, 3, 0, 7, 0, 1)
     assert heard == [write, write, write, read]
+
+
+class Closing(Asking):
+    """A read that the host closes with an ACK."""
+
+    closing = 1
+
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        progress = super().feed(data)
+        return Done(progress.value, send=b"\x06", rest=progress.rest) if isinstance(progress, Done) else progress
+
+
+def test_the_device_hears_what_closes_an_exchange() -> None:
+    heard: list[bytes] = []
+    answers = answers_of(Registers(17))
+
+    def device(sent: bytes) -> bytes:
+        heard.append(sent)
+        return answers(sent) if sent != b"\x06" else b""
+
+    trip = RoundTrip(17, lambda value: WriteRegister(7, value), ReadRegister(7, Closing), [3, 4])
+    check_protocol(MODBUS, [READING], round_trips=[trip], device=device)
+    read = checked(17, 3, 0, 7, 0, 1)
+    assert heard == [checked(17, 6, 0, 7, 0, 3), read, b"\x06", checked(17, 6, 0, 7, 0, 4), read, b"\x06"]
 
 
 def test_a_device_that_does_not_answer_is_found() -> None:
