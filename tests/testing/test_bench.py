@@ -238,10 +238,9 @@ def test_the_port_of_a_pseudo_terminal_has_all_settings_of_the_line(monkeypatch:
             return LineSettings(4800, 7, "O", 2)
 
     monkeypatch.setattr("busmaster.testing.bench.in_own_process", lambda line: nullcontext("/dev/pts/99"))
-    with (
-        pytest.warns(UserWarning, match="mentor is meant for 7E1, but /dev/pts/99 is 7O2"),
-        emulated(Other("mentor", (11,)), Workload(), handle=MentorDrive) as measurement,
-    ):
+    with ExitStack() as stack:
+        with pytest.warns(UserWarning, match="mentor is meant for 7E1, but /dev/pts/99 is 7O2"):
+            measurement = stack.enter_context(emulated(Other("mentor", (11,)), Workload(), handle=MentorDrive))
         assert measurement.bus.endpoint.settings == LineSettings(4800, 7, "O", 2)
         assert measurement.bus.endpoint.name == "/dev/pts/99"
 
