@@ -593,7 +593,8 @@ class Screen(App[int]):
         groups = self._chosen(all_groups)
         paused = not all(group.paused for group in groups)
         for group in groups:
-            self._start_request(f"pause {group.name}", partial(self.line.pause, group.name, paused))
+            what = f"{'pause' if paused else 'resume'} {group.name}"
+            self._start_request(what, partial(self.line.pause, group.name, paused))
 
     def action_demand(self, all_groups: bool) -> None:
         """Poll the row's group, or all groups, now."""

@@ -383,6 +383,22 @@ def test_without_a_terminal_nothing_is_offered(capfd: pytest.CaptureFixture[str]
     assert capfd.readouterr().err == ""
 
 
+def test_the_port_of_a_search_is_opened_with_its_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
+    requested: list[tuple[object, ...]] = []
+
+    @asynccontextmanager
+    async def noted(*arguments: object) -> AsyncIterator[None]:
+        requested.append(arguments)
+        yield None
+
+    monkeypatch.setattr(discover, "opened", noted)
+    monkeypatch.setattr(discover, "Search", FakeSearch)
+    port = SerialPort("COM1", baudrate=9600)
+    recorder: Any = object()
+    asyncio.run(discover.discover(Job(port, []), recorder))
+    assert requested == [(port, recorder)]
+
+
 def test_the_search_can_be_stopped_by_enter(monkeypatch: pytest.MonkeyPatch) -> None:
     searches: list[FakeSearch] = []
 

@@ -208,6 +208,21 @@ def test_limits_hold_for_an_action_and_not_for_a_stop(busmaster: Command, file: 
     assert [row[-1] for row in audit(file)] == ["written", "refused", "refused", "written"]
 
 
+def test_advice_for_a_late_reply_is_a_key_only_for_a_node_of_a_file(
+    busmaster: Command, file: Path, drive: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requested: list[bool] = []
+
+    def late_nodes(_: object, *, in_file: bool = False) -> None:
+        requested.append(in_file)
+        raise click.UsageError("that is enough")
+
+    monkeypatch.setattr("busmaster.app.cli.do.late_nodes", late_nodes)
+    for node in (("do", f"drive@{file}", "enable"), ("do", f"7@{drive.path}", "enable", *MICROFLEX)):
+        assert "that is enough" in busmaster(*node).err
+    assert requested == [True, False]
+
+
 def test_an_action_that_fails_is_on_record(busmaster: Command, file: Path, drive: TcpServer) -> None:
     drive.call(lambda line, now: line.cut(now, line.device(7)))
     file.write_text(file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05"))

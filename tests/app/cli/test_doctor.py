@@ -16,7 +16,7 @@ import sys
 import termios
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -33,7 +33,6 @@ from busmaster.app.diagnostics import adapters, diagnosis, examination
 from busmaster.app.diagnostics.adapters import Finding
 from busmaster.app.diagnostics.examination import HARMLESS, Patient, examine, other_settings
 from busmaster.app.diagnostics.probing import Outcome, Prober, opened
-from busmaster.arbiter.counters import Mark
 from busmaster.capture.pcapng import read_packets
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt, Tap
@@ -42,6 +41,8 @@ from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
+from busmaster.errors import LineDown
+from busmaster.ext import Mark
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
@@ -361,6 +362,58 @@ def test_a_named_node_that_is_not_there_is_named_and_the_others_are_measured() -
     assert findings.on("node 9").what == "does not reply"
 
 
+@dataclass(frozen=True)
+class Damaged(MemoryPort):
+    """A port that marks errors at these times."""
+
+    marks: tuple[tuple[float, Mark], ...] = ()
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
+    ) -> MemoryTransport:
+        wire: Any = protocol_factory()
+        for at, mark in self.marks:
+            asyncio.get_running_loop().call_later(at, wire.byte_marked, b"", mark)
+        return await MemoryPort.open(self, lambda: wire, only)
+
+
+def test_damaged_bytes_are_reported_unless_the_opening_of_the_port_has_caused_them() -> None:
+    opening, asking = examination.OPENING / 2, examination.OPENING + examination.LISTENING + 0.01
+    line = line_of("hcp2", [hcp2(1)])
+    clicks = tuple((opening, mark) for mark in (Mark.DAMAGED, Mark.BREAK))
+    assert examined(line, (1,), port=Damaged(line, clicks)).wrong == set()
+    marks = tuple((asking, mark) for mark in (Mark.DAMAGED, Mark.DAMAGED, Mark.BREAK))
+    findings = examined(line, (1,), port=Damaged(line, marks))
+    assert [one.what for one in findings if one.topic == "uart"] == ["2 parity or framing errors", "1 break"]
+
+
+class Courses:
+    """The courses of an examination, each with the number of its steps and how many of these were shown."""
+
+    def __init__(self) -> None:
+        self.shown: dict[str, list[int]] = {}
+
+    @contextlib.contextmanager
+    def __call__(self, label: str, steps: int) -> Iterator[Courses]:
+        self.shown[label] = [steps, 0]
+        yield self
+
+    def advance(self) -> None:
+        [*_, last] = self.shown.values()
+        last[1] += 1
+
+
+def test_an_examination_shows_how_far_it_is() -> None:
+    for nodes, shown in (
+        ((2, 3), {"asking": [3, 3], "measuring": [2 * examination.PROBES] * 2}),
+        ((), {"asking": [3, 3], "measuring": [0, 0], "trying rates": [20, 20]}),
+    ):
+        courses = Courses()
+        port = MemoryPort(line_of("hcp2", [hcp2(node) for node in nodes]))
+        run_in_virtual_time(examine(Patient(port, "hcp2", addresses=(1, 2, 3), progress=courses), lambda _: None))
+        assert courses.shown == shown
+
+
 def test_a_port_that_floods_is_examined_all_the_same(busmaster: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=flood, args=(server,), daemon=True)
@@ -648,6 +701,15 @@ def test_a_wrong_rate_is_found_and_the_port_is_left_as_it_was(busmaster: Command
 
 
 @pytest.mark.usefixtures("hasty")
+def test_no_other_rate_is_tried_on_a_pseudo_terminal(busmaster: Command) -> None:
+    with serve_pty(line_of("hcp2", [], paced=False)) as server:
+        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "50")
+    assert "no reply from node 1" in done.out
+    assert "a pseudo-terminal has no baud rate: no other was tried\n" in done.out
+    assert "other settings either" not in done.out
+
+
+@pytest.mark.usefixtures("hasty")
 def test_where_no_rate_helps_it_is_said_what_was_tried(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(examination, "RATES", (9600, 19200))
     monkeypatch.setattr(examination, "FRAMINGS", ())
@@ -694,6 +756,31 @@ def test_a_node_at_other_settings_is_found_at_any_of_the_first_addresses(setting
     assert findings.on("nodes").what == "no reply from nodes 1, 2, 4, 5 at 57600 8N1"
     assert findings.on("settings").what == f"nodes 1, 2, 4, 5: node 4 replies at {diagnosis.speed(settings)}"
     assert line.host == LineSettings(57600), "the settings of the port are as they were"
+
+
+@dataclass(frozen=True)
+class Choosy(Tunable):
+    """A port that does not take 9600 baud, the first of the other rates."""
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
+    ) -> MemoryTransport:
+        transport = await Tunable.open(self, protocol_factory, only)
+        tune = transport.tune
+
+        async def choose(settings: LineSettings) -> None:
+            if settings.baudrate == 9600:
+                raise LineDown("9600 baud: invalid argument", hint="")
+            await tune(settings)
+
+        transport.tune = choose  # type: ignore[method-assign]  # of this one
+        return transport
+
+
+def test_after_settings_that_the_port_does_not_take_the_next_are_tried() -> None:
+    line = Line(LineSettings(19200), [hcp2(4)], chance=random.Random(1))
+    findings = examined(line, (4,), port=Choosy(line))
+    assert findings.on("settings").what == "node 4: node 4 replies at 19200 8N1"
 
 
 def test_no_more_than_some_nodes_are_tried_at_each_of_the_other_settings() -> None:

@@ -29,18 +29,25 @@ class Wishes:
 
     def __init__(self) -> None:
         self.said: list[tuple[Any, ...]] = []
+        self.asked: set[tuple[str, str]] = set()
+        """The points whose details were requested."""
         self.error: Exception | None = None
 
     async def pause(self, group: str, paused: bool, /) -> None:
         self.said.append(("pause", group, paused))
+        if self.error is not None:
+            raise self.error
 
     async def demand(self, group: str, /) -> None:
         self.said.append(("demand", group))
+        if self.error is not None:
+            raise self.error
 
     async def suspend(self, protocol: str, address: int, for_: float, /) -> None:
         self.said.append(("suspend", protocol, address, for_))
 
     async def details(self, group: str, key: str, /) -> Mapping[str, Any]:
+        self.asked.add((group, key))
         timeline = {"queued": 1.0, "started": 1.004, "first_byte": 1.009, "last_byte": 1.012, "attempts": 1}
         limit = {"name": "outputs", "minimum": 0, "maximum": 7, "max_step": None, "writable": True}
         told = {"command": "read element 10", "hint": "", "low": None, "high": 5.5, "limits": [limit]}
@@ -177,6 +184,15 @@ async def test_a_click_selects_the_row_under_it_wherever_the_table_is_scrolled_t
             assert screen.table.selected.name.split() == second[:3]
 
 
+@pytest.mark.asyncio
+async def test_the_selected_row_stays_in_sight_when_the_terminal_becomes_smaller() -> None:
+    async with drawn(tell(Picture(), *(row(number) for number in range(1, 31))), (80, 40)) as (screen, _, pilot):
+        await pilot.press("end")
+        await pilot.resize_terminal(60, 20)
+        await pilot.pause()
+        assert table(screen)[-1][1] == "30"
+
+
 @pytest.mark.slow
 @pytest.mark.asyncio
 async def test_keys_move_the_selection_by_a_row_a_page_or_to_an_end() -> None:
@@ -292,6 +308,14 @@ async def test_o_orders_rows_by_node_item_age_and_trouble_in_turn(presses: int, 
 
 
 @pytest.mark.asyncio
+async def test_a_point_that_was_never_requested_counts_as_the_oldest() -> None:
+    async with drawn(tell(Picture(), row(1), row(2, asked=None), row(3, asked=1040.0))) as (screen, _, pilot):
+        await pilot.press("o", "o")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["2", "3", "1"]
+
+
+@pytest.mark.asyncio
 async def test_trouble_is_first_an_error_then_a_node_that_is_not_up_then_an_alarm_then_a_quality() -> None:
     rows = (
         row(1),
@@ -400,6 +424,15 @@ async def test_many_groups_leave_room_for_the_points_and_that_of_the_row_is_show
 
 
 @pytest.mark.asyncio
+async def test_groups_that_fit_are_shown_all() -> None:
+    groups = tuple({**GROUP, "name": f"group{number}"} for number in range(3))
+    async with drawn(tell(Picture(), row(group="group2"), groups=groups), (80, 24)) as (screen, _, _):
+        shown = lines(screen)
+    assert [line.split()[0] for line in shown[2:5]] == ["group0", "group1", "group2"]
+    assert "more groups" not in "".join(shown)
+
+
+@pytest.mark.asyncio
 async def test_keys_pause_poll_and_suspend_what_is_selected_or_all() -> None:
     groups = (GROUP, {**GROUP, "name": "slow", "paused": True})
     nodes = (node(5), node(6, "suspended"))
@@ -428,6 +461,17 @@ async def test_all_groups_are_paused_unless_all_are_and_only_then_resumed() -> N
             await pilot.press("P")
             await pilot.pause()
         assert line.said == [("pause", "axes", wanted), ("pause", "slow", wanted)]
+
+
+@pytest.mark.asyncio
+async def test_a_command_that_fails_is_named_with_its_group_and_why() -> None:
+    groups = (GROUP, {**GROUP, "name": "slow", "paused": True})
+    async with drawn(tell(Picture(), row(), row(6, group="slow"), groups=groups), (80, 24)) as (screen, line, pilot):
+        line.error = InvalidCommand("this role may only read")
+        for keys, what in ((("p",), "pause axes"), (("d",), "poll axes"), (("down", "p"), "resume slow")):
+            await pilot.press(*keys)
+            await pilot.pause()
+            assert f" {what}: this role may only read" in "\n".join(lines(screen))
 
 
 @pytest.mark.asyncio
@@ -599,6 +643,26 @@ async def test_details_follow_the_value_and_say_that_a_point_is_gone(
 
 
 @pytest.mark.asyncio
+async def test_details_of_a_point_that_has_left_the_picture_are_those_known_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with drawn(tell(Picture(), row(value=3))) as (screen, line, pilot):
+
+        async def gone(group: str, key: str, /) -> Mapping[str, Any]:
+            tell(screen.picture, row(6), set=2)
+            raise InvalidCommand("no point 5/outputs")
+
+        monkeypatch.setattr(line, "details", gone)
+        await pilot.press("enter")
+        shown = ""
+        while "no point 5/outputs" not in shown:
+            assert any(worker.is_running for worker in screen.workers)
+            await pilot.pause()
+            shown = "\n".join(lines(screen))
+        assert "value    3" in shown
+
+
+@pytest.mark.asyncio
 async def test_details_longer_than_the_terminal_stay_where_they_were_scrolled_to(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -638,7 +702,7 @@ async def test_details_longer_than_the_terminal_stay_where_they_were_scrolled_to
 @sizes
 @pytest.mark.asyncio
 async def test_details_show_limits_and_the_last_exchange_of_a_point(size: tuple[int, int]) -> None:
-    async with drawn(tell(Picture(), row(value=3, unit="V")), size) as (screen, _, pilot):
+    async with drawn(tell(Picture(), row(value=3, unit="V")), size) as (screen, line, pilot):
         await pilot.press("enter")
         shown = ""
         while "exchange" not in shown:
@@ -647,6 +711,9 @@ async def test_details_show_limits_and_the_last_exchange_of_a_point(size: tuple[
         await pilot.press("escape")
         assert len(screen.screen_stack) == 1
     assert "node 5 outputs (5/outputs) value 3 V, requested 0.1s ago" in shown
+    assert line.asked == {("axes", "5/outputs")}
+    assert "node hcp2 5, up: 10 requests, 0 failed" in shown
+    assert "group axes, every 200 ms" in shown
     assert "limits written from 0 to 7; alarm high 5.5" in shown
     assert "exchange waited 4.0 ms behind 2, reply after 5.0 ms, whole after 8.0 ms" in shown
 

@@ -28,6 +28,7 @@ from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.settings import MqttSettings
 from busmaster.bus.samples import Quality, Sample
 from busmaster.capture.decode import Decoder
+from busmaster.capture.pcapng import read_packets
 from busmaster.contract.frames import Direction
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import find
@@ -354,6 +355,15 @@ def test_the_end_of_an_alarm_is_of_less_weight_than_its_start(
         "<4>busmaster: winder/tension = 0.5 N is above its high of 0.4 N",
         "<5>busmaster: winder/tension is back at 0.3 N, was above its high of 0.4 N",
     ]
+
+
+def test_the_line_of_a_file_is_recorded(busmaster: Command, tmp_path: Path) -> None:
+    capture = tmp_path / "line.pcapng"
+    with line_of(asked(2) + REPLY) as port:
+        ran = busmaster("monitor", str(written(tmp_path, port)), "--capture", str(capture))
+    assert ran.status == 1
+    with capture.open("rb") as file:
+        assert [packet.frame for packet in read_packets(file)] == [asked(2), REPLY]
 
 
 def test_an_output_that_fails_is_reported_while_it_listens(busmaster: Command, tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import os
+import platform
 import pty
 import re
 import sqlite3
@@ -87,6 +89,7 @@ def test_only_the_named_items_are_saved(busmaster: Command, controllers: TcpServ
     ran = busmaster("params", "save", controllers.path, "1", "-o", str(path), "--items", "10,12", *HCP2)
     assert (ran.status, ran.out) == (0, ""), ran.err
     assert list(read_set(str(path)).set.entries) == ["10", "12"]
+    assert read_set(str(path)).set.by == f"{getpass.getuser()}@{platform.node()}"
     assert f"{path}: 2 parameters of node 1; without 0 that the node does not have" in ran.err
     again = busmaster("params", "save", controllers.path, "1", "-o", str(path), "--items", "10", *HCP2)
     assert again.status == 2
@@ -143,6 +146,16 @@ def test_two_nodes_of_a_line_and_two_files_are_compared(
     ]
     at = written(tmp_path / "b@ck.toml", '"10" = { value = 1 }\n"11" = { value = 5 }')
     assert busmaster("params", "diff", str(one), str(at)).status == 0
+
+
+def test_nodes_of_two_ports_are_compared(
+    busmaster: Command, controllers: TcpServer, three_controllers: TcpServer
+) -> None:
+    preset(controllers, 0, 7)
+    preset(three_controllers, 0, 8)
+    nodes = f"1@{controllers.path}", f"1@{three_controllers.path}"
+    ran = busmaster("params", "diff", *nodes, "--items", "11", *HCP2)
+    assert (ran.status, [line.split() for line in ran.lines[1:]]) == (1, [["11", "7", "8"]]), ran.err
 
 
 def test_items_of_two_files_are_named_as_the_files_name_them(busmaster: Command, tmp_path: Path) -> None:
@@ -326,9 +339,11 @@ def test_what_a_limit_excludes_is_named_each_and_the_others_are_written(
     assert "is not written (0, in the file 50.1): " in ran.err
     assert "above its maximum of 50" in ran.err
     assert "6 is beyond its maximum of 5" in ran.err
+    assert "winder: 1 to write, 0 equal, 2 excluded" in ran.err
     assert held(three_controllers, 10, 11, 12) == [0, 0, 3]
     [undo] = tmp_path.glob("one.undo-*.toml")
     assert list(read_set(str(undo)).set.entries) == ["12"]
+    assert read_set(str(undo)).set.by == f"{getpass.getuser()}@{platform.node()}"
     dry = busmaster("params", "load", str(path), node, "--dry-run", "--undo", str(tmp_path / "other.toml"))
     assert dry.status == 1
 
@@ -340,6 +355,17 @@ def test_a_set_of_another_kind_of_node_is_not_loaded(
     ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", "--yes", *HCP2)
     assert ran.status == 2
     assert "node 1 is a hcp2, but the set belongs to a hcp" in ran.err
+    assert held(three_controllers, 10) == [0]
+
+
+def test_without_a_file_for_the_old_values_nothing_is_written(
+    busmaster: Command, three_controllers: TcpServer, tmp_path: Path
+) -> None:
+    path = written(tmp_path / "one.toml", '"10" = { value = 1 }')
+    undo = tmp_path / "none" / "undo.toml"
+    ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", "--yes", "--undo", str(undo), *HCP2)
+    assert ran.status == 1
+    assert f"{undo}.new: No such file or directory" in ran.err
     assert held(three_controllers, 10) == [0]
 
 
@@ -452,12 +478,14 @@ def test_a_load_is_not_written_after_any_other_answer(
     assert list(tmp_path.glob("*undo*")) == []
 
 
-def test_a_drive_that_was_started_during_the_question_is_not_written(
+@pytest.mark.parametrize("enabled", [False, True])
+def test_a_drive_that_was_started_during_the_question_is_not_written_unless_that_is_permitted(
     busmaster: Command,
     three_controllers: TcpServer,
     tmp_path: Path,
     requested: Callable[[bytes], None],
     monkeypatch: pytest.MonkeyPatch,
+    enabled: bool,
 ) -> None:
     path = written(tmp_path / "one.toml", '"10" = { value = 1 }')
     states = iter(["", "it runs"])
@@ -467,10 +495,11 @@ def test_a_drive_that_was_started_during_the_question_is_not_written(
 
     monkeypatch.setattr(find("hcp2").handle, "in_operation", in_operation)
     requested(b"y\n")
-    ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", *HCP2)
-    assert ran.status == 1
-    assert "node 1 is in operation: it runs; nothing was written; stop the drive first, or use --enabled" in ran.err
-    assert held(three_controllers, 10) == [0]
+    node = f"1@{three_controllers.path}"
+    ran = busmaster("params", "load", str(path), node, *HCP2, *(["--enabled"] if enabled else []))
+    refusal = "node 1 is in operation: it runs; nothing was written; stop the drive first, or use --enabled"
+    assert (refusal in ran.err) is not enabled
+    assert (ran.status, held(three_controllers, 10)) == ((0, [1]) if enabled else (1, [0]))
 
 
 @pytest.mark.parametrize(

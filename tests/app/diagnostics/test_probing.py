@@ -9,6 +9,7 @@ import pytest
 from busmaster.app.diagnostics.probing import Outcome, Prober, opened
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt, Tap, Verdict
+from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.registry import find, make_device
@@ -51,3 +52,18 @@ def test_an_echo_that_differs_is_recorded_as_a_spoilt_exchange(
 
     assert run_in_virtual_time(ask()) is outcome
     assert [attempt.verdict for attempt in tap.ended] == [verdict]
+
+
+@pytest.mark.parametrize(("delay", "outcome"), [(0.149, Outcome.ANSWERED), (0.17, Outcome.SILENT)])
+def test_a_reply_within_its_time_is_waited_for_as_long_as_the_adapter_can_hold_it(
+    delay: float, outcome: Outcome
+) -> None:
+    profile = find("hcp2").profile
+    assert profile.timings.read.max_reply_delay == 0.15
+    line = Line(SETTINGS, [make_device("hcp2", 3, delay=Delay(delay))], chance=random.Random(1), latency=0.016)
+
+    async def ask() -> Outcome:
+        async with opened(MemoryPort(line)) as wire:
+            return (await Prober(wire, profile, profile.timings, SETTINGS.byte_time, echo=False).ask(3)).outcome
+
+    assert run_in_virtual_time(ask()) is outcome

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
+from math import inf
 
 import pytest
 
@@ -24,12 +27,13 @@ from busmaster.app.diagnostics.steps import (
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Echo, Line
-from busmaster.emulator.memory import MemoryPort
+from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.emulator.misheard import misheard
 from busmaster.emulator.traceable import TraceableMemory
-from busmaster.errors import InvalidCommand
+from busmaster.errors import InvalidCommand, LineDown
 from busmaster.registry import NodeKind, find, kinds, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport.identity import Identity
 
 MODULI = {"hcp": 10**12, "hcp2": 10**12, "microflex": 10**12, "msc": 2**31, "mentor": 10**4, "ct-ansi": 10**4}
 SHOWN = 3
@@ -191,6 +195,33 @@ def test_talk_in_an_unknown_protocol_is_left_alone_too() -> None:
     babbler.attentive = True
     discovery = looked(line_of(LineSettings(9600), babbler), steps(usual_kinds(), None, None))
     assert "with an unknown protocol" in discovery.talk
+
+
+class Once(Talker):
+    """Transmits some bytes once, at this time, and must not receive any."""
+
+    def __init__(self, talk: bytes, at: float) -> None:
+        super().__init__(talk)
+        self.attentive = True
+        self.wakeup = at
+
+    def wake(self, now: float) -> None:
+        self.reply(self._talk, now, 0.0)
+        self.wakeup = inf
+
+
+def test_a_master_that_has_fallen_silent_again_is_shown_by_its_bytes() -> None:
+    master = Once(bytes.fromhex("07 30 35 02 30 31 05 03"), at=1.0)
+    discovery = looked(line_of(LineSettings(57600), master), steps([find("hcp2")], None, None))
+    assert discovery.talk == "another master is active, with an unknown protocol: 07 30 35 02 30 31 05 03"
+
+
+def test_bytes_that_the_opening_of_a_port_causes_are_no_master() -> None:
+    click = Once(b"\x11", at=0.02)
+    click.attentive = False
+    line = line_of(LineSettings(57600), click, make_device("hcp2", 3))
+    discovery = looked(line, steps([find("hcp2")], (3,), LineSettings(57600)))
+    assert (discovery.talk, [node.address for node in discovery.found]) == ("", [3])
 
 
 def test_a_protocol_is_recognised_only_at_settings_at_which_it_is_tried() -> None:
@@ -447,6 +478,76 @@ def test_the_user_is_offered_to_stop_on_a_slow_line_and_what_was_found_is_kept()
     assert offers == [True]
     assert [node.address for node in discovery.found] == [5, 12]
     assert discovery.not_asked == {"modbus": tuple(range(39, 248))}
+
+
+class Courses:
+    """The courses of a search, each with the number of its steps and how many of these were shown."""
+
+    def __init__(self) -> None:
+        self.shown: dict[str, list[int]] = {}
+
+    @contextmanager
+    def __call__(self, label: str, steps: int) -> Iterator[Courses]:
+        self.shown[label] = [steps, 0]
+        yield self
+
+    def advance(self) -> None:
+        [*_, last] = self.shown.values()
+        last[1] += 1
+
+
+@pytest.mark.parametrize(
+    ("devices", "shown"),
+    [
+        ([], {"asking": [5 * 8, 5 * 8]}),
+        ([make_device("hcp2", 3)], {"asking": [5 * 8, 8], "trying the others": [248, 248]}),
+        ([Once(b"\x11", at=1.0)], {"listening": [5, 5]}),
+    ],
+    ids=["silent", "node", "master"],
+)
+def test_a_search_shows_how_far_it_is(devices: list[Device], shown: dict[str, list[int]]) -> None:
+    courses = Courses()
+    port = Undeclared(line_of(LineSettings(57600), *devices))
+
+    async def look() -> None:
+        async with opened(port) as wire:
+            search, tried = Search(wire, port, lambda _: None, courses), steps([find("hcp2")], None, None)
+            if not await search.listen(tried):
+                await search.look(tried)
+
+    run_in_virtual_time(look())
+    assert courses.shown == shown
+
+
+class Choosy(Undeclared):
+    """A port that does not take 57600 baud."""
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
+        transport = await MemoryPort.open(self, protocol_factory, only)
+        tune = transport.tune
+
+        async def choose(settings: LineSettings) -> None:
+            if settings.baudrate == 57600:
+                raise LineDown("57600 baud: invalid argument", hint="")
+            await tune(settings)
+
+        transport.tune = choose  # type: ignore[method-assign]  # of this one
+        return transport
+
+
+def test_settings_that_the_port_does_not_take_are_reported_and_left_out() -> None:
+    told: list[str] = []
+    port = Choosy(line_of(LineSettings(9600), make_device("hcp2", 3)))
+
+    async def look() -> Discovery:
+        async with opened(port) as wire:
+            return await Search(wire, port, told.append).look(steps([find("hcp2")], (3,), None))
+
+    discovery = run_in_virtual_time(look())
+    assert [(node.address, discovery.settings) for node in discovery.found] == [(3, LineSettings(9600))]
+    assert told == ["left out: 57600 baud: invalid argument"]
 
 
 def test_addresses_are_written_as_ranges() -> None:

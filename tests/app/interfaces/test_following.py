@@ -14,6 +14,7 @@ from busmaster.app.interfaces import following
 from busmaster.app.interfaces.following import Connected, Following, Lost
 from busmaster.app.service.permission import Access
 from busmaster.app.service.picture import Frame, Group, Row
+from busmaster.bus.polling import PollGroup
 from busmaster.errors import InvalidCommand, LineDown, NotStarted
 from tests.app.interfaces.lines import READS, assert_goes_on_alone, followed, poll, shows
 from tests.app.service.lines import served, until
@@ -64,16 +65,21 @@ async def test_a_write_passes_the_owners_authorisation(tmp_path: Path) -> None:
 
 
 @pytest.mark.asyncio
-async def test_groups_and_nodes_rest_as_an_interface_wishes_while_the_owner_is_there(tmp_path: Path) -> None:
+async def test_groups_and_nodes_rest_as_an_interface_wishes_while_the_owner_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demanded: list[str] = []
+    monkeypatch.setattr(PollGroup, "demand", lambda group: demanded.append(group.name))
     async with followed(tmp_path) as interface:
         async with served(tmp_path) as line:
             poll(line)
             [group] = line.bus.groups
             await shows(interface)
-            await interface.pause("axes", True)
-            assert group.paused
-            await interface.pause("axes", False)
+            for paused in (True, False):
+                await interface.pause("axes", paused)
+                assert group.paused is paused
             await interface.demand("axes")
+            assert demanded == ["axes"]
             await interface.suspend("hcp2", 5, 60.0)
             assert [node.label for node in line.bus.nodes if node.suspended] == ["node 5"]
         await until(lambda: isinstance(interface.state, Lost))

@@ -414,6 +414,46 @@ def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
     asyncio.run(run())
 
 
+def test_what_a_server_refuses_is_reported_here_and_to_the_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+    refused: list[tuple[str, str]] = []
+
+    class Refusals:
+        def __init__(self, interface: str, line: Any, *kinds: str) -> None:
+            assert (interface, kinds) == ("modbus-tcp", ("connections", "requests"))
+
+        def note(self, kind: str, peer: str) -> None:
+            refused.append((kind, peer))
+
+    async def forever() -> None:
+        await asyncio.get_running_loop().create_future()
+
+    async def run() -> None:
+        opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        values: Any = SimpleNamespace(run=forever, line=SimpleNamespace(follow=forever, read_only=False))
+        serving = asyncio.ensure_future(
+            modbus_tcp.serve(values, Rules(), ("127.0.0.1", 0), opened.set_result, reports.append)
+        )
+        async with asyncio.timeout(PATIENCE):
+            host, _, port = (await opened).rpartition(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            writer.write(frame(bytes.fromhex("06 0000 0007")))
+            assert (await reader.readexactly(9))[7:] == b"\x86\x01"
+            writer.write(frame(READ, protocol=1))
+            assert await is_closed(reader)
+        writer.transport.abort()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+
+    reports: list[str] = []
+    monkeypatch.setattr(modbus_tcp, "ReportedRefusals", Refusals)
+    asyncio.run(run())
+    assert refused == [("requests", "127.0.0.1"), ("connections", "127.0.0.1")]
+    assert [text.partition(",")[0] for text in reports] == [
+        "1 write requests of Modbus TCP were refused",
+        "Modbus TCP connections closed: 1 (not Modbus TCP)",
+    ]
+
+
 @pytest.mark.parametrize(
     "sent", [frame(READ, protocol=1), frame(READ, length=1), frame(READ, length=255), b"GET / HTTP"]
 )
@@ -1158,6 +1198,18 @@ def test_the_map_is_printed_as_csv(file: Path, busmaster: Command) -> None:
         "holding,4,4,float64,big,big,1,,oven/speed,,yes",
     ]
     assert printed.lines[5] == "holding,16,4,float64,big,big,1,,kiln/setpoint,,no"
+
+
+def test_the_map_of_a_line_that_does_not_run_is_not_waited_for() -> None:
+    line = Following(lambda: "unix:/nobody")
+
+    async def follow(*, patient: bool = True) -> None:
+        raise LineDown("nobody is there") if not patient else AssertionError("it would wait")
+
+    line.follow = follow  # type: ignore[method-assign]  # replaced here
+    with pytest.raises(ExceptionGroup) as raised:
+        asyncio.run(modbus_tcp.map_text(Values(line), ()))
+    assert [type(error) for error in raised.value.exceptions] == [LineDown]
 
 
 @pytest.mark.parametrize(

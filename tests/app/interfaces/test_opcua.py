@@ -175,6 +175,39 @@ async def test_a_point_has_its_unit_range_status_and_time(opened: Opened) -> Non
         assert (await opened.is_("Line Connected", "Good")).value is True
 
 
+async def test_a_point_is_found_from_the_line_and_has_its_name_its_description_and_its_access(opened: Opened) -> None:
+    def found() -> tuple[list[str], list[tuple[str, str, int]]]:
+        root = opened.client.client.get_objects_node()
+        path = ["3:Line", "3:Nodes", "3:node 5"]
+        references = []
+        for count in range(len(path)):
+            parent = root.get_child(path[:count]) if count else root
+            child = parent.get_child(path[count])
+            [reference] = [one for one in parent.get_references() if one.IsForward and one.NodeId == child.nodeid]
+            references.append(ua.ObjectIdNames[reference.ReferenceTypeId.Identifier])
+        points = []
+        for name in ("5/10", "5/20"):
+            point = root.get_child([*path, f"2:{name[2:]}"])
+            assert point.nodeid == opened.client.node(name).nodeid
+            access = point.get_attribute(ua.AttributeIds.AccessLevel).Value.Value
+            assert opened.client.user_access(name) == access
+            points.append((point.get_display_name().Text, point.get_description().Text, access))
+        return references, points
+
+    async with opened.owned() as line:
+        line.poll("10", "20")
+        await opened.is_("5/10", "Good")
+        await opened.is_("5/20", "Good")
+        read, read_and_write = 1, 3
+        assert await asyncio.to_thread(found) == (
+            ["Organizes", "HasComponent", "Organizes"],
+            [
+                ("10", "node 5 10 (read element 10)", read_and_write),
+                ("20", "node 5 20 (read element 20)", read),  # it is not on the list
+            ],
+        )
+
+
 @pytest.mark.parametrize(
     ("unit", "limit", "type_"),
     [

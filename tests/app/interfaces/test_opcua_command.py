@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from cryptography import x509
@@ -129,7 +129,7 @@ def test_with_a_certificate_only_trusted_clients_come_and_users_with_a_token_wri
     options = ["--certificate", server_files[0], "--key", str(server_key), "--trusted", str(tmp_path / "trusted")]
     with (
         owner("serve", str(file)),
-        interface("slitter", "--allow", "winder/force", "--token-file", str(tokens), *options) as (_, url),
+        interface("slitter", "--allow", "winder/force", "--token-file", str(tokens), *options) as (process, url),
     ):
 
         def secured(files: tuple[str, str], **more: Any) -> Any:
@@ -151,6 +151,9 @@ def test_with_a_certificate_only_trusted_clients_come_and_users_with_a_token_wri
                 pass
         with pytest.raises(ua.UaError), other_client(url):  # nobody is let in who says things openly
             pass
+        process.terminate()
+        assert process.stderr is not None
+        assert "1 failed login at opcua: 1 from 127.0.0.1\n" in process.stderr.read()
 
 
 @pytest.mark.slow
@@ -213,6 +216,20 @@ def test_a_server_has_the_name_that_its_certificate_has(tmp_path: Path) -> None:
     asyncio.run(opcua.load_certificate(server, *certificate(tmp_path / "own", "interface")))
     assert server.uris == ["urn:interface"]
     assert server.formats == ["der", "pem"]
+
+
+def test_files_that_are_no_certificate_and_key_are_named(tmp_path: Path) -> None:
+    own, key = certificate(tmp_path / "own", "interface")
+
+    async def fail(*_: object, **__: object) -> None:
+        raise TypeError("it is of another kind")
+
+    server: Any = WithCertificate()
+    server.load_private_key = fail
+    with pytest.raises(InvalidCommand, match=rf"^{own} and {key} are not a certificate and its key: it is of another"):
+        asyncio.run(opcua.load_certificate(server, own, key))
+    with pytest.raises(InvalidCommand, match=rf"^{key} and {key} are not a certificate and its key"):
+        asyncio.run(opcua.load_certificate(cast("Any", WithCertificate()), key, key))
 
 
 def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:

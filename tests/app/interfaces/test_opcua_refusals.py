@@ -298,6 +298,78 @@ async def test_a_second_hello_and_one_with_too_short_buffers_end_the_connection(
     assert (await asyncio.to_thread(received)).count(b"ACKF") == acknowledged
 
 
+async def test_a_message_that_arrives_byte_by_byte_is_one(opened: Opened) -> None:
+    host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
+
+    def received() -> bytes:
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
+            for byte in hello(65_536, 65_536):
+                connection.send(bytes((byte,)))
+            return connection.recv(4)
+
+    assert await asyncio.to_thread(received) == b"ACKF"
+
+
+async def test_a_message_in_many_chunks_ends_a_connection_without_a_session(opened: Opened) -> None:
+    client = opcua.Client(opened.url, timeout=PATIENCE)
+
+    def send() -> None:
+        client.connect_socket()
+        client.send_hello()
+        client.open_secure_channel()
+        used = client.uaclient._uasocket
+        token, last, size = used._connection.security_token, used._connection._sequence_number, 32_768
+        for number in (1, 2, 3):  # a fourth would be the last
+            header = struct.pack("<4sIIIII", b"MSGC", size, token.ChannelId, token.TokenId, last + number, 7)
+            used._socket.socket.sendall(header + bytes(size - len(header)))
+
+    known = set(opened.server.acceptor.clients)
+    await asyncio.to_thread(send)
+    others = [one for one in opened.server.acceptor.clients if one not in known]
+
+    def has_kept_all() -> bool:
+        return any(one.processor and one.processor._connection._incoming_size > 90_000 for one in others)
+
+    await until(lambda: has_kept_all() or not client.uaclient._uasocket._thread.is_alive())
+    assert not has_kept_all()
+    await asyncio.to_thread(client.disconnect_socket)
+
+
+async def test_the_pause_after_which_a_session_ends_is_bounded(opened: Opened) -> None:
+    def revised(wanted: float) -> float:
+        client = opcua.Client(opened.url, timeout=PATIENCE)
+        client.session_timeout = wanted
+        client.connect()
+        try:
+            return float(client.session_timeout)
+        finally:
+            client.disconnect()
+
+    most = 1000 * bounds.LONGEST_SESSION_PAUSE
+    assert await asyncio.to_thread(revised, 3_600_000) == most
+    assert await asyncio.to_thread(revised, most - 1) == most - 1
+
+
+async def test_a_second_session_of_a_connection_ends_the_first_with_its_subscriptions(opened: Opened) -> None:
+    service = opened.server.iserver.subscription_service
+
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        entered = other_client(opened.url)
+        client = await asyncio.to_thread(entered.__enter__)
+        before = set(service.subscriptions)
+        await asyncio.to_thread(client.client.create_subscription, 100, None)
+        assert set(service.subscriptions) > before
+        client.client.keepalive.stop()
+        await asyncio.to_thread(client.client.create_session)
+        assert set(service.subscriptions) == before
+        await asyncio.to_thread(client.client.activate_session)
+        assert (await asyncio.to_thread(client.read, "5/10")).status == "Good"
+        await asyncio.to_thread(entered.__exit__, None, None, None)
+
+
 async def test_a_connection_without_a_session_is_closed(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opcua_connections, "SESSION_WITHIN", 0.1)
     host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")

@@ -24,6 +24,7 @@ from busmaster import Hcp2Controller, MicroFlexDrive
 from busmaster.app.bounds import HISTORY_THREADS, LONGEST_COMMAND, MOST_HISTORY
 from busmaster.app.interfaces import audience, following, web
 from busmaster.app.interfaces.audience import MOST_EXCHANGES, Seat
+from busmaster.app.interfaces.connections import Crowd
 from busmaster.app.interfaces.following import Lost
 from busmaster.app.interfaces.guard import Guard
 from busmaster.app.interfaces.web import PAGE, application, serving
@@ -923,7 +924,16 @@ async def joined(of: Page) -> ClientConnection:
 
 
 @pytest.mark.asyncio
-async def test_the_page_of_a_proxy_is_served_with_its_history_and_its_writes_are_reported() -> None:
+async def test_the_page_of_a_proxy_is_served_with_its_history_and_its_writes_are_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    crowds: list[Any] = []
+
+    def crowd(report: Any) -> Crowd:
+        crowds.append(report)
+        return Crowd(report)
+
+    monkeypatch.setattr(web, "Crowd", crowd)
     line = connected(Remote())
     line._overview = cast("Any", Overview())
     line.picture._rows = {0: [row(value=7, writable=True)]}
@@ -944,10 +954,12 @@ async def test_the_page_of_a_proxy_is_served_with_its_history_and_its_writes_are
         answer = await client.get("/api/line", headers=headers)
         assert (answer.status_code, answer.json()["history"]) == (200, True)
         assert "server" not in answer.headers
-        answer = await client.put("/api/points/axes/winder/10", json={"value": 1}, headers=headers)
+        spoofed = {**headers, "X-Forwarded-For": "10.0.0.9"}  # a client can name any address
+        answer = await client.put("/api/points/axes/winder/10", json={"value": 1}, headers=spoofed)
         assert answer.status_code == 200
         answer = await client.get("/page/page.js")
         assert answer.status_code == 200
     assert reports == ["winder/10 = 1, from token hmi from 127.0.0.1: written"]
+    assert crowds == [reports.append], "connections that are closed are reported, too"
     serving_it.cancel()
     await asyncio.gather(serving_it, return_exceptions=True)
