@@ -177,6 +177,7 @@ def test_a_value_is_shown_with_its_digits_and_names(value: Any, precision: int |
         (True, 1, {}),
         ((True, Mode.SLOW, nan), [1, 1, None], {}),
         (-inf, None, {}),
+        (2.0**53 - 1, 2**53 - 1, {}),
         (2.0**53, 2.0**53, {}),
         ("a text", "a text", {}),
         (frozenset({16, 8, 1}), [1, 8, 16], {}),
