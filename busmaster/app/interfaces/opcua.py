@@ -505,7 +505,7 @@ async def serve(
 
 
 def read_trusted(folder: str) -> frozenset[bytes]:
-    """Return the certificates (DER) of the clients that are trusted: those of the files of a folder, PEM or DER.
+    """Return the certificates (DER) of the clients that are trusted: all of the files of a folder, PEM or DER.
 
     Raises OSError, and InvalidCommand for a file that is none, or a folder without one.
     """
@@ -513,10 +513,11 @@ def read_trusted(folder: str) -> frozenset[bytes]:
     for path in sorted(Path(folder).iterdir()):
         text = read_file(path)
         try:
-            load = x509.load_pem_x509_certificate if b"-----BEGIN" in text else x509.load_der_x509_certificate
-            found.add(load(text).public_bytes(Encoding.DER))
+            pem = b"-----BEGIN" in text
+            certificates = x509.load_pem_x509_certificates(text) if pem else [x509.load_der_x509_certificate(text)]
         except ValueError:
             raise InvalidCommand(f"{path} is not a certificate; {folder} is for those of trusted clients") from None
+        found |= {certificate.public_bytes(Encoding.DER) for certificate in certificates}
     if not found:
         raise InvalidCommand(f"{folder} has no certificate, so no client could connect; add one")
     return frozenset(found)

@@ -238,10 +238,15 @@ def test_every_certificate_in_the_folder_is_trusted(tmp_path: Path) -> None:
         certificate(folder, name)
     trusted = read_trusted(str(folder))
     assert len(trusted) == 2
+    both = tmp_path / "both"
+    both.mkdir()
     for number, der in enumerate(trusted):  # in the other form, under any name
         pem = x509.load_der_x509_certificate(der).public_bytes(serialization.Encoding.PEM)
         (folder / f"{number}").write_bytes(pem)
+        with (both / "both.pem").open("ab") as file:
+            file.write(pem)
     assert read_trusted(str(folder)) == trusted
+    assert read_trusted(str(both)) == trusted
 
 
 def test_a_folder_without_a_certificate_or_with_something_else_is_refused(tmp_path: Path) -> None:
