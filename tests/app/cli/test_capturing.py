@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,7 @@ def test_a_capture_of_nothing_is_wrong_usage(busmaster: Command, option: str) ->
     assert option in ran.err
 
 
+@pytest.mark.parametrize("leaving", [None, KeyboardInterrupt])
 @pytest.mark.parametrize(("output", "input_"), [(True, True), (True, False), (False, True)])
 def test_what_the_recorder_reports_is_printed_at_once_unless_a_picture_may_be_drawn(
     tmp_path: Path,
@@ -102,13 +104,16 @@ def test_what_the_recorder_reports_is_printed_at_once_unless_a_picture_may_be_dr
     capfd: pytest.CaptureFixture[str],
     output: bool,
     input_: bool,
+    leaving: type[BaseException] | None,
 ) -> None:
     monkeypatch.setattr(module, "Recorder", Noted)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: output)
     monkeypatch.setattr(sys.stdin, "isatty", lambda: input_)
     path = str(tmp_path / "line.pcapng")
-    with capturing(path, port="COM1"):
+    with nullcontext() if leaving is None else pytest.raises(leaving), capturing(path, port="COM1"):
         assert capfd.readouterr().err == ("" if output and input_ else f"busmaster: {path} is full\n")
+        if leaving is not None:
+            raise leaving
     assert capfd.readouterr().err == (f"busmaster: {path} is full\n" if output and input_ else "")
 
 

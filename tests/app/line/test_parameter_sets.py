@@ -116,7 +116,7 @@ def test_a_set_is_read_as_it_was_written_with_all_that_its_file_contains(tmp_pat
         EMPTY,
         label="node 11",
         line="/dev/ttyUSB0",
-        by="maria@press",
+        by='PLANT\\maria "m"@press',
         identity={"11.15": 530},
         entries={"1.18": Entry(FULL, 50), "1.19": Entry(WANTED[2], True)},
     )

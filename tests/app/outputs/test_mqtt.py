@@ -586,6 +586,11 @@ async def test_the_client_has_the_settings_of_the_file(tmp_path: Path) -> None:
     forbidden = Forbidden(settings, output._secrets, "x/set/#", frozenset(), lambda _: None)
     for paho in (client, forbidden._client):
         assert (paho._username, paho._password) == (b"op", b"secret")
+    without_password = MqttSettings(username="op")
+    output = MqttOutput("mqtt", without_password, BUS)
+    forbidden = Forbidden(without_password, output._secrets, "x/set/#", frozenset(), lambda _: None)
+    for paho in (output._client()._client, forbidden._client):
+        assert (paho._username, paho._password) == (b"op", None)
     assert client._will_topic == b"busmaster/status"
     assert main._keepalive == KEEP_ALIVE
     assert MqttOutput("mqtt", settings, BUS, in_charge=False)._client()._client._will_topic == b""
