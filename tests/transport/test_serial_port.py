@@ -291,6 +291,24 @@ async def test_closing_discards_what_has_not_left(pty_master: PtyMaster) -> None
 
 
 @pytest.mark.asyncio
+@pytest.mark.parametrize("end", ["close", "abort", "loss"])
+async def test_a_port_that_has_ended_with_unsent_bytes_leaves_nothing_in_the_event_loop(
+    pty_master: PtyMaster, end: str
+) -> None:
+    transport, recorder = await opened(pty_master.path)
+    descriptor = transport.get_extra_info("serial").fileno()
+    transport.write(bytes(300_000))
+    if end == "loss":
+        pty_master.unplug()
+        await recorder.lost()
+    else:
+        getattr(transport, end)()
+    loop = asyncio.get_running_loop()
+    assert (loop.remove_reader(descriptor), loop.remove_writer(descriptor)) == (False, False)
+    await recorder.lost()
+
+
+@pytest.mark.asyncio
 async def test_an_abort_is_a_close_from_here(pty_master: PtyMaster) -> None:
     transport, recorder = await opened(pty_master.path)
     transport.abort()

@@ -181,6 +181,12 @@ def test_a_table_has_columns_as_wide_as_their_widest_cell_and_no_spaces_at_the_e
     assert list(columns(rows)) == ["NAME    N    UNIT", "a       100", "longer  7    mm"]
 
 
+def test_a_row_whose_first_cell_is_empty_or_flush_right_is_indented() -> None:
+    rows = [("AT", "STATE"), ("120", "on"), ("7", "off"), ("", "unknown"), ("", "")]
+    assert list(columns(rows, right=(0,))) == [" AT  STATE", "120  on", "  7  off", "     unknown", ""]
+    assert list(columns(rows)) == ["AT   STATE", "120  on", "7    off", "     unknown", ""]
+
+
 class Disk:
     """Standard output on a disk that takes so many bytes at each attempt; -1 for an error."""
 

@@ -32,6 +32,7 @@ def test_the_bits_of_a_word_stand_below_it(busmaster: Command) -> None:
         ["bit", "1", "BATTERY_LOW"],
     ]
     assert lines[status + 13].split(maxsplit=3)[3] == "error: a bad opcode was found"
+    assert all(line.startswith("  bit ") for line in lines[status + 1 :])
     assert len(lines) == status + 17
 
 

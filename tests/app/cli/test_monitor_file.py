@@ -58,6 +58,8 @@ path = "{folder}/line.sqlite"
 REQUEST = hcp2.Read(1).open(2, hcp2.PROFILE.timings).request
 REPLY = bytes.fromhex("02 30 31 35 03 37")
 """Element 1 is 5."""
+WINDOW = hcp2.PROFILE.timings.read.window
+MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.max_reply_delay
 
 
 class Tapped:
@@ -205,6 +207,13 @@ def test_only_the_answer_to_its_own_request_is_a_value(
 
 def test_an_answer_that_is_later_than_max_reply_delay_may_be_another_requests(tmp_path: Path) -> None:
     assert heard(tmp_path, REQUEST, REPLY, apart=1.0) == []
+    assert heard(tmp_path, REQUEST, REPLY, apart=MAX_REPLY_DELAY + 0.001) == []
+
+
+def test_a_reply_after_the_reply_window_is_a_value_until_max_reply_delay(tmp_path: Path) -> None:
+    assert WINDOW < MAX_REPLY_DELAY - 0.001
+    for delay in (WINDOW + 0.001, MAX_REPLY_DELAY - 0.001):
+        assert heard(tmp_path, REQUEST, REPLY, apart=delay) == [0.5]
 
 
 def test_what_is_missing_or_too_much_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -238,9 +247,6 @@ def overheard_of(folder: Path, *pieces: tuple[float, bytes], earlier: float = 0.
             snapshot = overheard.groups[0].turn(at, 0.0)
             found += snapshot.samples.values() if snapshot else []
     return found
-
-
-MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.max_reply_delay
 
 
 @pytest.mark.parametrize(

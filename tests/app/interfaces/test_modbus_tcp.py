@@ -169,6 +169,10 @@ def test_exceptions_of_units_keep_their_code_and_others_say_what_happened_to_the
         ({"type": "int64"}, -(2**63), [0x8000, 0, 0, 0]),
         ({"type": "uint64", "word_order": "little"}, 1, [1, 0, 0, 0]),
         ({"type": "float32"}, 12.3, [0x4144, 0xCCCD]),
+        ({"type": "float32"}, 1975308.5, [0x49F1, 0x2064]),  # of eight digits
+        ({"type": "float32"}, -103.217316, [0xC2CE, 0x6F44]),  # of nine
+        ({"type": "float32"}, 3.4028235e38, [0x7F7F, 0xFFFF]),
+        ({"type": "float32"}, 1.4013e-45, [0x0000, 0x0001]),
         ({"type": "float64"}, 12.3, [0x4028, 0x9999, 0x9999, 0x999A]),
         ({"type": "bit", "table": "coil"}, 1, [1]),
     ],

@@ -33,6 +33,7 @@ from busmaster.app.service.failures import encode_error, error_of
 from busmaster.app.service.fields import OptionsForm
 from busmaster.app.service.link import Link
 from busmaster.app.service.owner_messages import ErrorForm
+from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.errors import (
     BusClosed,
     BusError,
@@ -368,6 +369,27 @@ def test_a_program_polls_its_own_points_until_it_leaves(tmp_path: Path) -> None:
             assert remote.groups[0].name == group.owners_name
             assert group.owners_name.startswith("mine (")
         await until(lambda: not (line.bus.groups or line.bus.nodes))
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_that_begins_after_another_has_ended_takes_no_cycles_of_one_that_runs(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        drive = Hcp2Controller(remote, 5)
+
+        def polled(item: str) -> RemoteGroup:
+            return remote.poll_group(item, period=0.02, points=[drive.point(item)])
+
+        ended, runs = polled("1"), polled("2")
+        await asyncio.gather(ended.ready(), runs.ready())
+        ended.close()
+        new = polled("3")
+        await new.ready()
+        for group, item in ((runs, "2"), (new, "3")):
+            cycles = group.subscribe()
+            before = (await anext(cycles)).cycle
+            after = await anext(cycles)
+            assert (after.cycle > before, [point.item for point in after]) == (True, [item])
 
     on_a_served_line(tmp_path, story)
 

@@ -319,6 +319,41 @@ def test_a_node_that_was_named_wrongly_is_asked_once_it_is_named_rightly(tmp_pat
     on_a_line(tmp_path, story)
 
 
+def test_a_program_that_leaves_keeps_its_place_and_nodes_until_each_of_its_writes_has_ended(tmp_path: Path) -> None:
+    begun: list[asyncio.Event] = []
+    cancelled: list[asyncio.Event] = []
+
+    async def slow(end: asyncio.Event) -> str:
+        begun.append(end)
+        try:
+            await end.wait()
+        except asyncio.CancelledError:
+            cancelled.append(end)
+            await end.wait()
+        return ""
+
+    async def story(line: Served) -> None:
+        line.authorisation.record = lambda _: slow(asyncio.Event())
+        async with raw(line) as client:
+            for number in range(3):
+                await client.say(method="request", params=write(number), id=number)
+            await until(lambda: len(begun) == 3)
+        [program] = line.service.clients
+        await until(lambda: len(cancelled) == 3)
+        first, *others = begun
+        first.set()
+        await until(lambda: len(program.unfinished) == 2)
+        await Hcp2Controller(line.bus, 6).read(1)  # the loop turns meanwhile
+        assert line.service.clients == (program,)
+        assert {node.address for node in line.bus.nodes} == {5, 6}
+        for end in others:
+            end.set()
+        await line.alone()
+        assert [node.address for node in line.bus.nodes] == [6]
+
+    on_a_line(tmp_path, story)
+
+
 def test_r12_the_times_of_a_request_that_has_waited_are_shorter_by_that() -> None:
     given: CommandOptions = {"start_within": 1.0, "finish_within": 2.0, "retries": 3}
     assert shortened(given, 0.5) == {"start_within": 0.5, "finish_within": 1.5, "retries": 3}
