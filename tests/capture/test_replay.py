@@ -197,6 +197,53 @@ def test_the_outcome_of_a_request_that_no_command_sends_is_not_that_of_the_next_
     assert [one.packet for one in replay_packets(overheard(*READ, wrong, (NODE, NAK)))] == [1, 3]
 
 
+NEXT_VALUE = "02 30 31 31 38 2B 30 30 30 30 03 20"
+"""Mentor's parameter 1.18 is 0."""
+
+
+def mentor_read(*replies: str) -> list[Turn]:
+    return exchange(mentor.Read(1, 17), 12, MENTOR, *replies)
+
+
+@pytest.mark.parametrize(
+    ("turns", "command", "result"),
+    [
+        pytest.param(
+            [*mentor_read(EOT), (HOST, ACK), (NODE, NEXT_VALUE)], "read 01.17 to 01.18", "refused", id="refused"
+        ),
+        pytest.param([*mentor_read(), (HOST, ACK)], "read 01.17 to 01.18", "no reply", id="no reply"),
+        pytest.param(
+            [
+                *mentor_read("02 30 31 31 37 2D 30 34 37 36 03 2C"),
+                (HOST, ACK),
+                (NODE, NEXT_VALUE),
+                (HOST, "08"),
+                (NODE, "02 30 31 31 37 2D 30 34 37 36 03 2C"),
+            ],
+            "read 01.17",
+            "ok: -476",
+            id="forwards and backwards",
+        ),
+    ],
+)
+def test_a_short_command_that_no_exchange_of_ours_sends_is_not_an_exchange_of_its_own(
+    turns: list[Turn], command: str, result: str
+) -> None:
+    one = only(overheard(*turns))
+    assert (one.packet, one.command) == (1, command)
+    assert str(one.now).startswith(result)
+    assert not one.changed
+    replayed = replay_packets(overheard(*turns, *mentor_read(EOT)))
+    assert [each.packet for each in replayed] == [1, 1 + len(overheard(*turns))]
+
+
+def test_the_outcome_of_a_request_that_no_command_sends_is_that_of_its_last_short_command() -> None:
+    wrong = (mentor_read()[0][0], "04 31 32 32 32 30 31 31 37 05")
+    one = only(overheard(wrong, (NODE, EOT), (HOST, ACK), (NODE, NEXT_VALUE)))
+    assert (one.packet, one.recorded.outcome) == (1, Outcome.OK)
+    assert str(one.now) == "read 01.17: no drive address: '1222'"
+
+
 def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
     with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
         exchanges = list(replay_packets(read_packets(file)))
