@@ -322,3 +322,28 @@ def test_an_exchange_in_which_the_host_said_something_else_is_a_change() -> None
     one = told(Verdict.OK, None, *turns, (HOST, ACK), (NODE, ACK))
     assert one.judged
     assert one.changed
+
+
+def test_a_change_is_reported_if_the_outcome_is_recorded_after_what_the_host_would_send_otherwise_today() -> None:
+    turns = exchange(msc.SetFlag(5), 2, MSC, NAK)
+    one = told(Verdict.OK, None, *turns, (HOST, "02 02 00 08 00 00 53 46 4C 41 47 2C 00 06 01 A9"), (NODE, ACK))
+    assert one.changed
+    assert (str(one.recorded), str(one.now)) == ("ok: ok", "refused: refused")
+
+
+def test_a_change_is_reported_if_the_pauses_of_its_steps_do_not_lead_to_the_recorded_outcome() -> None:
+    repeated = next(turns for turns in GOOD if (HOST, NAK) in turns)
+    packets = overheard(*repeated)
+    answer = next(packet for packet in packets if packet.outcome is Outcome.OK)
+    answer.comment = "read data 2008: 4097"
+    one = only(packets)
+    assert one.changed
+    assert (str(one.recorded), str(one.now)) == ("ok: 4097", "ok: 1234")
+
+
+def test_a_pause_that_ended_the_reply_is_no_change_whatever_the_host_sent_then() -> None:
+    turns = exchange(msc.DataRead(2008), 1, MSC, ACK, "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
+    again = (HOST, "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
+    one = told(Verdict.NO_REPLY, "no reply", *turns, again, (NODE, NAK))
+    assert one.judged
+    assert not one.changed
