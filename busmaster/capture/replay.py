@@ -180,12 +180,13 @@ class _Run:
             return found
         run = _Run(self.asked, self._command, self._profile, pauses=True)
         for heard in self._received:
-            if heard.packet.direction is not Direction.HOST:
+            if heard.packet.direction is Direction.HOST:
+                run.add_request(heard)
+            else:
                 run.add_reply(heard)
-            elif not run.add_request(heard):
-                break
         by_pauses = run._end()
-        return found if by_pauses.changed else by_pauses
+        # If it ended before the packet with the outcome, it has nothing to compare with.
+        return by_pauses if by_pauses.judged and not by_pauses.changed else found
 
     def _pause(self, now: int) -> None:
         """Report a pause to the reader if it was long enough."""

@@ -340,6 +340,15 @@ def test_a_protocol_that_nobody_knows_here_is_recorded_as_it_passed() -> None:
         (NODE, VALUE[3:], OK, "read element 1: 5.0"),
     ]
     assert {(packet.protocol, packet.node) for packet in tape.packets} == {("", 2)}
+    assert [packet.micros for packet in tape.packets] == [101_000_000, 101_010_000, 101_020_000]
+
+
+def test_overheard_bytes_without_a_known_protocol_have_the_times_at_which_they_passed() -> None:
+    tape = Tape()
+    tape.overheard(1.0, READ)
+    tape.overheard(1.01, VALUE)
+    tape.lines()
+    assert [(packet.micros, packet.frame) for packet in tape.packets] == [(101_000_000, READ), (101_010_000, VALUE)]
 
 
 def test_an_echo_is_left_out_and_one_that_differs_is_kept() -> None:

@@ -197,6 +197,53 @@ def test_the_outcome_of_a_request_that_no_command_sends_is_not_that_of_the_next_
     assert [one.packet for one in replay_packets(overheard(*READ, wrong, (NODE, NAK)))] == [1, 3]
 
 
+NEXT_VALUE = "02 30 31 31 38 2B 30 30 30 30 03 20"
+"""Mentor's parameter 1.18 is 0."""
+
+
+def mentor_read(*replies: str) -> list[Turn]:
+    return exchange(mentor.Read(1, 17), 12, MENTOR, *replies)
+
+
+@pytest.mark.parametrize(
+    ("turns", "command", "result"),
+    [
+        pytest.param(
+            [*mentor_read(EOT), (HOST, ACK), (NODE, NEXT_VALUE)], "read 01.17 to 01.18", "refused", id="refused"
+        ),
+        pytest.param([*mentor_read(), (HOST, ACK)], "read 01.17 to 01.18", "no reply", id="no reply"),
+        pytest.param(
+            [
+                *mentor_read("02 30 31 31 37 2D 30 34 37 36 03 2C"),
+                (HOST, ACK),
+                (NODE, NEXT_VALUE),
+                (HOST, "08"),
+                (NODE, "02 30 31 31 37 2D 30 34 37 36 03 2C"),
+            ],
+            "read 01.17",
+            "ok: -476",
+            id="forwards and backwards",
+        ),
+    ],
+)
+def test_a_short_command_that_no_exchange_of_ours_sends_is_not_an_exchange_of_its_own(
+    turns: list[Turn], command: str, result: str
+) -> None:
+    one = only(overheard(*turns))
+    assert (one.packet, one.command) == (1, command)
+    assert str(one.now).startswith(result)
+    assert not one.changed
+    replayed = replay_packets(overheard(*turns, *mentor_read(EOT)))
+    assert [each.packet for each in replayed] == [1, 1 + len(overheard(*turns))]
+
+
+def test_the_outcome_of_a_request_that_no_command_sends_is_that_of_its_last_short_command() -> None:
+    wrong = (mentor_read()[0][0], "04 31 32 32 32 30 31 31 37 05")
+    one = only(overheard(wrong, (NODE, EOT), (HOST, ACK), (NODE, NEXT_VALUE)))
+    assert (one.packet, one.recorded.outcome) == (1, Outcome.OK)
+    assert str(one.now) == "read 01.17: no drive address: '1222'"
+
+
 def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
     with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
         exchanges = list(replay_packets(read_packets(file)))
@@ -275,3 +322,28 @@ def test_an_exchange_in_which_the_host_said_something_else_is_a_change() -> None
     one = told(Verdict.OK, None, *turns, (HOST, ACK), (NODE, ACK))
     assert one.judged
     assert one.changed
+
+
+def test_a_change_is_reported_if_the_outcome_is_recorded_after_what_the_host_would_send_otherwise_today() -> None:
+    turns = exchange(msc.SetFlag(5), 2, MSC, NAK)
+    one = told(Verdict.OK, None, *turns, (HOST, "02 02 00 08 00 00 53 46 4C 41 47 2C 00 06 01 A9"), (NODE, ACK))
+    assert one.changed
+    assert (str(one.recorded), str(one.now)) == ("ok: ok", "refused: refused")
+
+
+def test_a_change_is_reported_if_the_pauses_of_its_steps_do_not_lead_to_the_recorded_outcome() -> None:
+    repeated = next(turns for turns in GOOD if (HOST, NAK) in turns)
+    packets = overheard(*repeated)
+    answer = next(packet for packet in packets if packet.outcome is Outcome.OK)
+    answer.comment = "read data 2008: 4097"
+    one = only(packets)
+    assert one.changed
+    assert (str(one.recorded), str(one.now)) == ("ok: 4097", "ok: 1234")
+
+
+def test_a_pause_that_ended_the_reply_is_no_change_whatever_the_host_sent_then() -> None:
+    turns = exchange(msc.DataRead(2008), 1, MSC, ACK, "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
+    again = (HOST, "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
+    one = told(Verdict.NO_REPLY, "no reply", *turns, again, (NODE, NAK))
+    assert one.judged
+    assert not one.changed

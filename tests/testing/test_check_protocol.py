@@ -404,10 +404,30 @@ class EndlessListener(DeafListener):
         return Done(None)
 
 
+class BreakingListener(DeafListener):
+    """It rejects its first chunk, and has a bug in what it does with the next one."""
+
+    def __init__(self) -> None:
+        self._rejects = True
+
+    def feed(self, data: bytes, /) -> Done[None]:
+        if self._rejects:
+            self._rejects = False
+            raise FrameError("no frame begins so")
+        return super().feed(data)
+
+    def expired(self) -> Done[None]:
+        return Done(None)
+
+
 def test_bugs_in_a_listener_are_found() -> None:
     findings = find(READING, profile=replace(MODBUS, listen=DeafListener))
     assert "the listener raises KeyError" in findings
     assert "the listener has no end" in find(READING, profile=replace(MODBUS, listen=EndlessListener))
+
+
+def test_a_listener_that_fails_at_the_bytes_after_a_bad_frame_is_found() -> None:
+    assert "the listener raises KeyError" in find(READING, profile=replace(MODBUS, listen=BreakingListener))
 
 
 class Noting(EndlessListener):

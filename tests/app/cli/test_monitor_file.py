@@ -101,9 +101,9 @@ def tapped() -> Iterator[Tapped]:
         line.close()
 
 
-def written(folder: Path, port: int = 1) -> Path:
+def written(folder: Path, port: int = 1, file: str = FILE) -> Path:
     path = folder / "line.toml"
-    path.write_text(FILE.format(port=port, folder=folder))
+    path.write_text(file.format(port=port, folder=folder))
     return path
 
 
@@ -230,9 +230,11 @@ def asked(node: int, element: int = 1) -> bytes:
     return hcp2.Read(element).open(node, hcp2.PROFILE.timings).request
 
 
-def overheard_of(folder: Path, *pieces: tuple[float, bytes], earlier: float = 0.0) -> list[Sample[Any]]:
-    """The samples of the point that these bytes, each at its time, stand for; the last came `earlier`."""
-    line = ConfiguredLine(load(written(folder)), outputs=False)
+def overheard_of(
+    folder: Path, *pieces: tuple[float, bytes], earlier: float = 0.0, file: str = FILE
+) -> list[Sample[Any]]:
+    """The samples of the points that these bytes, each at its time, stand for; the last came `earlier`."""
+    line = ConfiguredLine(load(written(folder, file=file)), outputs=False)
     points = line.members("fast")
     now = [0.0]
     overheard = Overheard(find("hcp2").protocol, points, lambda: now[0])
@@ -293,6 +295,28 @@ def test_a_request_is_open_while_its_reply_may_have_come_before_it_was_read(tmp_
     pieces = [(0.0, asked(3)), (late, asked(2)), (late + 0.01, REPLY)]
     assert [sample.value for sample in overheard_of(tmp_path, *pieces, earlier=0.0)] == [0.5]
     assert overheard_of(tmp_path, *pieces, earlier=0.05 + late - MAX_REPLY_DELAY) == []
+
+
+def with_delay(seconds: float) -> str:
+    """A file whose first node has a maximum reply delay of its own, and both nodes a point."""
+    timing = f"timing = {{{{ window = {seconds}, max_reply_delay = {seconds} }}}}"
+    file = FILE.replace("address = 2\n", f"address = 2\n{timing}\n")
+    return file.replace('points = ["winder/tension"]', 'points = ["winder/tension", "spare/1"]')
+
+
+@pytest.mark.parametrize("own", [MAX_REPLY_DELAY / 2, 3 * MAX_REPLY_DELAY])
+def test_a_reply_is_in_time_by_the_maximum_reply_delay_of_its_node(tmp_path: Path, own: float) -> None:
+    for node, delay, value in ((2, own, 0.5), (3, MAX_REPLY_DELAY, 5.0)):
+        for late, values in ((-0.01, [value]), (0.01, [])):
+            samples = overheard_of(tmp_path, (0, asked(node)), (delay + late, REPLY), file=with_delay(own))
+            assert [sample.value for sample in samples] == values
+
+
+@pytest.mark.parametrize("own", [MAX_REPLY_DELAY / 2, 3 * MAX_REPLY_DELAY])
+def test_a_request_is_open_until_the_maximum_reply_delay_of_its_node(tmp_path: Path, own: float) -> None:
+    for late, values in ((-0.01, []), (0.01, [5.0])):
+        pieces = [(0, asked(2)), (own + late - 0.005, asked(3)), (own + late, REPLY)]
+        assert [sample.value for sample in overheard_of(tmp_path, *pieces, file=with_delay(own))] == values
 
 
 def test_what_is_overheard_is_never_good_and_as_old_as_its_first_byte_may_be(tmp_path: Path) -> None:

@@ -92,6 +92,10 @@ READ = bytes.fromhex("03 0000 0001")
         ("05 0003 0000", WriteRequest("coil", 3, (0,))),
         ("06 0003 1234", WriteRequest("holding", 3, (0x1234,))),
         ("0f 0003 000a 02 0502", WriteRequest("coil", 3, (1, 0, 1, 0, 0, 0, 0, 0, 0, 1))),
+        ("0f 0003 0007 01 45", WriteRequest("coil", 3, (1, 0, 1, 0, 0, 0, 1))),
+        ("0f 0003 0008 01 85", WriteRequest("coil", 3, (1, 0, 1, 0, 0, 0, 0, 1))),  # a full byte
+        ("0f 0003 0009 02 8501", WriteRequest("coil", 3, (1, 0, 1, 0, 0, 0, 0, 1, 1))),
+        ("0f 0000 07b0 f6" + 246 * "ff", WriteRequest("coil", 0, 1968 * (1,))),
         ("10 0003 0002 04 0001 fffe", WriteRequest("holding", 3, (1, 0xFFFE))),
     ],
 )
@@ -117,6 +121,7 @@ def test_a_request_is_decoded(pdu: str, request_: ReadRequest | WriteRequest) ->
         ("06 0000", 3),
         ("0f 0000 07b1 f7" + 247 * "00", 3),
         ("0f 0000 0009 01 01", 3),
+        ("0f 0000 0008 02 0100", 3),
         ("0f 0000 0009", 3),
         ("10 0000 007c f8" + 248 * "00", 3),
         ("10 0000 0002 04 0001", 3),

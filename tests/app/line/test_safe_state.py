@@ -206,6 +206,42 @@ def test_a_line_that_is_left_takes_no_other_write_and_one_that_is_not_left_does(
     on_a_line(story, "winder/speed")
 
 
+@pytest.mark.parametrize("leaving", [True, False])
+def test_a_line_takes_writes_again_after_a_safe_state_that_was_cancelled_unless_it_is_left(leaving: bool) -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        drive = line.nodes["winder"]
+        entering = asyncio.ensure_future(line.safe_state.enter(line.authorisation, "a test", leaving=leaving))
+        await asyncio.sleep(WITHIN / 2)  # node 1 is gone
+        with pytest.raises(Superseded):
+            await drive.write(10, 5)
+        entering.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await entering
+        assert [(record.point, record.outcome) for record in records] == [("gone/speed", Outcome.UNCONFIRMED)]
+        if leaving:
+            with pytest.raises(Superseded):
+                await drive.write(10, 5)
+        else:
+            await drive.write(10, 5)
+        assert await drive.read(10) == (7 if leaving else 5)
+
+    on_a_line(story, "gone/speed", gone=True)
+
+
+def test_a_line_takes_writes_again_after_a_safe_state_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(node: Node, seconds: float) -> None:
+        raise RuntimeError("a bug")
+
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        monkeypatch.setattr(Node, "suspend", fail)
+        with pytest.raises(BaseExceptionGroup):
+            await line.safe_state.enter(line.authorisation, "a test", leaving=False)
+        await line.nodes["winder"].write(10, 5)
+        assert await line.nodes["winder"].read(10) == 5
+
+    on_a_line(story, "winder/speed")
+
+
 @pytest.mark.parametrize(
     ("allowed", "may_send"), [("*/speed", False), ("winder/speed,force", True), ("winder/force", False)]
 )

@@ -45,7 +45,9 @@ def _installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None
     (broken / "entry_points.txt").write_text(
         "[busmaster.outputs]\nabsent = busmaster_absent:X\nnumber = math:pi\ncsv = math:pi\n"
         "other = busmaster_influx:INFLUX\nkind = busmaster_influx:InfluxOutput\n"
+        "renamed = math:INFLUX\nunfinished = busmaster_unfinished:X\n"
     )
+    (tmp_path / "busmaster_unfinished.py").write_text("X = (\n")
     monkeypatch.syspath_prepend(str(HERE / "installed"))
     monkeypatch.syspath_prepend(str(tmp_path))
     forget()
@@ -108,6 +110,8 @@ def test_the_reference_has_its_table() -> None:
         ),
         ("kind", "the output 'kind' of busmaster-broken is not an OutputKind but the class InfluxOutput"),
         ("absent", "the output 'absent' of busmaster-broken cannot be imported: No module named 'busmaster_absent'"),
+        ("renamed", "the output 'renamed' of busmaster-broken cannot be imported: .* no attribute 'INFLUX'; fix or"),
+        ("unfinished", "the output 'unfinished' of busmaster-broken cannot be imported: '\\(' was never closed"),
         ("number", "the output 'number' of busmaster-broken is not an OutputKind but a float"),
     ],
 )
