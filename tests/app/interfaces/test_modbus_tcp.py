@@ -827,6 +827,11 @@ def eventually(request: Callable[[], Any], wanted: Callable[[Any], bool], allowe
     return reply
 
 
+def write(request: Callable[[], Any]) -> None:
+    """Write. On a busy machine, a request can reach the owner too late to be sent: the exception 6."""
+    eventually(request, lambda reply: not code(reply), allowed=(6,))
+
+
 @pytest.mark.slow
 def test_a_client_that_asks_nothing_for_the_time_of_the_option_is_disconnected(file: Path) -> None:
     with (
@@ -847,19 +852,19 @@ def test_points_are_read_and_written_as_the_map_says(file: Path) -> None:
         assert first.registers == [0, 0, 0, 0]
         # a write is confirmed, and the value before it is never read again
         for number in range(1, 20):
-            assert code(client.write_register(0, number)) == 0
+            write(lambda number=number: client.write_register(0, number))  # type: ignore[misc]
             eventually(
                 lambda: client.read_holding_registers(0, count=1),
                 lambda reply, number=number: not code(reply) and reply.registers == [number],  # type: ignore[misc]
             )
-        assert code(client.write_register(10, 1230)) == 0
+        write(lambda: client.write_register(10, 1230))
         eventually(
             lambda: client.read_holding_registers(10), lambda reply: not code(reply) and reply.registers == [1230]
         )
-        assert code(client.write_registers(2, [0, 1234])) == 0
-        assert code(client.write_coil(0, True)) == 0
+        write(lambda: client.write_registers(2, [0, 1234]))
+        write(lambda: client.write_coil(0, True))
         eventually(lambda: client.read_coils(0), lambda reply: not code(reply) and reply.bits[0])
-        assert code(client.write_coils(0, [False])) == 0
+        write(lambda: client.write_coils(0, [False]))
         # what is refused, and why
         assert code(client.write_register(2, 5)) == 3  # a part of a value
         assert code(client.write_registers(2, [1, 0])) == 3  # 65536 is more than the unit's register holds
