@@ -59,6 +59,17 @@ async def controller() -> AsyncIterator[Hcp2Controller]:
         yield Hcp2Controller(bus, 5)
 
 
+@asynccontextmanager
+async def slow_drive(seconds: float) -> AsyncIterator[tuple[Hcp2Controller, Bus]]:
+    """A drive that takes this time to reply, of which one value changes in steps."""
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(seconds, seconds))) as bus:
+        in_use(bus)
+        drive = Hcp2Controller(bus, 5)
+        await drive.read(10)
+        drive.element(10).limit(max_step=20)
+        yield drive, bus
+
+
 HCP2_WAYS: dict[str, Way] = {
     "its point": lambda drive, value: drive.element(10).write(value),
     "another point of it": lambda drive, value: drive.point("10").write(value),
@@ -304,11 +315,7 @@ async def test_a_step_counts_from_what_is_read_where_the_node_was_away() -> None
 @in_virtual_time
 async def test_the_time_of_a_write_counts_from_before_the_value_is_read_from_which_it_steps() -> None:
     slow = 0.03
-    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(slow, slow))) as bus:
-        in_use(bus)
-        drive = Hcp2Controller(bus, 5)
-        await drive.read(10)
-        drive.element(10).limit(max_step=20)
+    async with slow_drive(slow) as (drive, bus):
         began = bus.now()
         with pytest.raises(WriteUnconfirmed):
             await drive.write(10, 20, finish_within=2 * slow)
@@ -517,11 +524,7 @@ async def test_a_message_about_a_limit_has_the_unit_of_the_point() -> None:
 @in_virtual_time
 async def test_the_time_in_which_a_write_must_be_sent_counts_from_before_its_current_value_is_read() -> None:
     slow = 0.03
-    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(slow, slow))) as bus:
-        in_use(bus)
-        drive = Hcp2Controller(bus, 5)
-        await drive.read(10)
-        drive.element(10).limit(max_step=20)
+    async with slow_drive(slow) as (drive, _):
         writing = asyncio.ensure_future(drive.write(10, 20, start_within=1.5 * slow))
         await asyncio.sleep(0.001)
         reading = asyncio.ensure_future(drive.read(10))  # goes before the write, which waits for its value

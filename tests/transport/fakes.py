@@ -16,6 +16,9 @@ from typing import Any, cast
 
 import pytest
 
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.memory import MemoryTransport
+from busmaster.errors import LineDown
 from busmaster.testing.virtual_time import VirtualTimeLoop
 from busmaster.transport import serial_port
 from busmaster.transport.serial_port import PortTransport, SerialPort
@@ -204,3 +207,16 @@ def with_the_number_of(gone: PtyMaster) -> Iterator[PtyMaster]:
     finally:
         for end in (pty_master, *lower):
             end.forget()
+
+
+def without_rate(transport: MemoryTransport, baudrate: int) -> MemoryTransport:
+    """Return the transport as one of a port that does not take this rate."""
+    tune = transport.tune
+
+    async def choose(settings: LineSettings) -> None:
+        if settings.baudrate == baudrate:
+            raise LineDown(f"{baudrate} baud: invalid argument", hint="")
+        await tune(settings)
+
+    transport.tune = choose  # type: ignore[method-assign]  # of this one
+    return transport

@@ -846,7 +846,7 @@ class ModbusTcpServer:
 
     def close(self) -> None:
         """End all connections."""
-        for writer in (*self._open, *self._replaced):
+        for writer in self._open:
             writer.transport.abort()
 
     def _make_room(self, peer: str) -> bool:

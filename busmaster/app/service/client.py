@@ -633,7 +633,6 @@ class Client:
         self._gathered.pop(stream, None)
         group = self._groups.pop(stream, None)
         if group is not None:
-            self._line.of_programs.discard(group)
             group.close()
         self.dropped.pop(stream, None)
 

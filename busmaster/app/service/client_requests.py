@@ -349,17 +349,17 @@ def _left(options: CommandOptions, age: float, node: Node, command: Command[Any]
     """
     limit = options.get("start_within")
     if limit is not None and age > limit:
-        raise _arrived_late(age, node, command)
+        raise _arrived_late(age, node, command, f"its start_within of {limit:g} s was over; give it more time, or ")
     return shortened(options, age)
 
 
-def _arrived_late(age: float, node: Node, command: Command[Any]) -> NotStarted:
+def _arrived_late(age: float, node: Node, command: Command[Any], advice: str = "") -> NotStarted:
     late = f"{age:.1f} s" if age >= 1.0 else f"{age * 1000.0:.0f} ms"
     return NotStarted(
         f"the request arrived {late} after the program made it",
         node=node,
         command=str(command),
-        hint="check whether the requesting program, or the owner of the line, was stopped meanwhile",
+        hint=f"{advice}check whether the requesting program, or the owner of the line, was stopped meanwhile",
     )
 
 

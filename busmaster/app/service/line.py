@@ -6,7 +6,7 @@ from collections.abc import Collection, Hashable
 from functools import partial
 from math import inf, nextafter
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 from busmaster import Bus, InvalidCommand, Node, Point, PollGroup, ext
 from busmaster.app.service.authorisation import Authorisation
@@ -37,7 +37,7 @@ class ServedLine:
         """The events from now on, also before the line is served."""
         self._demanded: WeakKeyDictionary[PollGroup, dict[Role, float]] = WeakKeyDictionary()
         """When a role's programs last had a group polled off its grid."""
-        self.of_programs: set[PollGroup] = set()
+        self.of_programs: WeakSet[PollGroup] = WeakSet()
         """Poll groups of connected programs, which choose the names of their points."""
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None

@@ -52,6 +52,7 @@ HOSTS = ("localhost", "busmaster")
 MOST_WAITING_TO_CONNECT = 100
 NAME_WITHIN = 1.0
 """Seconds that the first client waits at most for this user's name. Audit entries then have the number."""
+WITHDRAWN = "this token is not valid any more"
 GROUPS_EVERY = 0.1
 """Seconds between two lists of the poll groups, however often clients open and close groups."""
 
@@ -313,7 +314,7 @@ class Service:
             if client.peer.may_stay(self.authorisation.access):
                 client.notify_access()
             else:
-                connection.cut("this token is not valid any more")
+                connection.cut(WITHDRAWN)
 
     def admit(self, connection: ClientConnection, message: ClientMessage, /) -> Client:
         """Admit a program by its first message, and reply to that. Raises Malformed."""
@@ -331,7 +332,7 @@ class Service:
                 INVALID_PARAMS,
             )
         if not connection.peer.may_stay(self.authorisation.access):
-            raise Malformed("this token is not valid any more")
+            raise Malformed(WITHDRAWN)
         permission = connection.peer.permission(self.authorisation.access)
         in_safe_place = self._admission.admit(permission, self._clients, safe_only=params.safe_only)
 

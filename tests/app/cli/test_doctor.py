@@ -41,7 +41,6 @@ from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
-from busmaster.errors import LineDown
 from busmaster.ext import Mark
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
@@ -50,7 +49,7 @@ from busmaster.transport import identity
 from busmaster.transport.serial_port import SerialPort
 from tests.app.cli.conftest import Command, without_time
 from tests.app.cli.conftest import Outcome as Ended
-from tests.transport.fakes import plugged
+from tests.transport.fakes import plugged, without_rate
 from tests.transport.rs485_driver import FakeDriver
 from tests.transport.usb import UsbTree
 
@@ -765,16 +764,7 @@ class Choosy(Tunable):
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
     ) -> MemoryTransport:
-        transport = await Tunable.open(self, protocol_factory, only)
-        tune = transport.tune
-
-        async def choose(settings: LineSettings) -> None:
-            if settings.baudrate == 9600:
-                raise LineDown("9600 baud: invalid argument", hint="")
-            await tune(settings)
-
-        transport.tune = choose  # type: ignore[method-assign]  # of this one
-        return transport
+        return without_rate(await Tunable.open(self, protocol_factory, only), 9600)
 
 
 def test_after_settings_that_the_port_does_not_take_the_next_are_tried() -> None:

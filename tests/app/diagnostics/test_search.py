@@ -30,10 +30,11 @@ from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.emulator.misheard import misheard
 from busmaster.emulator.traceable import TraceableMemory
-from busmaster.errors import InvalidCommand, LineDown
+from busmaster.errors import InvalidCommand
 from busmaster.registry import NodeKind, find, kinds, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.identity import Identity
+from tests.transport.fakes import without_rate
 
 MODULI = {"hcp": 10**12, "hcp2": 10**12, "microflex": 10**12, "msc": 2**31, "mentor": 10**4, "ct-ansi": 10**4}
 SHOWN = 3
@@ -525,16 +526,7 @@ class Choosy(Undeclared):
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> MemoryTransport:
-        transport = await MemoryPort.open(self, protocol_factory, only)
-        tune = transport.tune
-
-        async def choose(settings: LineSettings) -> None:
-            if settings.baudrate == 57600:
-                raise LineDown("57600 baud: invalid argument", hint="")
-            await tune(settings)
-
-        transport.tune = choose  # type: ignore[method-assign]  # of this one
-        return transport
+        return without_rate(await MemoryPort.open(self, protocol_factory, only), 57600)
 
 
 def test_settings_that_the_port_does_not_take_are_reported_and_left_out() -> None:

@@ -14,7 +14,7 @@ import struct
 import subprocess
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -1070,6 +1070,26 @@ def test_the_addresses_of_an_ipv6_network_have_few_requests_on_the_line_together
     asyncio.run(run())
 
 
+@contextlib.asynccontextmanager
+async def serving_at(host: str, owner: Owner) -> AsyncIterator[str]:
+    """Serve a line that is followed by no connection, and yield the address."""
+    line = connected(owner)
+    opened: asyncio.Queue[str] = asyncio.Queue()
+
+    async def follow() -> None:
+        await asyncio.Event().wait()
+
+    line.follow = follow  # type: ignore[method-assign,assignment]  # replaced here
+    values = values_of(line, row_of("1"))
+    serving = asyncio.ensure_future(modbus_tcp.serve(values, Rules(), (host, 0), opened.put_nowait, lambda _: None))
+    try:
+        async with asyncio.timeout(PATIENCE):
+            yield await opened.get()
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+
+
 def test_refused_writes_and_connections_of_the_server_are_reported_to_the_owner(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -1082,20 +1102,9 @@ def test_refused_writes_and_connections_of_the_server_are_reported_to_the_owner(
             reported.put_nowait((interface, kind, dict(peers)))
 
     async def story() -> list[tuple[str, str, dict[str, int]]]:
-        line = connected(Told())
-        opened: asyncio.Queue[str] = asyncio.Queue()
-
-        async def follow() -> None:
-            await asyncio.Event().wait()
-
-        line.follow = follow  # type: ignore[method-assign,assignment]  # replaced here
-        values = values_of(line, row_of("1"))
-        serving = asyncio.ensure_future(
-            modbus_tcp.serve(values, Rules(), ("127.0.0.1", 0), opened.put_nowait, lambda _: None)
-        )
         found = []
-        async with asyncio.timeout(PATIENCE):
-            port = int((await opened.get()).rpartition(":")[2])
+        async with serving_at("127.0.0.1", Told()) as address:
+            port = int(address.rpartition(":")[2])
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             writer.write(frame(bytes.fromhex("06 0000 0007"), unit=1))
             assert (await reader.readexactly(9))[-2:] == bytes.fromhex("86 01")
@@ -1104,8 +1113,6 @@ def test_refused_writes_and_connections_of_the_server_are_reported_to_the_owner(
             found.append(await reported.get())
             for one in (writer, beyond):
                 one.close()
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
         return found
 
     assert asyncio.run(story()) == [
@@ -1117,22 +1124,8 @@ def test_refused_writes_and_connections_of_the_server_are_reported_to_the_owner(
 @pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
 def test_an_ipv6_address_is_reported_in_brackets() -> None:
     async def story() -> str:
-        line = connected(Owner())
-        opened: asyncio.Queue[str] = asyncio.Queue()
-
-        async def follow() -> None:
-            await asyncio.Event().wait()
-
-        line.follow = follow  # type: ignore[method-assign,assignment]  # replaced here
-        values = values_of(line, row_of("1"))
-        serving = asyncio.ensure_future(
-            modbus_tcp.serve(values, Rules(), ("::1", 0), opened.put_nowait, lambda _: None)
-        )
-        async with asyncio.timeout(PATIENCE):
-            address = await opened.get()
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
-        return address
+        async with serving_at("::1", Owner()) as address:
+            return address
 
     assert re.fullmatch(r"\[::1\]:\d+", asyncio.run(story()))
 

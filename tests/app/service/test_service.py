@@ -6,13 +6,14 @@ import asyncio
 import os
 import socket
 import stat
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as connect_websocket
 from websockets.exceptions import ConnectionClosedError
 
@@ -276,34 +277,38 @@ def test_who_shows_no_token_has_not_failed_to_log_in(tmp_path: Path) -> None:
 
 
 def test_a_token_that_is_withdrawn_before_the_first_message_is_not_admitted(tmp_path: Path) -> None:
+    async def story(line: Served, connection: ClientConnection) -> None:
+        line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
+        said = await Raw(connection).ask("hello", versions=[3])
+        assert said["error"]["message"] == "this token is not valid any more"
+        assert line.service.clients == ()
+
+    with_a_token(tmp_path, story)
+
+
+def test_a_program_whose_token_is_withdrawn_gets_the_reason_for_its_end(tmp_path: Path) -> None:
+    async def story(line: Served, connection: ClientConnection) -> None:
+        assert "result" in await Raw(connection).ask("hello", versions=[3])
+        line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
+        await line.alone()
+        with pytest.raises(ConnectionClosedError) as closed:
+            await connection.recv()
+        assert closed.value.rcvd is not None
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "this token is not valid any more")
+
+    with_a_token(tmp_path, story)
+
+
+def with_a_token(folder: Path, story: Callable[[Served, ClientConnection], Awaitable[None]]) -> None:
+    """Run a story with a connection that shows a known token, before its first message."""
+
     async def run() -> None:
-        async with asyncio.timeout(PATIENCE), served(tmp_path, access=TOKENS, listen=("127.0.0.1", 0)) as line:
+        async with asyncio.timeout(PATIENCE), served(folder, access=TOKENS, listen=("127.0.0.1", 0)) as line:
             assert line.service.tcp_address is not None
             known = {"Authorization": f"Bearer {SECRET}"}
             address = line.service.tcp_address.replace("tcp://", "ws://")
             async with connect_websocket(address, additional_headers=known) as connection:
-                line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
-                said = await Raw(connection).ask("hello", versions=[3])
-                assert said["error"]["message"] == "this token is not valid any more"
-            assert line.service.clients == ()
-
-    asyncio.run(run())
-
-
-def test_a_program_whose_token_is_withdrawn_is_told_why_it_is_cut_off(tmp_path: Path) -> None:
-    async def run() -> None:
-        async with asyncio.timeout(PATIENCE), served(tmp_path, access=TOKENS, listen=("127.0.0.1", 0)) as line:
-            assert line.service.tcp_address is not None
-            known = {"Authorization": f"Bearer {SECRET}"}
-            address = line.service.tcp_address.replace("tcp://", "ws://")
-            async with connect_websocket(address, additional_headers=known) as connection:
-                assert "result" in await Raw(connection).ask("hello", versions=[3])
-                line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
-                await line.alone()
-                with pytest.raises(ConnectionClosedError) as closed:
-                    await connection.recv()
-                assert closed.value.rcvd is not None
-                assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "this token is not valid any more")
+                await story(line, connection)
 
     asyncio.run(run())
 
