@@ -200,6 +200,7 @@ class Writing:
         sender: RequestSender,
         client: LineClient,
         asked: float,
+        late: float,
         stops_seen: int | None,
         stop: bool,
     ) -> None:
@@ -214,6 +215,8 @@ class Writing:
         self._line = line
         self._sender = sender
         self._asked = asked
+        self._late = late
+        """Age of the request at its arrival, in seconds. This end's own time to begin does not make it late."""
         self._stop = stop
         self._begun = False
         self._cause = BY_PROGRAM
@@ -275,8 +278,9 @@ class Writing:
             # A stop is sent however late it comes: without it, the drive would go on.
             if (age := self._line.bus.now() - self._asked) > FRESH and not self._stop:
                 raise _arrived_late(age, self.node, self.command)
+            _check_arrival(self._options, self._late, self.node, self.command)
             self._request.options = ext.checked_options(
-                self.node, _left(self._options, self._line.bus.now() - self._asked, self.node, self.command)
+                self.node, shortened(self._options, self._line.bus.now() - self._asked)
             )
             value = await ext.run(self.node, self._request)
         except BaseException as error:
@@ -336,21 +340,31 @@ def client_request_of(params: RequestParams | WriteParams, sender: RequestSender
     now = line.bus.now()
     asked = now if params.requested is None else min(now, _requested(params.requested, now))
     if not command.writes:
-        options = RequestOptions.of(_left(given, now - asked, node, command), node.label)
+        _check_arrival(given, now - asked, node, command)
+        options = RequestOptions.of(shortened(given, now - asked), node.label)
         options = replace(options, priority=max(options.priority, sender.rights.reads))
         return Reading(node, command, client, stops_seen, options)
-    return Writing(task, given, line=line, sender=sender, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+    return Writing(
+        task,
+        given,
+        line=line,
+        sender=sender,
+        client=client,
+        asked=asked,
+        late=now - asked,
+        stops_seen=stops_seen,
+        stop=stop,
+    )
 
 
-def _left(options: CommandOptions, age: float, node: Node, command: Command[Any]) -> CommandOptions:
-    """Return the options of a request that is `age` seconds old, its times reduced by that.
+def _check_arrival(options: CommandOptions, age: float, node: Node, command: Command[Any]) -> None:
+    """Raise NotStarted for a request that arrives, `age` seconds old, after its `start_within`.
 
-    Raises NotStarted if its `start_within` is over: on an idle line, a request that may start at once is always sent.
+    An idle line would send it: there, a request with no time left to wait does not have to wait.
     """
     limit = options.get("start_within")
     if limit is not None and age > limit:
         raise _arrived_late(age, node, command, f"its start_within of {limit:g} s was over; give it more time, or ")
-    return shortened(options, age)
 
 
 def _arrived_late(age: float, node: Node, command: Command[Any], advice: str = "") -> NotStarted:

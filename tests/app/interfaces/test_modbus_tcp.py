@@ -419,6 +419,8 @@ def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
                 await serving
             assert await is_closed(reader)
             writer.transport.abort()
+            with pytest.raises(ConnectionRefusedError):
+                await asyncio.open_connection(host, int(port))
 
     asyncio.run(run())
 

@@ -112,10 +112,11 @@ def test_what_could_not_be_written_at_the_end_is_written_by_the_next_process(tmp
     assert numbers(tmp_path / "x") == list(range(1, 52))
 
 
+@pytest.mark.parametrize(("hurry", "written"), [(0.0, 1), (PATIENCE, 50)])
 def test_what_a_slow_output_cannot_write_until_it_must_end_goes_to_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurry: float, written: int
 ) -> None:
-    monkeypatch.setattr(batches, "HURRY", 0.0)
+    monkeypatch.setattr(batches, "HURRY", hurry)
     monkeypatch.setattr(batches, "BATCH", 1)
 
     class Slow(CsvOutput):
@@ -133,10 +134,10 @@ def test_what_a_slow_output_cannot_write_until_it_must_end_goes_to_disk(
     until(lambda: len(output._batch) == 1)
     output.close(PATIENCE)
     counts = output.statistics()
-    assert (counts.written, counts.dropped, counts.spilled) == (1, 0, 49)
+    assert (counts.written, counts.dropped, counts.spilled) == (written, 0, 50 - written)
     again = CsvOutput("csv", settings)
     again.start()
-    until(lambda: again.written == 49)
+    until(lambda: again.written == 50 - written)
     again.close(PATIENCE)
     assert numbers(tmp_path / "x") == list(range(1, 51))
 

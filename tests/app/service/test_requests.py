@@ -118,9 +118,14 @@ def test_a_request_that_came_after_its_time_is_not_sent_on_an_idle_line_either(
             for late, options in ((0.9, {"start_within": 0.5}), (0.9, {"finish_within": 0.5})):
                 said = await client.ask("request", **request_, requested=line.bus.now() - late, options=options)
                 assert error_of(said) == "NotStarted"
+                hint = "its start_within of 0.5 s was over; give it more time" if "start_within" in options else ""
+                assert hint in said["error"]["data"]["hint"]
             assert await controller.read(1) == 0
             in_time = {"start_within": PATIENCE, "finish_within": PATIENCE}
             assert "result" in await client.ask("request", **request_, requested=line.bus.now(), options=in_time)
+            at_once = {"start_within": 0.0}  # from its arrival, or from a time ahead of this clock, it is in time
+            for requested in ({}, {"requested": line.bus.now() + FARTHEST_REQUESTED / 2}):
+                assert "result" in await client.ask("request", **request_, **requested, options=at_once)
 
     on_a_line(tmp_path, story)
 
@@ -850,11 +855,18 @@ def test_points_without_a_name_have_keys_of_their_own(tmp_path: Path) -> None:
         point = polled(1)["points"][0]
         del point["item"]
         reads = [{"command": "read", "element": element} for element in (1, 2)]
-        points = [{**point, "key": "speed"}, *({**point, "command": read} for read in reads)]
+        points = [
+            {**point, "key": "winder/force", "item": "force"},
+            {**point, "key": "speed"},
+            *({**point, "command": read} for read in reads),
+        ]
         async with raw(line) as client:
             await client.say(method="poll", params=polled(1, points=points), id=1)
             body = (await client.hear())["params"]["body"]
-            assert [one["key"] for one in body["points"]] == ["5/speed", "5/read element 1", "5/read element 2"]
+            assert [one["key"] for one in body["points"]] == [
+                *("5/force", "5/speed"),
+                *("5/read element 1", "5/read element 2"),
+            ]
 
     on_a_line(tmp_path, story)
 

@@ -299,6 +299,19 @@ def test_a_program_whose_token_is_withdrawn_gets_the_reason_for_its_end(tmp_path
     with_a_token(tmp_path, story)
 
 
+def test_a_program_whose_token_is_withdrawn_is_cut_off_although_it_does_not_read(tmp_path: Path) -> None:
+    async def story(line: Served, connection: ClientConnection) -> None:
+        assert "result" in await Raw(connection).ask("hello", versions=[3])
+        connection.transport.pause_reading()
+        line.authorisation.take_secrets({"hmi": digest_of("a-newer-token-of-the-hmi")})
+        for _ in range(5):  # turns of the loop: nothing of the other end is awaited
+            await asyncio.sleep(0)
+        assert line.service.clients == ()
+        connection.transport.abort()
+
+    with_a_token(tmp_path, story)
+
+
 def with_a_token(folder: Path, story: Callable[[Served, ClientConnection], Awaitable[None]]) -> None:
     """Run a story with a connection that shows a known token, before its first message."""
 
