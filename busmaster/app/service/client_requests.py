@@ -36,6 +36,7 @@ from busmaster.ext import (
 INTERFACE = "service"
 BY_PROGRAM, BY_OWNER = "its program cancelled it", "the program that owns the line ended"
 """Why a request was cancelled."""
+CHECK_WHETHER_STOPPED = "check whether the requesting program, or the owner of the line, was stopped meanwhile"
 
 
 class RequestSender(Protocol):
@@ -277,7 +278,7 @@ class Writing:
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             # A stop is sent however late it comes: without it, the drive would go on.
             if (age := self._line.bus.now() - self._asked) > FRESH and not self._stop:
-                raise _arrived_late(age, self.node, self.command)
+                raise _arrived_late(age, self.node, self.command, CHECK_WHETHER_STOPPED)
             _check_arrival(self._options, self._late, self.node, self.command)
             self._request.options = ext.checked_options(
                 self.node, shortened(self._options, self._line.bus.now() - self._asked)
@@ -364,16 +365,17 @@ def _check_arrival(options: CommandOptions, age: float, node: Node, command: Com
     """
     limit = options.get("start_within")
     if limit is not None and age > limit:
-        raise _arrived_late(age, node, command, f"its start_within of {limit:g} s was over; give it more time, or ")
+        over = f"its start_within of {limit:g} s was over; give it more time, or {CHECK_WHETHER_STOPPED}"
+        raise _arrived_late(age, node, command, over)
 
 
-def _arrived_late(age: float, node: Node, command: Command[Any], advice: str = "") -> NotStarted:
+def _arrived_late(age: float, node: Node, command: Command[Any], hint: str) -> NotStarted:
     late = f"{age:.1f} s" if age >= 1.0 else f"{age * 1000.0:.0f} ms"
     return NotStarted(
         f"the request arrived {late} after the program made it",
         node=node,
         command=str(command),
-        hint=f"{advice}check whether the requesting program, or the owner of the line, was stopped meanwhile",
+        hint=hint,
     )
 
 
