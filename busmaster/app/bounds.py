@@ -41,6 +41,9 @@ SHORTEST_TOKEN = 16
 
 LONGEST_REQUEST = 1 << 16
 """Bytes of one message of a client: the time for parsing one delays the line."""
+READ_AT_ONCE = 512
+"""Bytes of one connection, also to the web page, that are read in one turn of the loop: two or three requests, or
+eighty of the smallest frames."""
 MOST_PARTS = 1 << 13
 """Values in one message of a client: of as many bytes, those of many small ones take longest to understand."""
 LONGEST_ANSWER = 1 << 20

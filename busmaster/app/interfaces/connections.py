@@ -17,7 +17,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from busmaster.app.bounds import MOST_PAGE_CONNECTIONS, REQUEST_WITHIN, SEND_WITHIN
+from busmaster.app.bounds import MOST_PAGE_CONNECTIONS, READ_AT_ONCE, REQUEST_WITHIN, SEND_WITHIN
 from busmaster.app.service.refusals import LimitedReport
 
 RESERVED = 128
@@ -66,10 +66,16 @@ class Crowd:
 
 
 class _Taken:
-    """A connection whose client must read its messages. One that reads nothing for SEND_WITHIN is closed."""
+    """A connection of which READ_AT_ONCE bytes are handled in a turn of the loop, so that all others get their turns,
+    and whose client must read its messages. One that reads nothing for SEND_WITHIN is closed."""
 
     transport: Any
     _reading: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        # The library handles all that it gets in one turn: of 256 KiB, which is asyncio's value, that is a second.
+        transport.max_size = READ_AT_ONCE
+        super().connection_made(transport)  # type: ignore[misc]
 
     def pause_writing(self) -> None:
         super().pause_writing()  # type: ignore[misc]

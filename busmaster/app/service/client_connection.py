@@ -7,7 +7,7 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
-from busmaster.app.bounds import HELLO_WITHIN, LONGEST_REQUEST
+from busmaster.app.bounds import HELLO_WITHIN, LONGEST_REQUEST, READ_AT_ONCE
 from busmaster.app.service.client import Client
 from busmaster.app.service.client_messages import ClientMessage
 from busmaster.app.service.connection import GOING_AWAY, POLICY, IncomingConnection
@@ -23,10 +23,6 @@ from busmaster.app.service.peers import Peer
 
 if TYPE_CHECKING:
     from websockets.http11 import Request
-
-READ_AT_ONCE = 512
-"""Bytes of a connection that are read in one turn of the line's loop: two or three requests, or eighty of the smallest
-frames."""
 
 
 class MessageOrder:

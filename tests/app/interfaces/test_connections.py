@@ -11,7 +11,10 @@ from typing import Any
 
 import httpx2 as httpx
 import pytest
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
+from busmaster.app.bounds import READ_AT_ONCE
 from busmaster.app.interfaces import connections
 from busmaster.app.interfaces.connections import FEWEST, RESERVED, Crowd, most_connections
 from busmaster.app.interfaces.guard import Guard
@@ -119,6 +122,42 @@ async def test_a_connection_that_became_a_pages_waits_for_no_request_and_is_not_
         assert connection._request is None  # nothing closes it later
         assert not crowds[0]._waiting
         end[1].transport.abort()
+
+
+@pytest.mark.asyncio
+async def test_only_a_small_part_of_what_a_client_sends_is_handled_in_a_turn_of_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: dict[type, list[int]] = {H11Protocol: [], WebSocketsSansIOProtocol: []}
+
+    def note(library: type) -> None:
+        data_received = library.data_received  # type: ignore[attr-defined]
+
+        def noting(connection: Any, data: bytes) -> None:
+            sizes[library].append(len(data))
+            data_received(connection, data)
+
+        monkeypatch.setattr(library, "data_received", noting)
+
+    for library in sizes:
+        note(library)
+    pings, body = 2000, b" " * 20_000
+    async with page(tmp_path) as of:
+        reader, writer = await end_of(of.url)
+        writer.write(b"PUT %b HTTP/1.1\r\nHost: 127.0.0.1\r\n" % ONE.encode())
+        writer.write(b"Content-Type: application/json\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
+        assert await asyncio.wait_for(reader.readline(), PATIENCE)
+        writer.transport.abort()
+        reader, writer = await end_of(of.url)
+        writer.write(UPGRADE)
+        await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
+        writer.write(b"\x89\x80\0\0\0\0" * pings)
+        async with asyncio.timeout(PATIENCE):
+            for _ in range(pings):
+                await reader.readuntil(b"\x8a\0")
+        writer.transport.abort()
+    for received in sizes.values():
+        assert max(received) <= READ_AT_ONCE
 
 
 @pytest.mark.asyncio

@@ -15,9 +15,10 @@ from websockets.exceptions import ConnectionClosed
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, connect
 from busmaster.app import bounds
+from busmaster.app.bounds import READ_AT_ONCE
 from busmaster.app.service import plans
 from busmaster.app.service.client import Client
-from busmaster.app.service.client_connection import READ_AT_ONCE, ClientConnection, MessageOrder
+from busmaster.app.service.client_connection import ClientConnection, MessageOrder
 from busmaster.app.service.client_messages import CancelParams, ClientMessage, RequestParams, StreamParams
 from busmaster.app.service.folder import Owner, ServedSocket
 from busmaster.app.service.messages import decode_client_message, encode_notification, encode_request
