@@ -159,7 +159,7 @@ class Superseded(BusError):
 class NodeDown(BusError):
     """The node is DOWN, and the request was not sent."""
 
-    hint = "it is probed automatically; node.probe() sends a probe now"
+    hint = "it is probed automatically, and node.probe() sends a probe now; node.suspend(0) ends a suspension"
 
 
 class NotStarted(BusError, TimeoutError):
