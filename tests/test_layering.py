@@ -52,7 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "emulator.world": {"emulator", "wire", "arbiter"} | BASE,
     "emulator.memory": {"emulator", "transport"} | BASE,
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable"} | BASE,
-    "capture": {"capture", "wire", "registry", "transport.files"} | BASE,
+    "capture": {"capture", "wire", "registry", "transport.files", "transport.clock"} | BASE,
     "testing": LIBRARY - {"protocols"},
     "testing.bench": {"", "testing", "ext", "emulator"} | BASE,
     "__init__": LIBRARY | ON_DEMAND,

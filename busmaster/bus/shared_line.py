@@ -4,7 +4,6 @@ stale."""
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable, Hashable
 from math import inf
 from threading import current_thread, get_ident
@@ -28,11 +27,8 @@ from busmaster.contract.places import Changing, Placed
 from busmaster.contract.tap import Attempt, Tap
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from busmaster.planning import Sharing
+from busmaster.transport.clock import TimeOfDay
 from busmaster.transport.pump import Pump
-
-# The two clocks are read one after the other, so their difference varies a little although neither was set.
-CLOCK_WAS_SET = 0.005
-"""Difference in seconds above which the machine's clock counts as set."""
 
 # Not None, which `running_loop` returns outside of a loop: a request there would pass the check for an open bus.
 NO_LOOP = object()
@@ -134,7 +130,7 @@ class SharedLine:
         # By node, (node, command) or (node, place), because not every write declares which values it changes.
         self._touched: dict[object, float] = {}
         self._written: dict[NodeRecord, float] = {}
-        self._wall_offset = inf
+        self._time_of_day = TimeOfDay(self.now)
 
     def take_writes_again(self) -> None:
         """Accept all writes again, unless another caller still allows only safe writes."""
@@ -196,18 +192,8 @@ class SharedLine:
         return self.pump.clock()
 
     def wall_offset(self) -> float:
-        """Return the offset from the bus's clock to seconds since 1970, by the machine's clock.
-
-        The value stays exactly the same until the machine's clock is set.
-        """
-        before, wall = self.now(), time.time()
-        if self.now() - before > CLOCK_WAS_SET:
-            # The process was stopped between the two readings, for example by a debugger: the clock was not set.
-            before, wall = self.now(), time.time()
-        offset = wall - before
-        if abs(offset - self._wall_offset) > CLOCK_WAS_SET:
-            self._wall_offset = offset
-        return self._wall_offset
+        """Return the offset from the bus's clock to seconds since 1970, by the machine's clock."""
+        return self._time_of_day.offset()
 
     # polls
 

@@ -89,7 +89,7 @@ class _Exchange:
 
 class Assembler:
     """Creates packets and passes them to `write`, in order. `now` is in seconds; `offset` converts it to seconds since
-    1970.
+    1970, and may be changed.
 
     `protocol`: the protocol if nothing else determines it: on a line that is listened to, and before the first request.
     It also names the kind of node if several use that protocol. `echo`: sent bytes are received too, and are left out.
@@ -106,7 +106,7 @@ class Assembler:
         self._echo = echo
         self._echo_pending = b""
         self._sent = b""
-        self._offset = offset
+        self.offset = offset
         self._decoders: dict[str, Decoder] = {}
         self._asked: Attempt | None = None
         self._is_sender_known = False
@@ -278,7 +278,7 @@ class Assembler:
         target.outcome, target.comment = outcome, comment
 
     def _micros(self, now: float) -> int:
-        return round((now + self._offset) * 1e6)
+        return round((now + self.offset) * 1e6)
 
 
 def why_asked(attempt: Attempt) -> str:

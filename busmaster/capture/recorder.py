@@ -18,6 +18,7 @@ from busmaster.capture.files import COUNT, SIZE, CaptureFiles
 from busmaster.capture.pcapng import Packet, PcapngWriter
 from busmaster.contract.frames import Direction
 from busmaster.contract.tap import Attempt
+from busmaster.transport.clock import TimeOfDay
 
 CAPACITY = 50_000
 """Events that can wait for the disk: minutes of a line at 57600 baud."""
@@ -85,8 +86,8 @@ class Recorder:
         self._file_ended = False
         """The file has its closing statistics, but the next one could not be created yet."""
         self._reported = 0
-        offset = time.time() - time.monotonic()
-        self._assembler = Assembler(self._write, protocol=protocol, echo=echo, offset=offset)
+        self._time_of_day = TimeOfDay(time.monotonic)
+        self._assembler = Assembler(self._write, protocol=protocol, echo=echo)
         self._thread = threading.Thread(target=self._run, name="busmaster capture", daemon=True)
         self._thread.start()
 
@@ -168,6 +169,7 @@ class Recorder:
 
     def _drain(self) -> None:
         """Write waiting events in small batches, so that the loop never waits long for the interpreter."""
+        self._assembler.offset = self._time_of_day.offset()  # the machine's clock may have been set
         handled = 0
         # While the disk is full the events stay in the queue, whose size is bounded.
         while self._events and self.error is None:

@@ -62,6 +62,21 @@ def test_an_exchange_is_on_disk_when_the_recorder_is_closed(tmp_path: Path) -> N
     assert (tap.dropped, tap.error) == (0, None)
 
 
+def test_packets_follow_a_clock_that_was_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, wall = tmp_path / "line.pcapng", time.time
+    with Recorder(path) as tap:
+        now = time.monotonic()
+        for _ in range(2):
+            tap.transmitted(now, REQUEST, attempt())
+            tap.transmitted(now, REQUEST, attempt())  # the packet before it is written then
+            size = path.stat().st_size
+            until_larger(path, size)
+            monkeypatch.setattr(time, "time", lambda: wall() + 3600.0)
+    with path.open("rb") as file:
+        packets = list(read_packets(file))
+    assert 3599 < (packets[-1].micros - packets[0].micros) / 1e6 < 3601
+
+
 def test_what_does_not_fit_is_dropped_and_counted_in_the_file_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
