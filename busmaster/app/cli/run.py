@@ -223,8 +223,7 @@ class Running:
         ext.accept_device(self.line.bus)
         try:
             file, secrets = await anyio.to_thread.run_sync(self._checked_file)
-            await self.line.take(file)
-            self.line.authorisation.take_secrets(secrets)
+            await self.line.take(file, secrets)
         except (InvalidCommand, OSError) as error:
             note(f"reload failed, nothing was changed: {error}", Level.ERROR)
         else:

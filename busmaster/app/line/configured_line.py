@@ -165,8 +165,9 @@ class ConfiguredLine:
             await self._kept_times.close()
             await self.outputs.close()
 
-    async def take(self, file: LineFile) -> None:
-        """Apply a changed file. Unchanged groups keep their grid and streams.
+    async def take(self, file: LineFile, secrets: Mapping[str, bytes] | None = None) -> None:
+        """Apply a changed file and its tokens, digests by name; None keeps the present ones. Unchanged groups keep their
+        grid and streams.
 
         Groups whose section or points changed are closed and created again. So are outputs; the other outputs are
         reopened. Raises InvalidCommand, before any change, for changes that need a restart, such as another port or
@@ -185,7 +186,8 @@ class ConfiguredLine:
         self._wanted = self._members_of_groups()
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.authorisation.safe_state = self.safe_state
-        self.authorisation.access = access_of(file.service, self, self.authorisation.access.secrets)
+        secrets = self.authorisation.access.secrets if secrets is None else secrets
+        self.authorisation.access = access_of(file.service, self, secrets)
         for name, group in list(self.groups.items()):
             same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]
             # by identity: points are equal whatever their scale and unit, which may be what changed

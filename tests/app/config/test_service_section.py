@@ -19,7 +19,7 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.service import read_tokens
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
-from busmaster.app.service.permission import Permission, digest_of
+from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.rights import Role
 from busmaster.contract.bounds import LONGEST_FILE
 from busmaster.errors import InvalidCommand
@@ -266,17 +266,21 @@ def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Pat
 def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> None:
     line = ConfiguredLine(parse(f'{TEXT}[service.users.{USER}]\nrole = "read"\n'), outputs=False)
 
+    def access() -> Access:
+        return line.authorisation.access
+
     async def run() -> None:
         with pytest.raises(InvalidCommand, match=r"changes of \[service\] need a restart"):
             await line.take(parse(f'{TEXT}[service]\nlisten = "127.0.0.1:7420"\n'))
         line.authorisation.take_secrets({"hmi": b"kept"})
-        line.authorisation.on_access.append(lambda: told.append(line.authorisation.access.users[0].writes))
+        line.authorisation.on_access.append(lambda: told.append((access().users[0].writes, dict(access().secrets))))
         await line.take(parse(f'{TEXT}[service.users.{USER}]\nrole = "write"\n'))
+        await line.take(parse(f'{TEXT}[service.users.{USER}]\nrole = "read"\n'), {"view": b"new"})
+        await line.take(parse(f'{TEXT}[service.users.{USER}]\nrole = "read"\n'), {})
 
-    told: list[bool] = []
+    told: list[tuple[bool, dict[str, bytes]]] = []
     asyncio.run(run())
-    assert told == [True]
-    assert line.authorisation.access.secrets == {"hmi": b"kept"}
+    assert told == [(True, {"hmi": b"kept"}), (False, {"view": b"new"}), (False, {})]
 
 
 def test_the_share_of_line_time_that_each_program_has() -> None:
