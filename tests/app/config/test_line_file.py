@@ -203,9 +203,14 @@ def test_a_line_has_the_name_of_its_file_unless_the_file_has_a_title() -> None:
     assert read(Source("/etc/lines/slitter.toml", f'title = "Slitter 2"\n{HEAD}{NODE}')).title == "Slitter 2"
 
 
-def test_a_title_has_as_many_characters_as_the_bound() -> None:
-    title = "x" * LONGEST_TITLE
+@pytest.mark.parametrize("character", ["x", "°", "張", "🏭"])
+def test_a_title_has_as_many_characters_as_the_bound_whatever_bytes_they_take(character: str) -> None:
+    title = character * LONGEST_TITLE
     assert parse(f'title = "{title}"\n{HEAD}{NODE}').title == title
+    with pytest.raises(FileError) as caught:
+        parse(f'title = "{title}{character}"\n{HEAD}{NODE}')
+    bound = f"at most {LONGEST_TITLE} characters, not {LONGEST_TITLE + 1}"
+    assert str(caught.value) == f"line.toml:1: title: must have {bound}"
 
 
 def test_symbols_stand_for_addresses_of_thirty_two_bits() -> None:
