@@ -504,6 +504,13 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             f"{SLOW}{PRESS}address_step = 4\n[groups.g]\nperiod = 1\npoints = ['press/2000:33']",
             "line.toml:8: groups.g.points[1]: a point that is polled has at most 32 values",
         ),
+        *(
+            (
+                f"{HEAD}[outputs.sqlite]\npath = 'x'\n{key} = 0",
+                f"line.toml:4: outputs.sqlite.{key}: must be more than 0, not 0; leave it out to keep all",
+            )
+            for key in ("keep_days", "keep_mb")
+        ),
         (f"{HEAD}[outputs.sqlit]\npath = 'x'", "line.toml:2: outputs.sqlit: no such key; did you mean 'sqlite'?"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\ngroups = ['g']", "line.toml:4: outputs.csv.groups[1]: no such group 'g'"),
         (
