@@ -64,7 +64,8 @@ class Source:
             self.data: dict[str, Any] = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             found = AT.search(str(error))
-            line = (found and found[1]) or text.rstrip("\n").count("\n") + 1  # "at end of document"
+            # "at end of document" has no number. TOML has no line ends but these; `splitlines` has more.
+            line = (found and found[1]) or text.removesuffix("\n").count("\n") + 1
             what = AT.sub("", str(error))
             raise FileError(name, int(line), "", f"not valid TOML: {what[:1].lower()}{what[1:]}") from None
         self.problems: dict[tuple[str, str], FileError] | None = None

@@ -203,9 +203,14 @@ def test_a_line_has_the_name_of_its_file_unless_the_file_has_a_title() -> None:
     assert read(Source("/etc/lines/slitter.toml", f'title = "Slitter 2"\n{HEAD}{NODE}')).title == "Slitter 2"
 
 
-def test_a_title_has_as_many_characters_as_the_bound() -> None:
-    title = "x" * LONGEST_TITLE
+@pytest.mark.parametrize("character", ["x", "°", "張", "🏭"])
+def test_a_title_has_as_many_characters_as_the_bound_whatever_bytes_they_take(character: str) -> None:
+    title = character * LONGEST_TITLE
     assert parse(f'title = "{title}"\n{HEAD}{NODE}').title == title
+    with pytest.raises(FileError) as caught:
+        parse(f'title = "{title}{character}"\n{HEAD}{NODE}')
+    bound = f"at most {LONGEST_TITLE} characters, not {LONGEST_TITLE + 1}"
+    assert str(caught.value) == f"line.toml:1: title: must have {bound}"
 
 
 def test_symbols_stand_for_addresses_of_thirty_two_bits() -> None:
@@ -498,6 +503,13 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (
             f"{SLOW}{PRESS}address_step = 4\n[groups.g]\nperiod = 1\npoints = ['press/2000:33']",
             "line.toml:8: groups.g.points[1]: a point that is polled has at most 32 values",
+        ),
+        *(
+            (
+                f"{HEAD}[outputs.sqlite]\npath = 'x'\n{key} = 0",
+                f"line.toml:4: outputs.sqlite.{key}: must be more than 0, not 0; leave it out to keep all",
+            )
+            for key in ("keep_days", "keep_mb")
         ),
         (f"{HEAD}[outputs.sqlit]\npath = 'x'", "line.toml:2: outputs.sqlit: no such key; did you mean 'sqlite'?"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\ngroups = ['g']", "line.toml:4: outputs.csv.groups[1]: no such group 'g'"),

@@ -95,8 +95,9 @@ def test_every_value_of_the_examples_has_a_place_on_a_line_that_names_it(path: P
         ("a = 1\nb 2\n", "x.toml:2: not valid TOML: expected '=' after a key"),
         ("a = 1\na = 2\n", "x.toml:2: not valid TOML: cannot overwrite a value"),
         ('a = 1\n\nb = "no end', "x.toml:3: not valid TOML: unterminated string"),
-        ("a = 1\nb = [1,\n", "x.toml:2: not valid TOML: invalid value"),
-        ("a = 1 # one line of TOML\u2028\nb =", "x.toml:2: not valid TOML: invalid value"),
+        ("a = 1\r\n\r\nb = [1,\r\n", "x.toml:3: not valid TOML: invalid value"),
+        ("a = [", "x.toml:1: not valid TOML: invalid value"),
+        ('a = "1\u2028\x85" # \u2029\nb = "no end', "x.toml:2: not valid TOML: unterminated string"),
     ],
 )
 def test_what_is_no_toml_is_said_with_its_line(text: str, complaint: str) -> None:

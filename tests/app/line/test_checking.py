@@ -393,9 +393,12 @@ def test_each_missing_file_of_an_output_is_reported_once_with_its_key_as_by_run_
 
 def test_a_missing_token_file_hides_no_problem_of_another_table(tmp_path: Path) -> None:
     safe = '[safe]\nwrites = { "winder/?" = 0 }\n'
-    mqtt = '[outputs.mqtt]\npassword_file = "/no/such/password"\n'
+    mqtt = '[outputs.mqtt]\ntls = true\npassword_file = "/no/such/password"\nca_file = "/no/such/ca"\n'
     service = '[service]\nlisten = "127.0.0.1:7420"\ntoken_file = "/no/such/tokens"\n'
     found = problems(tmp_path, f"{GOOD}{safe}{mqtt}{service}")
     assert [error.key for error in found] == [
-        *("safe.writes.winder/?", "outputs.mqtt.password_file", "service.token_file"),
+        "safe.writes.winder/?",
+        "outputs.mqtt.password_file",
+        "outputs.mqtt.ca_file",
+        "service.token_file",
     ]

@@ -120,6 +120,16 @@ def test_what_goes_out_gives_the_same_points_to_a_file_without_any() -> None:
     assert back.text.startswith(HEAD)
 
 
+def test_texts_are_written_with_their_own_characters_and_only_control_characters_are_escaped() -> None:
+    unit, label = 'unit = "µm/°C 🏭\\n\\u007f"', '0 = "geöffnet"'
+    held = file(f'[nodes.w.points]\na = {{ item = "10", {unit}, labels = {{ {label} }} }}\n', "")
+    back = taken(file("", ""), "points.csv", points_csv(held))
+    [point] = [line for line in back.text.splitlines() if "µm" in line]
+    assert unit in point
+    assert label in point
+    assert read(Source("line.toml", back.text)).nodes == held.nodes
+
+
 @settings(max_examples=30)
 @given(
     unit=st.text(st.characters(exclude_categories=["Cs"])),

@@ -189,6 +189,18 @@ def test_the_range_of_a_number_is_that_of_its_own_narrowest_limits() -> None:
     assert [component for component, _ in made(point, 1.0, commands={"5/10": point})] == ["sensor"], "one value"
 
 
+def test_a_limit_of_zero_bounds_the_range_of_a_number_at_either_end() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    controller = Hcp2Controller(bus, 5)
+    up, down = controller.point("10"), controller.point("11")
+    up.limit(minimum=-5, maximum=400)
+    up.limit(minimum=0)
+    down.limit(minimum=-400, maximum=5)
+    down.limit(maximum=0)
+    configs = [made(point, -1.0, commands={point.key: point})[0][1] for point in (up, down)]
+    assert [(number["min"], number["max"]) for number in configs] == [(0, 400), (-400, 0)]
+
+
 def test_names_in_topics_have_the_characters_that_are_allowed_and_stay_different() -> None:
     names = ("axis0.position", "axis0_position", "axis0-position", "axis0-2e-position", "Länge", "a+b", "a/b")
     topics = set()
