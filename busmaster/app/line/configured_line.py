@@ -169,8 +169,8 @@ class ConfiguredLine:
         """Apply a changed file, and its tokens: digests by name; None keeps the present ones.
 
         Unchanged groups keep their grid and streams. Groups whose section or points changed are closed and created
-        again. So are outputs; the other outputs are reopened. Raises InvalidCommand, before any change, for changes that need a restart, such as another port or
-        other settings of a node. The file must be valid for a line.
+        again. So are outputs; the other outputs are reopened. Raises InvalidCommand, before any change, for changes
+        that need a restart, such as another port or other settings of a node. The file must be valid for a line.
         """
         check_same_line(self.file, file)
         fresh = {name: self._handle(node) for name, node in file.nodes.items() if name not in self.nodes}
