@@ -219,7 +219,12 @@ class Output(ABC):
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(within)
-        self.dropped += self._left() - self.spilled
+        left = self._left() - self.spilled
+        if left and self._thread.is_alive():
+            self._report(
+                f"{self.kind} did not end within {within:g} s: {left} values count as dropped, and may still be written"
+            )
+        self.dropped += left
         for entry, _ in list(self._promised.values()):
             self.settle_entry(entry, f"{self.kind} ended before it was written")
 

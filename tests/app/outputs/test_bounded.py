@@ -144,16 +144,19 @@ def test_a_bug_in_an_output_does_not_end_it() -> None:
 
 
 def test_what_is_left_when_it_is_closed_is_counted_as_dropped() -> None:
-    output = Shelf()
+    said: list[str] = []
+    output = Shelf(report=said.append)
     output.broken = OSError("gone")
     output.start()
     offer(output, 1, 5)
     output.close(PATIENCE)
     assert (output.written, output.dropped) == (0, 10)
+    assert said == ["shelf is down: gone"]
 
 
 def test_one_that_hangs_is_not_waited_for() -> None:
-    output = Shelf()
+    said: list[str] = []
+    output = Shelf(report=said.append)
     output.let.clear()
     output.start()
     offer(output, 1, 1)
@@ -161,6 +164,7 @@ def test_one_that_hangs_is_not_waited_for() -> None:
     output.close(0.01)
     assert output._thread.is_alive()
     assert output.dropped == 2
+    assert said == ["shelf did not end within 0.01 s: 2 values count as dropped, and may still be written"]
     output.let.set()
     assert output._thread.daemon, "or it would keep the process from ending"
 
