@@ -27,8 +27,12 @@ class ProtocolOption(click.Option):
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         """Return the help, with the names of all protocols in it."""
-        self.help = (self.help or "").replace("{}", ", ".join(kinds()))
-        return super().get_help_record(ctx)
+        text = self.help or ""
+        self.help = text.replace("{}", ", ".join(kinds()))
+        try:
+            return super().get_help_record(ctx)
+        finally:
+            self.help = text
 
 
 def protocol_option(*, required: bool = True, text: str = "One of {}.") -> Callable[[F], F]:
