@@ -479,6 +479,7 @@ def test_a_number_that_is_too_large_is_not_said_to_be_none() -> None:
         (b'{"id": "a", "value": "NaN"}', "a"),
         (b'{"id": 7, "value": NaN}', "7"),
         (b'{"id": 7}', "7"),
+        (b'{"id": 0}', "0"),
         (b'{"id": 7, "value": 1, "x": 2}', "7"),
         (b'{"id": 7, "value": 1e308}', "7"),
         (b'{"id": 7, "value": 1, "expires": "soon"}', "7"),

@@ -19,13 +19,15 @@ from busmaster.app.service.payload import LATEST, NoCommand, Payload, read_paylo
         (bytearray(b"[-1]"), Payload([-1])),
         (json.dumps({"value": 1, "id": "x" * LONGEST_ID}), Payload(1, "x" * LONGEST_ID)),
         ('{"value": 1, "id": -7}', Payload(1, "-7")),
+        ('{"value": 1, "id": 0}', Payload(1, "0")),
+        ('{"value": 0, "id": "0"}', Payload(0, "0")),
         ('{"value": 1, "id": ""}', Payload(1)),
         (json.dumps([LARGEST_VALUE, -LARGEST_VALUE]), Payload([LARGEST_VALUE, -LARGEST_VALUE])),
         (json.dumps({"value": 1, "expires": LATEST}), Payload(1, "", LATEST)),
         ('{"value": 1, "expires": 0}', Payload(1, "", 0)),
         ('{"value": 1, "expires": null}', Payload(1)),
     ],
-    ids=range(10),
+    ids=range(12),
 )
 def test_a_command_at_its_limit_is_read(payload: Any, expected: Payload) -> None:
     found = read_payload(payload)
@@ -41,6 +43,8 @@ def test_a_command_at_its_limit_is_read(payload: Any, expected: Payload) -> None
         (json.dumps({"value": 1, "id": "x" * (LONGEST_ID + 1)}), "an id must be a whole number, or a text"),
         (json.dumps({"value": 1, "id": 10**LONGEST_ID}), "an id must be a whole number, or a text"),
         ('{"value": 1, "id": true}', "an id must be"),
+        ('{"value": 1, "id": false}', "an id must be"),
+        ('{"value": 1, "id": []}', "an id must be"),
         ('{"value": 1, "id": 1.5}', "an id must be"),
         ('{"value": 1, "id": null}', "an id must be"),
         ("[1, true]", "is neither a number nor a list of numbers"),
@@ -55,7 +59,7 @@ def test_a_command_at_its_limit_is_read(payload: Any, expected: Payload) -> None
         ('{"expires": 1}', "is not a command; use"),
         ('{"value": 1, "valu": 2}', "is not a command; use"),
     ],
-    ids=range(18),
+    ids=range(20),
 )
 def test_a_command_beyond_its_limit_is_refused_with_the_reason(payload: str, reason: str) -> None:
     with pytest.raises(NoCommand, match=reason):

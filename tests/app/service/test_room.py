@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from busmaster import Hcp2Controller, RemoteBus
+from busmaster import Hcp2Controller, Priority, RemoteBus, connect
 from busmaster.app.service.client_messages import CancelParams, RequestParams
 from busmaster.app.service.connection import IncomingConnection
 from busmaster.app.service.messages import decode_client_message, encode_notification, encode_request
@@ -19,8 +19,9 @@ from busmaster.app.service.sequences import RequestLimit
 from busmaster.app.service.streams import READERS_IN_A_TURN, Broadcast
 from busmaster.app.service.typed import Raw
 from busmaster.bus.requester import ORDINARY, Requester, RequestOptions
-from busmaster.errors import NotStarted
+from busmaster.errors import BusClosed, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport.pump import Pump
 from tests.app.service.lines import Served, on_a_line, on_a_served_line, raw, until
@@ -100,6 +101,104 @@ def test_those_who_have_given_up_are_passed_over(monkeypatch: pytest.MonkeyPatch
         assert room.take()
 
     run_in_virtual_time(run())
+
+
+async def is_answered(controller: Hcp2Controller) -> None:
+    assert await controller.read(1) == 0
+
+
+async def is_not_a_command_of_the_node(controller: Hcp2Controller) -> None:
+    with pytest.raises(InvalidCommand, match="hcp2 has no command DataRead"):
+        await controller.node.request(msc.DataRead(1))
+
+
+async def touches_what_the_node_does_not_have(controller: Hcp2Controller) -> None:
+    with pytest.raises(InvalidCommand, match="hcp2 has no command DataRead"):
+        await controller.node.request(hcp2.Write(1, (7.0,)), touches=msc.DataRead(1))
+
+
+async def has_impossible_options(controller: Hcp2Controller) -> None:
+    with pytest.raises(InvalidCommand, match="retries"):
+        await controller.read(1, retries=-1)
+
+
+async def is_refused_by_the_owner(controller: Hcp2Controller) -> None:
+    command = hcp2.Write(1, (7.0,))
+    with pytest.raises(InvalidCommand, match="is not a stop"):
+        await controller.node.request(command, stop=True)
+
+
+async def is_given_up(controller: Hcp2Controller) -> None:
+    reading = asyncio.ensure_future(controller.read(1))
+    await asyncio.sleep(0)
+    reading.cancel()
+    await asyncio.gather(reading, return_exceptions=True)
+    assert reading.cancelled()
+
+
+ENDS = [
+    is_answered,
+    is_not_a_command_of_the_node,
+    touches_what_the_node_does_not_have,
+    has_impossible_options,
+    is_refused_by_the_owner,
+    is_given_up,
+]
+
+
+@pytest.mark.parametrize("end", ENDS, ids=lambda end: end.__name__)
+def test_a_request_gives_back_its_place_however_it_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: Callable[[Hcp2Controller], Awaitable[None]]
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", 1)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        await end(controller)
+        assert remote.room.take(), "the place is free again"
+        assert not remote.room.take(), "and there is one"
+        ending = asyncio.ensure_future(end(controller))
+        behind = asyncio.ensure_future(controller.read(1))
+        await asyncio.sleep(0)
+        remote.room.give_back()  # to the request that waits for it, and from that to the one behind it
+        await ending
+        assert await behind == 0
+        assert remote.room.take()
+        assert not remote.room.take()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_request_that_takes_no_place_gives_none_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", 1)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        assert remote.room.take()
+        assert await controller.read(1, priority=Priority.URGENT) == 0
+        with pytest.raises(InvalidCommand, match="no command"):
+            await controller.node.request(msc.DataRead(1), priority=Priority.URGENT)
+        async with controller.exclusive(max_hold=5.0) as held:
+            assert await held.read(1) == 0
+        assert not remote.room.take()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_request_before_the_bus_is_entered_takes_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.sequences.MOST_UNDER_WAY", 1)
+
+    async def story(line: Served) -> None:
+        remote = connect(line.address)
+        controller = Hcp2Controller(remote, 5)
+        with pytest.raises(BusClosed, match="the bus is not open"):
+            await controller.read(1)
+        async with remote:
+            assert remote.room.take()
+            remote.room.give_back()
+            assert await controller.read(1) == 0
+
+    on_a_line(tmp_path, story)
 
 
 def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
