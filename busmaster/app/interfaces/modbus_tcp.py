@@ -33,6 +33,7 @@ from busmaster import (
     Priority,
     Quality,
     Refused,
+    Snapshot,
     Superseded,
 )
 from busmaster.app.bounds import (
@@ -43,6 +44,7 @@ from busmaster.app.bounds import (
     MOST_GATEWAY_UNREAD,
     REQUEST_WITHIN,
 )
+from busmaster.app.interfaces.followed_groups import FollowedGroups
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.reported_refusals import ReportedRefusals
 from busmaster.app.service.picture import Row
@@ -61,8 +63,6 @@ FINISH_WITHIN = 3.0
 """Seconds in which a unit of the line must have replied. Many Modbus TCP clients wait no longer."""
 LOOK_EVERY = 0.25
 """Seconds between two looks for other points of the line."""
-ASK_AGAIN = 1.0
-"""Seconds after which a poll group is requested again that has ended."""
 
 # The frames of Modbus TCP
 
@@ -469,11 +469,9 @@ class Values:
         self._fixed = fixed
         self._type, self._last, self._warn = type_, last, warn
         self._held: dict[Identity, Held] = {}
-        self._last_cycles: dict[str, float] = {}
-        """When the last cycle of each group ended, by the line's clock."""
         self._touches = Touches()
         self._remote: RemoteBus | None = None
-        self._groups: dict[str, asyncio.Task[None]] = {}
+        self._groups = FollowedGroups(line, self._take)
         self._changed = asyncio.Event()
         self._new_rows = True
 
@@ -494,7 +492,7 @@ class Values:
         finally:
             for end in ends:
                 end()
-            await self._leave_groups(set())
+            await self._groups.leave()
 
     def _receive(self, method: str, _params: Mapping[str, Any]) -> None:
         if method in ("rows", "frame"):
@@ -511,7 +509,7 @@ class Values:
                 remote = self.line.remote
         if remote is not self._remote:
             self._remote = remote
-            await self._leave_groups(set())
+            await self._groups.leave()
             if remote is not None:  # another owner has another clock; until then the last values stay, as AWAY
                 self._touches = Touches()
                 self._held.clear()
@@ -540,50 +538,29 @@ class Values:
             if len(self.map.entries) < len(keys):
                 self._warn(f"{len(keys) - len(self.map.entries)} points have no address: 65536 are in use")
         names = {row.group for row in self.rows.values()}
-        await self._leave_groups(names)
-        for name in names - self._groups.keys():
-            self._last_cycles[name] = remote.now()
-            self._groups[name] = asyncio.ensure_future(self._follow_group(remote, name))
+        await self._groups.follow(remote, names)
+        self._held = {identity: held for identity, held in self._held.items() if held.group in names}
         self.known.set()
 
-    async def _follow_group(self, remote: RemoteBus, name: str) -> None:
-        while True:
-            with suppress(BusError, InvalidCommand):  # values without a cycle become stale by their age
-                group = remote.group(name)
-                try:
-                    async for snapshot in group:
-                        self._last_cycles[name] = snapshot.finished
-                        for point, sample in snapshot.items():
-                            identity = point.node.profile.name, point.node.address, point.item
-                            held = self._held.setdefault(identity, Held(name))
-                            if held.group != name:
-                                continue
-                            if sample.error is not None:
-                                held.status = BAD
-                                continue
-                            held.value = sample.value
-                            held.asked = sample.finished if sample.started is None else sample.started
-                            held.status = STALE if sample.quality is Quality.STALE else CURRENT
-                finally:
-                    group.close()
-            await asyncio.sleep(ASK_AGAIN)
-
-    async def _leave_groups(self, wanted: set[str]) -> None:
-        for name in self._groups.keys() - wanted:
-            task = self._groups.pop(name)
-            self._last_cycles.pop(name, None)
-            if self._remote is not None:  # the group has ended, and not its owner
-                for identity in [identity for identity, held in self._held.items() if held.group == name]:
-                    del self._held[identity]
-            task.cancel()
-            await asyncio.wait([task])
+    async def _take(self, name: str, snapshot: Snapshot) -> None:
+        for point, sample in snapshot.items():
+            identity = point.node.profile.name, point.node.address, point.item
+            held = self._held.setdefault(identity, Held(name))
+            if held.group != name:
+                continue
+            if sample.error is not None:
+                held.status = BAD
+                continue
+            held.value = sample.value
+            held.asked = sample.finished if sample.started is None else sample.started
+            held.status = STALE if sample.quality is Quality.STALE else CURRENT
 
     def look_up(self, keys: Iterable[str]) -> dict[str, tuple[Any, int]]:
         """Return the last good value of each point and its status, all of one moment."""
         frame, remote = self.line.picture.frame, self._remote
         away = remote is None or not self.line.is_connected or frame is None
         lost = frame.now if frame is not None and frame.state == "offline" else -inf
-        old = self.line.old_groups(self._last_cycles, remote.now()) if remote is not None and not away else set()
+        old = self._groups.old(remote.now()) if remote is not None and not away else set()
         found: dict[str, tuple[Any, int]] = {}
         for key in keys:
             row = self.rows.get(key)

@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from busmaster import BusError, InvalidCommand, LineDown, Snapshot
 from busmaster.app.bounds import MOST_SHOWN_POINTS
+from busmaster.app.interfaces.followed_groups import FollowedGroups
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua_access import Rules, guard
 from busmaster.app.interfaces.opcua_connections import OpcuaServer
@@ -45,8 +46,6 @@ from busmaster.ext import read_file
 
 LOOK_EVERY = 0.25
 """Seconds between two looks for values that are old."""
-ASK_AGAIN = 5.0
-"""Seconds after which a poll group without messages from its owner is requested again."""
 LISTEN_AFTER = 2.0
 """Seconds after which clients are accepted although the points of the line are not known yet."""
 AT_ONCE = 50
@@ -74,11 +73,10 @@ Place = tuple[str, str]
 class Health:
     """The variables of a line, its groups and nodes, except for its points."""
 
-    def __init__(self, space: Space, line: Following) -> None:
-        self.dropped: dict[str, int] = {}
-        """Of each group, the cycles that this process was too slow for."""
+    def __init__(self, space: Space, line: Following, groups: FollowedGroups) -> None:
         self._space = space
         self._line = line
+        self._followed = groups
         self._objects: dict[str, ua.NodeId] = {}
         self._variables: dict[Place, Variable] = {}
 
@@ -121,7 +119,7 @@ class Health:
             owner = f"Groups/{group.name}"
             if owner in self._objects:
                 yield from _shown(owner, group, GROUP)
-                yield (owner, "Dropped"), self.dropped.get(group.name, 0)
+                yield (owner, "Dropped"), self._followed.dropped.get(group.name, 0)
         for node in picture.nodes.values():
             owner = _node(node.protocol, node.address)
             if owner in self._objects:
@@ -162,15 +160,13 @@ class LineServer:
         self._rules = rules
         self._report = report
         self._space = Space(server)
-        self._health = Health(self._space, line)
+        self._groups = FollowedGroups(line, self._take)
+        self._health = Health(self._space, line, self._groups)
         self._points: dict[Identity, Shown] = {}
         self._by_id: dict[ua.NodeId, Shown] = {}
         self._keys: dict[str, Identity] = {}
         self._remote: RemoteBus | None = None
         """The connection that is shown."""
-        self._groups: dict[str, asyncio.Task[None]] = {}
-        self._last_cycles: dict[str, float] = {}
-        """When the last cycle of each group ended, by the clock of the line."""
         self._touches = Touches()
         self._changed = asyncio.Event()
         self.has_points = asyncio.Event()
@@ -196,7 +192,7 @@ class LineServer:
             end_picture()
             end_state()
             end_touched()
-            await self._leave_groups(set())
+            await self._groups.leave()
 
     def _receive(self, method: str, params: Mapping[str, Any]) -> None:
         if method == "rows":
@@ -221,7 +217,7 @@ class LineServer:
             self._remote = remote
             self._touches = Touches()
             self._new_rows = True
-            await self._leave_groups(set())
+            await self._groups.leave()
             await self._put_bad(CODES.BadOutOfService)
         try:
             if remote is not None:
@@ -255,10 +251,7 @@ class LineServer:
             if identity not in wanted and shown.variable.status != CODES.BadConfigurationError:
                 await shown.variable.put(None, CODES.BadConfigurationError, time.time())
         names = {row.group for row in wanted.values()}
-        await self._leave_groups(names)
-        for name in names - self._groups.keys():
-            self._last_cycles[name] = remote.now()
-            self._groups[name] = asyncio.ensure_future(self._follow_group(remote, name))
+        await self._groups.follow(remote, names)
 
     async def _take_row(self, identity: Identity, row: Row) -> None:
         details = await self._line.details(row.group, row.key)
@@ -283,21 +276,7 @@ class LineServer:
 
     # values
 
-    async def _follow_group(self, remote: RemoteBus, name: str) -> None:
-        """Put what each cycle of a group brings, for as long as the line has it."""
-        while True:
-            with suppress(BusError, InvalidCommand):  # that no cycles come shows in the values' age
-                group = remote.group(name)
-                try:
-                    async for snapshot in group:
-                        await self._take(name, snapshot)
-                        self._health.dropped[name] = group.dropped
-                finally:
-                    group.close()
-            await asyncio.sleep(ASK_AGAIN)
-
     async def _take(self, name: str, snapshot: Snapshot) -> None:
-        self._last_cycles[name] = snapshot.finished
         taken: set[Identity] = set()
         for count, (point, sample) in enumerate(snapshot.items(), 1):
             identity = point.node.profile.name, point.node.address, point.item
@@ -334,19 +313,11 @@ class LineServer:
 
     async def _doubt_old(self, now: float) -> None:
         """Have values ambiguous that no cycle has followed: their group rests, or the line's program stands still."""
-        old = self._line.old_groups(self._last_cycles, now)
+        old = self._groups.old(now)
         if old:
             for shown in list(self._points.values()):
                 if shown.row.group in old:
                     await shown.variable.doubt()
-
-    async def _leave_groups(self, wanted: set[str]) -> None:
-        """Follow no groups but these."""
-        for name in self._groups.keys() - wanted:
-            task = self._groups.pop(name)
-            self._last_cycles.pop(name, None)
-            task.cancel()
-            await asyncio.wait([task])
 
     # writing
 

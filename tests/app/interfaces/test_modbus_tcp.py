@@ -25,7 +25,7 @@ from pymodbus.client import ModbusTcpClient
 
 from busmaster import Priority, Quality, Snapshot
 from busmaster.app import bounds
-from busmaster.app.interfaces import modbus_tcp, reported_refusals
+from busmaster.app.interfaces import followed_groups, modbus_tcp, reported_refusals
 from busmaster.app.interfaces.following import Connected, Following, Lost
 from busmaster.app.interfaces.modbus_tcp import (
     UNIT_REFUSED,
@@ -1365,7 +1365,7 @@ async def story_of_values() -> None:
     again.groups["axes"].cycles.put_nowait(read_cycle(1.0, 2.0, at=7.0))
     await look(values)
     assert values.look_up(keys[:2]) == {"winder/1": (1.0, 0), "winder/2": (2.0, 0)}, "no write is known of this owner"
-    await values._leave_groups(set())
+    await values._groups.leave()
 
 
 def test_a_value_has_the_status_of_its_read_its_group_its_line_and_its_owner() -> None:
@@ -1384,7 +1384,7 @@ def test_a_value_is_of_the_time_of_its_request() -> None:
         await look(values)
         values._receive_touched({"protocol": "hcp2", "address": 5, "when": 100.2, "items": ["1"], "all": False})
         assert values.look_up(["winder/1"]) == {"winder/1": (1.0, 1)}, "the write ended while it was read"
-        await values._leave_groups(set())
+        await values._groups.leave()
 
     asyncio.run(story())
 
@@ -1392,7 +1392,7 @@ def test_a_value_is_of_the_time_of_its_request() -> None:
 def test_a_point_of_two_groups_has_the_values_of_the_first_and_a_group_that_has_gone_leaves_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(modbus_tcp, "ASK_AGAIN", 0.0)
+    monkeypatch.setattr(followed_groups, "ASK_AGAIN", 0.0)
 
     async def story() -> None:
         owner = Owner()
@@ -1419,7 +1419,7 @@ def test_a_point_of_two_groups_has_the_values_of_the_first_and_a_group_that_has_
         owner.groups["other"].cycles.put_nowait(read_cycle(1.0, 7.0))
         await look(values)
         assert values.look_up(["winder/2"]) == {"winder/2": (7.0, 0)}
-        await values._leave_groups(set())
+        await values._groups.leave()
         assert all(group.subscriptions == group.closes for group in owner.groups.values())
 
     asyncio.run(story())
@@ -1448,7 +1448,7 @@ def test_points_keep_their_addresses_and_what_has_none_is_reported(monkeypatch: 
         await look(values)
         assert len(values.map.entries) == 4
         assert warnings[-1] == "2 points have no address: 65536 are in use"
-        await values._leave_groups(set())
+        await values._groups.leave()
 
     asyncio.run(story())
 
@@ -1461,7 +1461,7 @@ def test_every_entry_of_the_map_that_is_no_point_is_reported() -> None:
         await look(values)
         assert [text.split()[3] for text in warnings] == ["'winder/1',", "'winder/3',"]
         assert values.map is fixed
-        await values._leave_groups(set())
+        await values._groups.leave()
 
     asyncio.run(story())
 

@@ -12,7 +12,7 @@ import pytest
 from asyncua import ua
 from asyncua.crypto.permission_rules import User
 
-from busmaster.app.interfaces import opcua
+from busmaster.app.interfaces import followed_groups, opcua
 from busmaster.app.interfaces.following import Connected, Lost
 from busmaster.app.interfaces.opcua import Health, LineServer
 from busmaster.app.interfaces.opcua_access import Rules
@@ -111,7 +111,7 @@ class Story:
         self.server = LineServer(server, self.line, rules or Rules(allow=("*",)), self.reports.append)
         self.shown = Shown()
         self.server._space = cast("Space", self.shown)
-        self.server._health = Health(cast("Space", self.shown), self.line)
+        self.server._health = Health(cast("Space", self.shown), self.line, self.server._groups)
         self.has(*rows)
 
     def has(self, *rows: Row) -> None:
@@ -133,7 +133,7 @@ class Story:
         self.line._remote, self.line.state = cast("Any", self.owner), Connected({"read_only": False})
 
     async def end(self) -> None:
-        await self.server._leave_groups(set())
+        await self.server._groups.leave()
 
     async def write(self, key: str = "winder/1", value: Any = 12.5, *, user: str | None = None, **data: Any) -> str:
         """The status of a write."""
@@ -279,7 +279,7 @@ async def test_of_a_point_in_two_groups_the_values_of_the_first_are_shown() -> N
 
 
 async def test_groups_that_end_are_requested_again_and_count_what_was_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opcua, "ASK_AGAIN", 0.0)
+    monkeypatch.setattr(followed_groups, "ASK_AGAIN", 0.0)
     story = Story(row_of("1"))
     story.line.picture._groups = {0: [Group("axes", 0.02)]}
     await story.show()
