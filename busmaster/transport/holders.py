@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import grp
-import itertools
 import os
 import re
 import stat
@@ -12,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PROC = Path("/proc")
+WITH_VALUE = re.compile(r"-[^-cmWX]*(?P<name>[cmWX])(?P<value>.*)", re.DOTALL)
+"""Short options of Python of which the last one has a value: behind it, or in the next word."""
 GROUP_OPENS = stat.S_IRGRP | stat.S_IWGRP
 
 
@@ -129,18 +130,20 @@ def _with_arguments(command: str, line: bytes) -> str:
 
     What follows may be long or secret.
     """
-    shown = [command]
+    shown: list[str] = []
     words = iter(line.decode(errors="replace").split("\0")[1:])
     for word in words:
-        if not word:
+        option = WITH_VALUE.fullmatch(word)
+        name, value = (option["name"], option["value"]) if option else ("", "")
+        if name == "c":
+            shown.append(word.removesuffix(value))
             break
-        shown.append(repr(word)[1:-1])
-        if word in ("-W", "-X"):  # the next word is its value
-            shown.append(repr(next(words, ""))[1:-1])
-            continue
-        if not word.startswith("-") or word.endswith("c"):  # also -Ic
+        shown.append(word)
+        if (name and not value) or word == "--check-hash-based-pycs":
+            shown.append(next(words, ""))
+        if name == "m":
+            shown.append(next(words, ""))
             break
-        if word.endswith("m"):
-            shown += [repr(text)[1:-1] for text in itertools.islice(words, 2) if text]
+        if not word.startswith("-") or word == "-":  # the script, or the standard input
             break
-    return " ".join(shown)
+    return " ".join((command, *(repr(text)[1:-1] for text in shown if text)))
