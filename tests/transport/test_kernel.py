@@ -82,6 +82,14 @@ async def test_what_a_stopped_tty_does_not_take_has_not_left(pty_master: PtyMast
 
 
 @pytest.mark.asyncio
+async def test_a_port_with_flow_control_is_one_that_can_hold_its_bytes(pty_master: PtyMaster) -> None:
+    for rtscts in (True, False):
+        transport, recorder = await opened(pty_master.path, rtscts=rtscts)
+        assert open_port(transport).flow_controlled is rtscts
+        await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
 async def test_bytes_that_have_come_and_were_not_handed_over_are_seen(pty_master: PtyMaster) -> None:
     transport, recorder = await opened(pty_master.path)
     port = open_port(transport)

@@ -157,6 +157,18 @@ async def test_rtscts_is_set_at_the_server() -> None:
 
 
 @pytest.mark.asyncio
+async def test_flow_control_that_an_earlier_client_left_on_is_switched_off() -> None:
+    port = RemotePort()
+    port.rtscts = True
+    async with rfc2217_server(port=port) as server:
+        transport, recorder = await opened(server.number)
+        transport.write(b"x")
+        await until(server, lambda: server.sessions[0].received == b"x")
+        assert not server.port.rtscts
+        await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
 async def test_dtr_and_rts_are_left_alone_unless_asked_for() -> None:
     port = RemotePort(lambda name, _: name not in ("dtr", "rts"))  # it would raise
     async with rfc2217_server(port=port) as server:
@@ -339,10 +351,11 @@ async def test_a_lost_connection_is_made_again_and_the_port_set_again() -> None:
 
 @pytest.mark.asyncio
 async def test_a_server_that_answers_no_masks_and_no_flow_control_is_used() -> None:
-    async with scripted(AGREES, CONFIRMS) as (number, heard, _):
+    async with scripted(AGREES + "ff fb 03 ff fd 03", CONFIRMS) as (number, heard, _):
         transport, recorder = await opened(number)
         assert transport.get_extra_info("modem_lines") is None
         assert heard[0] == bytes.fromhex("ff fb 2c ff fb 00 ff fd 00 ff fb 03 ff fd 03")
+        assert heard[1].startswith(bytes.fromhex("ff fa 2c 01")), "it does not answer agreements (RFC 854)"
         await closed(transport, recorder)
 
 
@@ -434,6 +447,51 @@ async def test_dtr_that_is_not_confirmed_is_an_error(monkeypatch: pytest.MonkeyP
     async with scripted(AGREES, CONFIRMS, "ff fa 2c 69 01 ff f0 ff fa 2c 69 09 ff f0") as (number, _, _):
         with pytest.raises(LineDown, match="does not take DTR ON: it confirms DTR OFF"):
             await opened(number, dtr=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "answer", "says"),
+    [
+        ({"rtscts": True}, "ff fa 2c 69 01 ff f0", "does not take RTS CTS: it confirms NO FLOW CONTROL"),
+        (
+            {"rts": False},
+            "ff fa 2c 69 01 ff f0 ff fa 2c 69 0b ff f0",
+            "does not take RTS OFF: it confirms RTS ON",
+        ),
+        ({"rtscts": True}, "ff fa 2c 69 03 ff f0 ff fc 00", "refuses binary transmission"),
+    ],
+)
+@pytest.mark.asyncio
+async def test_a_server_that_does_not_control_the_lines_as_set_or_refuses_in_the_end_is_not_used(
+    options: dict[str, Any], answer: str, says: str
+) -> None:
+    recorder = Recorder()
+    async with scripted(AGREES, CONFIRMS, answer) as (number, _, writers):
+        with pytest.raises(LineDown, match=says):
+            await opened(number, recorder, **options)
+        assert await asyncio.wait_for(_ended(writers), PATIENCE)
+    assert recorder.connections == 0
+
+
+@pytest.mark.asyncio
+async def test_a_change_of_settings_ends_only_when_the_server_has_answered_all_of_it() -> None:
+    """An answer that is left over would be taken for that to the next change."""
+    async with scripted(AGREES, CONFIRMS, "ff fa 2c 69 01 ff f0", "ff fa 2c 65 00 00 e1 00 ff f0 78") as (
+        number,
+        heard,
+        writers,
+    ):
+        transport, recorder = await opened(number)
+        async with asyncio.timeout(PATIENCE):
+            while len(heard) < 3:  # noqa: ASYNC110  # the server has no event for it
+                await asyncio.sleep(0.001)
+        tuning = asyncio.ensure_future(transport.tune(LineSettings(9600)))
+        await recorder.heard(b"x")
+        assert not (await asyncio.wait([tuning], timeout=0.02))[0]
+        writers[0].write(bytes.fromhex("ff fa 2c 66 08 ff f0 ff fa 2c 67 01 ff f0 ff fa 2c 68 01 ff f0"))
+        with pytest.raises(LineDown, match="does not take 9600 baud: it confirms 57600 baud"):
+            await tuning
+        await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
