@@ -240,6 +240,34 @@ async def test_a_folder_that_is_made_while_the_watch_begins_is_watched_too(tmp_p
     await becomes(lambda: watches() == 0)
 
 
+@pytest.mark.parametrize("way", ["made", "moved into it", "permitted", "link replaced", "folder moved"])
+@pytest.mark.asyncio
+async def test_each_way_in_which_a_device_can_appear_in_a_folder_is_noticed(tmp_path: Path, way: str) -> None:
+    """udev makes a link beside its place, and renames it."""
+    folder, changed = tmp_path / "by-id", asyncio.Event()
+    folder.mkdir()
+    (folder / "node").touch(0o600)
+    (folder / "it").symlink_to("node")
+    (tmp_path / "new").symlink_to("node")
+    watch = folder_watch.watch_folders(None, lambda: (str(folder),), changed.set)
+    assert watch is not None
+    match way:
+        case "made":
+            (folder / "other").symlink_to("node")
+        case "moved into it":
+            (tmp_path / "new").rename(folder / "other")
+        case "permitted":
+            (folder / "node").chmod(0o660)
+        case "link replaced":
+            (tmp_path / "new").replace(folder / "it")
+        case "folder moved":
+            folder.rename(tmp_path / "by-path")
+    async with asyncio.timeout(PATIENCE / 10):
+        await changed.wait()
+    watch.close()
+    await becomes(lambda: watches() == 0)
+
+
 def test_the_folders_to_a_device_are_those_of_each_link_on_the_way(tmp_path: Path) -> None:
     for folder in ("a", "b", "c"):
         (tmp_path / folder).mkdir()

@@ -273,6 +273,12 @@ def test_of_two_adapters_with_the_same_serial_number_only_the_place_is_a_lasting
     assert names == {end.path: f"{tmp_path}/links/by-path/{os.path.basename(end.path)}" for end in (one, two)}
 
 
+def test_the_number_of_an_interface_is_hexadecimal_as_the_kernel_writes_it(usb: UsbTree, one: PtyMaster) -> None:
+    usb.plug(one.path, "A500ABC", interface=0x1A)
+    assert str(identify(one.path)) == "FTDI A500ABC interface 26"
+    assert resolve("usb:A500ABC:26") == one.path
+
+
 def test_a_text_of_an_adapter_that_is_not_utf_8_hides_no_port(usb: UsbTree, one: PtyMaster, two: PtyMaster) -> None:
     usb.plug(one.path, "A500ABC", place="1-1")
     usb.plug(two.path, "A500XYZ", place="1-2")

@@ -9,6 +9,7 @@ import fcntl
 import socket
 import termios
 from collections.abc import Callable, Coroutine, Iterator
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -292,6 +293,20 @@ def test_an_acknowledgement_within_the_usual_time_of_the_path_is_waited_for(peer
         await recorder.lost()
 
     run(main())
+
+
+@pytest.mark.asyncio
+async def test_the_usual_time_of_an_acknowledgement_is_that_of_the_kernels_retransmissions(peer: Peer) -> None:
+    transport, port, recorder = await peer.connect()
+    measured = kernel.TCP_INFO_TIMES.pack(100_000, 25_000)  # microseconds: 100 ms, and four times 25 ms
+    with standing_still(peer.connection):
+        transport.write(b"05\x05")
+        really = port._socket
+        port._socket = cast("socket.socket", SimpleNamespace(getsockopt=lambda *_: measured))
+        assert (port.unsent(0.199), port.unsent(0.201)) == (0, 3)
+        port._socket = really
+    transport.abort()
+    await recorder.lost()
 
 
 @both_loops

@@ -276,6 +276,31 @@ async def test_output_that_the_server_suspends_is_held_and_sent_in_order() -> No
         await closed(transport, recorder)
 
 
+@pytest.mark.asyncio
+async def test_output_that_the_network_does_not_take_pauses_the_protocol_and_is_dropped_by_an_abort(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with scripted(AGREES, CONFIRMS) as (number, _, writers):
+        transport, recorder = await opened(number)
+        server: Any = writers[0].transport
+        for stops, size in ((1, 1_000_000), (2, 40_000_000)):  # the second is more than the kernel ever takes
+            with monkeypatch.context() as patch:
+                patch.setattr(server, "resume_reading", lambda: None)  # its stream would do so
+                server.pause_reading()
+                while recorder.flow.count("pause") < stops:
+                    transport.write(bytes(size))
+                assert transport.get_write_buffer_size() > 0
+                if stops == 2:
+                    transport.abort()
+                    async with asyncio.timeout(PATIENCE / 10):
+                        await recorder.lost()
+            server.resume_reading()
+            if stops == 1:
+                await recorder.until(lambda r: r.flow == ["pause", "resume"])
+                assert transport.get_write_buffer_size() == 0
+        assert recorder.losses == [None]
+
+
 class Chunks:
     """A tap that keeps what was received at a time."""
 

@@ -16,6 +16,7 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine, kept_times
 from busmaster.bus.node import Node
+from busmaster.emulator.line import Echo
 from busmaster.statistics import LearnedTimes
 from busmaster.testing import run_in_virtual_time
 
@@ -132,6 +133,20 @@ def test_what_was_learned_at_another_port_is_forgotten(text: str, monkeypatch: p
             patch.setattr(MemoryPort, attribute, other)
             assert run_for(text, SHORT) == set()
     assert run_for(text, SHORT) == {"winder", "drive"}
+
+
+def test_what_was_learned_without_an_echo_is_forgotten_where_there_is_one(text: str) -> None:
+    run_for(text, LONG)
+
+    async def main() -> set[str]:
+        file = read(Source("line.toml", text))
+        emulated = emulated_line(file)
+        emulated.echo = Echo()
+        async with ConfiguredLine(file, port=MemoryPort(emulated)) as line:
+            await asyncio.sleep(SHORT)
+            return trusted(line)
+
+    assert run_in_virtual_time(main()) == set()
 
 
 DAMAGED = [
