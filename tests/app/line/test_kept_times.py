@@ -273,6 +273,27 @@ def test_a_file_that_is_read_again_may_name_another_place_for_the_times(text: st
     assert json.loads(other.read_text())["nodes"].keys() == json.loads(kept.read_text())["nodes"].keys()
 
 
+def test_a_file_that_is_read_again_without_a_place_keeps_no_more_times(text: str, kept: Path) -> None:
+    reported: list[str] = []
+
+    async def main() -> None:
+        async with opened(text, reported.append) as line:
+            await asyncio.sleep(1.5 * OFTEN)
+            await line.take(read(Source("line.toml", text.replace(f'learned = "{kept}"\n', ""))))
+            kept.unlink()
+            await asyncio.sleep(OFTEN)
+
+    run_in_virtual_time(main())
+    assert (list(kept.parent.iterdir()), reported) == ([], [])
+
+
+def test_what_a_killed_run_left_beside_the_file_is_not_in_the_next_one(text: str, kept: Path) -> None:
+    kept.with_name(f"{kept.name}.new").write_text("x" * 100_000)
+    run_for(text, LONG)
+    assert run_for(text, SHORT) == {"winder", "drive"}
+    assert list(kept.parent.iterdir()) == [kept]
+
+
 def test_the_times_of_each_kind_of_request_are_kept(text: str, kept: Path) -> None:
     async def main() -> int:
         async with opened(text) as line:
