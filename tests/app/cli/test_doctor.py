@@ -47,10 +47,12 @@ from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import identity
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from tests.app.cli.conftest import Command, without_time
 from tests.app.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged, without_rate
+from tests.transport.rfc2217_server import RemotePort, rfc2217_server
 from tests.transport.rs485_driver import FakeDriver
 from tests.transport.usb import UsbTree
 
@@ -779,6 +781,24 @@ def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
     assert LineSettings(9600, 7, "E") not in candidates
     framings = [candidate.framing for candidate in candidates]
     assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.asyncio
+async def test_other_rates_are_tried_at_a_server_with_rfc_2217_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(examination, "RATES", (9600,))
+    monkeypatch.setattr(examination, "FRAMINGS", ())
+    rates: list[object] = []
+    remote = RemotePort(lambda name, value: rates.append(value) is None if name == "baudrate" else True)
+    async with rfc2217_server(port=remote) as server:
+        findings = Findings()
+        port = Rfc2217Port("127.0.0.1", server.number, baudrate=57600)
+        await examine(Patient(port, "hcp2", addresses=(4,)), findings.append)
+    assert [finding.topic for finding in findings] == [
+        *("adapter", "open", "line errors", "modem lines", "silence", "echo", "nodes", "settings")
+    ]
+    assert findings.on("settings").what == "node 4: no reply with 1 other settings either"
+    assert (rates[-2:], remote.baudrate) == ([9600, 57600], 57600)
 
 
 @dataclass(frozen=True)

@@ -239,7 +239,7 @@ def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, p
     in_another_container = (0, -1)
     for pid, owner in ((4711, Holder(4711, "another program")), *((number, None) for number in in_another_container)):
         (tmp_path / "locks").write_text(
-            f"1: POSIX ADVISORY WRITE 1 00:01:2 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
+            f"1: POSIX ADVISORY WRITE 1 {place} 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
         )
         assert lock_owner(pty_master.path, proc=tmp_path) == owner
     assert str(Holder(4711, "another program")) == "another program (process 4711)"
