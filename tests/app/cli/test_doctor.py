@@ -789,7 +789,13 @@ async def test_other_rates_are_tried_at_a_server_with_rfc_2217_too(monkeypatch: 
     monkeypatch.setattr(examination, "RATES", (9600,))
     monkeypatch.setattr(examination, "FRAMINGS", ())
     rates: list[object] = []
-    remote = RemotePort(lambda name, value: rates.append(value) is None if name == "baudrate" else True)
+
+    def takes(name: str, value: object) -> bool:
+        if name == "baudrate":
+            rates.append(value)
+        return True
+
+    remote = RemotePort(takes)
     async with rfc2217_server(port=remote) as server:
         findings = Findings()
         port = Rfc2217Port("127.0.0.1", server.number, baudrate=57600)
