@@ -14,8 +14,9 @@ from busmaster import BusClosed, InvalidCommand, MemoryPort, NoReply, WriteUncon
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
-from busmaster.app.line import ConfiguredLine
+from busmaster.app.line import ConfiguredLine, configured_line
 from busmaster.app.line.kept_times import KeptTimes
+from busmaster.app.outputs.distributor import Distributor
 from busmaster.app.service.authorisation import WriteRequest
 from busmaster.bus.node import Node
 from busmaster.emulator.serve import serve_tcp
@@ -278,6 +279,25 @@ async def test_open_line_opens_the_port_of_the_file_and_passes_its_options_on(tm
             assert await line.nodes["winder"].read(10) == 0
             assert [output.kind for output in line.outputs.statistics()] == ["jsonl"] * outputs
     assert received
+
+
+def test_outputs_report_the_state_of_a_line_only_in_the_process_that_polls_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[tuple[object, object]] = []
+
+    class Noted(Distributor):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            made.append((options.get("in_charge", True), options.get("asks", True)))
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr(configured_line, "Distributor", Noted)
+    kinds = ("csv", "jsonl", "sqlite")
+    outputs = "".join(f'[outputs.{kind}]\npath = "{tmp_path / kind}"\n' for kind in kinds)
+    file = read(Source("line.toml", TEXT + outputs))
+    assert [output.kind for output in ConfiguredLine(file).audit().statistics()] == ["jsonl", "sqlite"]
+    ConfiguredLine(file, asks=False)
+    assert made == [(True, True), (False, True), (True, False)]
 
 
 def test_a_symbol_that_looks_like_a_range_is_one_point() -> None:
