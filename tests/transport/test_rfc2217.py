@@ -105,6 +105,7 @@ async def scripted(*says: str) -> AsyncIterator[tuple[int, list[bytes], list[asy
         ({"stopbits": 3}, "framing"),
         ({"receive_latency": -1.0}, "receive_latency"),
         ({"rtscts": True, "rts": True}, "exclude each other"),
+        ({"rtscts": True, "rts": False}, "exclude each other"),
     ],
 )
 def test_values_that_no_port_can_have_are_rejected_when_it_is_built(values: dict[str, Any], says: str) -> None:
@@ -116,6 +117,7 @@ def test_values_that_no_port_can_have_are_rejected_when_it_is_built(values: dict
 def test_it_has_the_framing_that_it_sets() -> None:
     port = Rfc2217Port("server", 4001, baudrate=9600, bytesize=7, parity="E")
     assert port.settings == LineSettings(9600, 7, "E")
+    assert Rfc2217Port("server", 4001, baudrate=2**32 - 1).settings.baudrate == 2**32 - 1
     assert port.name == "server:4001"
 
 

@@ -47,6 +47,7 @@ def test_a_port_is_a_value() -> None:
         ({"stopbits": 3}, "framing"),
         ({"receive_latency": -0.1}, "receive_latency"),
         ({"receive_latency": float("nan")}, "receive_latency"),
+        ({"receive_latency": float("inf")}, "receive_latency"),
         ({"rtscts": True, "rs485": True}, "exclude each other"),
         ({"path": ""}, "path"),
     ],

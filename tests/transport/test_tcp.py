@@ -61,6 +61,8 @@ async def done(happening: Awaitable[Any]) -> None:
         {"host": ""},
         {"port": 0},
         {"port": 65536},
+        {"port": "4001"},
+        {"port": 4001.0},
         {"baudrate": 0},
         {"receive_latency": -1.0},
         {"receive_latency": float("inf")},

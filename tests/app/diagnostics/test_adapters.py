@@ -197,6 +197,7 @@ def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path
         ("python3.11", "python -I poll.py --password x", "python3.11 -I poll.py"),
         ("python", "python -u -c import@sys;print(1)", "python -u -c"),
         ("python", "python -m timeit", "python -m timeit"),
+        ("python", "python -Im busmaster safe line.toml", "python -Im busmaster safe"),
         ("python", "python -W error -X dev -m busmaster run x", "python -W error -X dev -m busmaster run"),
         ("python", "python", "python"),
         ("python", "python /a\nb.py", "python /a\\nb.py"),
