@@ -333,6 +333,30 @@ async def test_where_no_folder_can_be_watched_the_clock_serves_and_the_log_says_
     assert "too many watches" in said[0]
 
 
+@pytest.mark.parametrize("limit", ["watches", "loop"])
+@pytest.mark.asyncio
+async def test_a_watch_that_cannot_begin_keeps_no_descriptor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
+) -> None:
+    really_call = folder_watch.call_system
+
+    def call(name: str, *arguments: Any) -> int:
+        if name == "inotify_add_watch":
+            raise OSError(28, "No space left on device")
+        return really_call(name, *arguments)
+
+    def refuse(*_: object) -> None:
+        raise NotImplementedError
+
+    if limit == "loop":
+        monkeypatch.setattr(asyncio.get_running_loop(), "add_reader", refuse)
+    else:
+        monkeypatch.setattr(folder_watch, "call_system", call)
+    assert folder_watch.watch_folders(None, lambda: (str(tmp_path),), lambda: None) is None
+    async with asyncio.timeout(PATIENCE / 10):
+        await becomes(lambda: watches() == 0)
+
+
 @pytest.mark.asyncio
 async def test_what_no_folder_tells_is_seen_by_the_clock_all_the_same(
     usb_dev: UsbTree, ends: list[PtyMaster], monkeypatch: pytest.MonkeyPatch
