@@ -781,6 +781,7 @@ def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
     assert LineSettings(9600, 7, "E") not in candidates
     framings = [candidate.framing for candidate in candidates]
     assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)
+    assert {candidate.stopbits for candidate in other_settings(LineSettings(9600, stopbits=2))} == {2}
 
 
 @pytest.mark.usefixtures("hasty")
