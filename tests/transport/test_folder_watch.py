@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from busmaster.transport import folder_watch, reconnect
+from busmaster.transport.alarm import call_system
 from busmaster.transport.identity import folders_to
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
@@ -338,12 +339,10 @@ async def test_where_no_folder_can_be_watched_the_clock_serves_and_the_log_says_
 async def test_a_watch_that_cannot_begin_keeps_no_descriptor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
-    really_call = folder_watch.call_system
-
     def call(name: str, *arguments: Any) -> int:
         if name == "inotify_add_watch":
             raise OSError(28, "No space left on device")
-        return really_call(name, *arguments)
+        return call_system(name, *arguments)
 
     def refuse(*_: object) -> None:
         raise NotImplementedError

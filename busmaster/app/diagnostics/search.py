@@ -75,7 +75,6 @@ class Search:
         stop_offered: Callable[[], Callable[[], bool]] = lambda: lambda: False,
     ) -> None:
         self._wire = wire
-        self._endpoint = endpoint
         self._report = report
         self._progress = progress
         self._echo = endpoint.echo
