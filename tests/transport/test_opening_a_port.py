@@ -266,6 +266,21 @@ async def test_both_locks_are_taken_and_given_back(pty_master: PtyMaster) -> Non
     os.close(bystander)
 
 
+@pytest.mark.parametrize("exclusive", [True, False])
+@pytest.mark.asyncio
+async def test_a_port_that_is_closed_or_refused_leaves_the_flags_to_a_program_that_shares_it(
+    pty_master: PtyMaster, exclusive: bool
+) -> None:
+    def marks() -> bool:
+        return bool(termios.tcgetattr(pty_master.fd)[0] & termios.PARMRK)
+
+    await closed(*await opened(pty_master.path, exclusive=exclusive))
+    assert marks() is not exclusive
+    with pytest.raises(LineDown, match="no low-latency flag"):
+        await opened(pty_master.path, exclusive=exclusive, low_latency=True)
+    assert marks() is not exclusive
+
+
 @pytest.mark.asyncio
 async def test_a_second_opening_says_that_this_program_has_it(pty_master: PtyMaster) -> None:
     transport, recorder = await opened(pty_master.path)
