@@ -182,14 +182,14 @@ class SerialPort:
             async with asyncio.timeout(OPEN_DEADLINE):
                 device, paced, found = await asyncio.wrap_future(opening)
         except TimeoutError:
-            opening.add_done_callback(_drop)
+            opening.add_done_callback(functools.partial(_drop, self.exclusive))
             # with some drivers an opening does not return before the closing has ended
             if any(closing.name == self.path for closing in tuple(_closings)):
                 raise _still_closing(self.path) from None
             raise LineDown(f"{self.path} did not open within {OPEN_DEADLINE:g} s", hint="replug the adapter") from None
         # The thread cannot be cancelled, so the port it opens later is released when it returns.
         except asyncio.CancelledError:
-            opening.add_done_callback(_drop)
+            opening.add_done_callback(functools.partial(_drop, self.exclusive))
             raise
         transport = PortTransport(asyncio.get_running_loop(), protocol_factory(), device, self, paced, found)
         try:
@@ -635,8 +635,8 @@ def _discard_output(descriptor: int) -> None:
         termios.tcflush(descriptor, termios.TCOFLUSH)
 
 
-def _drop(opening: Future[tuple[MarkingSerial, bool, Identity]]) -> None:
+def _drop(exclusive: bool, opening: Future[tuple[MarkingSerial, bool, Identity]]) -> None:
     """Release a port that was opened after its caller had stopped waiting."""
     if not opening.cancelled() and opening.exception() is None:
         device, *_ = opening.result()
-        _release(device, True)
+        _release(device, exclusive)

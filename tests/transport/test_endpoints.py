@@ -58,6 +58,7 @@ MENTOR = LineSettings(9600, 7, "E", 1)
         ),
         ("line?baudrate=9600&parity=space&echo=False", SerialPort("line", baudrate=9600, parity="S")),
         ("line?baudrate=9600&parity=none&rtscts=off", SerialPort("line", baudrate=9600)),
+        ("line?baudrate=9600&rtscts=1&rs485=0", SerialPort("line", baudrate=9600, rtscts=True, rs485=False)),
         ("line?baudrate=9600&parity=odd&rs485=0", SerialPort("line", baudrate=9600, parity="O", rs485=False)),
         ("socket://server:4001", TcpPort("server", 4001)),
         ("socket://[::1]:4001/", TcpPort("::1", 4001)),

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from busmaster.transport import folder_watch, reconnect
+from busmaster.transport.alarm import call_system
 from busmaster.transport.identity import folders_to
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
@@ -240,6 +241,34 @@ async def test_a_folder_that_is_made_while_the_watch_begins_is_watched_too(tmp_p
     await becomes(lambda: watches() == 0)
 
 
+@pytest.mark.parametrize("way", ["made", "moved into it", "permitted", "link replaced", "folder moved"])
+@pytest.mark.asyncio
+async def test_each_way_in_which_a_device_can_appear_in_a_folder_is_noticed(tmp_path: Path, way: str) -> None:
+    """udev makes a link beside its place, and renames it."""
+    folder, changed = tmp_path / "by-id", asyncio.Event()
+    folder.mkdir()
+    (folder / "node").touch(0o600)
+    (folder / "it").symlink_to("node")
+    (tmp_path / "new").symlink_to("node")
+    watch = folder_watch.watch_folders(None, lambda: (str(folder),), changed.set)
+    assert watch is not None
+    match way:
+        case "made":
+            (folder / "other").symlink_to("node")
+        case "moved into it":
+            (tmp_path / "new").rename(folder / "other")
+        case "permitted":
+            (folder / "node").chmod(0o660)
+        case "link replaced":
+            (tmp_path / "new").replace(folder / "it")
+        case "folder moved":
+            folder.rename(tmp_path / "by-path")
+    async with asyncio.timeout(PATIENCE / 10):
+        await changed.wait()
+    watch.close()
+    await becomes(lambda: watches() == 0)
+
+
 def test_the_folders_to_a_device_are_those_of_each_link_on_the_way(tmp_path: Path) -> None:
     for folder in ("a", "b", "c"):
         (tmp_path / folder).mkdir()
@@ -303,6 +332,28 @@ async def test_where_no_folder_can_be_watched_the_clock_serves_and_the_log_says_
     said = [record.message for record in caplog.records if "polling for ports that come back" in record.message]
     assert len(said) == 1
     assert "too many watches" in said[0]
+
+
+@pytest.mark.parametrize("limit", ["watches", "loop"])
+@pytest.mark.asyncio
+async def test_a_watch_that_cannot_begin_keeps_no_descriptor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
+) -> None:
+    def call(name: str, *arguments: Any) -> int:
+        if name == "inotify_add_watch":
+            raise OSError(28, "No space left on device")
+        return call_system(name, *arguments)
+
+    def refuse(*_: object) -> None:
+        raise NotImplementedError
+
+    if limit == "loop":
+        monkeypatch.setattr(asyncio.get_running_loop(), "add_reader", refuse)
+    else:
+        monkeypatch.setattr(folder_watch, "call_system", call)
+    assert folder_watch.watch_folders(None, lambda: (str(tmp_path),), lambda: None) is None
+    async with asyncio.timeout(PATIENCE / 10):
+        await becomes(lambda: watches() == 0)
 
 
 @pytest.mark.asyncio

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from collections.abc import Callable, Iterator
@@ -258,6 +259,34 @@ def test_the_lasting_name_is_the_serial_number_or_else_the_link_that_udev_keeps(
     assert name_of(one) == ""
 
 
+def test_of_two_adapters_with_the_same_serial_number_only_the_place_is_a_lasting_name(
+    usb: UsbTree, one: PtyMaster, two: PtyMaster, tmp_path: Path
+) -> None:
+    for folder in ("by-path", "by-id"):
+        (tmp_path / "links" / folder).mkdir(parents=True)
+    (tmp_path / "links/by-id/it").symlink_to(one.path)  # that of the adapter that was plugged in last
+    for end in (one, two):
+        (tmp_path / "links/by-path" / os.path.basename(end.path)).symlink_to(end.path)
+    usb.plug(one.path, "0001", place="1-1")
+    usb.plug(two.path, "0001", place="1-2")
+    names = {device.path: lasting_name(device) for device in usb_devices()}
+    assert names == {end.path: f"{tmp_path}/links/by-path/{os.path.basename(end.path)}" for end in (one, two)}
+
+
+def test_the_number_of_an_interface_is_hexadecimal_as_the_kernel_writes_it(usb: UsbTree, one: PtyMaster) -> None:
+    usb.plug(one.path, "A500ABC", interface=0x1A)
+    assert str(identify(one.path)) == "FTDI A500ABC interface 26"
+    assert resolve("usb:A500ABC:26") == one.path
+
+
+def test_a_text_of_an_adapter_that_is_not_utf_8_hides_no_port(usb: UsbTree, one: PtyMaster, two: PtyMaster) -> None:
+    usb.plug(one.path, "A500ABC", place="1-1")
+    usb.plug(two.path, "A500XYZ", place="1-2")
+    (usb.root / "devices/1-1/manufacturer").write_bytes("Lüttich\n".encode("latin-1"))
+    assert str(identify(one.path)) == "L\ufffdttich A500ABC"
+    assert {device.path for device in usb_devices()} == {one.path, two.path}
+
+
 # -- pseudo-terminals ------------------------------------------------------------------------------------------------
 
 
@@ -271,6 +300,20 @@ def test_a_pseudo_terminal_stays_the_same_whatever_is_done_to_it(one: PtyMaster,
     os.close(descriptor)
     assert known.accepts(identify(one.path))
     assert not known.accepts(identify(two.path))
+
+
+def test_what_a_pseudo_terminal_is_known_by_is_given_back(one: PtyMaster) -> None:
+    def kept() -> int:
+        found = 0
+        for number in os.listdir("/proc/self/fd"):
+            with contextlib.suppress(FileNotFoundError):
+                found += os.readlink(f"/proc/self/fd/{number}") == one.path
+        return found
+
+    known = identify(one.path)
+    assert kept() == 1
+    del known
+    assert kept() == 0
 
 
 def with_reused_number(check: Callable[[Identity, PtyMaster], None], link: Path | None = None) -> None:

@@ -9,6 +9,7 @@ import fcntl
 import socket
 import termios
 from collections.abc import Callable, Coroutine, Iterator
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -79,6 +80,14 @@ async def test_what_a_stopped_tty_does_not_take_has_not_left(pty_master: PtyMast
     assert port.unsent(0.0) == 0
     assert pty_master.read() == b"05\x05"
     await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_port_with_flow_control_is_one_that_can_hold_its_bytes(pty_master: PtyMaster) -> None:
+    for rtscts in (True, False):
+        transport, recorder = await opened(pty_master.path, rtscts=rtscts)
+        assert open_port(transport).flow_controlled is rtscts
+        await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
@@ -284,6 +293,20 @@ def test_an_acknowledgement_within_the_usual_time_of_the_path_is_waited_for(peer
         await recorder.lost()
 
     run(main())
+
+
+@pytest.mark.asyncio
+async def test_the_usual_time_of_an_acknowledgement_is_that_of_the_kernels_retransmissions(peer: Peer) -> None:
+    transport, port, recorder = await peer.connect()
+    measured = kernel.TCP_INFO_TIMES.pack(100_000, 25_000)  # microseconds: 100 ms, and four times 25 ms
+    with standing_still(peer.connection):
+        transport.write(b"05\x05")
+        really = port._socket
+        port._socket = cast("socket.socket", SimpleNamespace(getsockopt=lambda *_: measured))
+        assert (port.unsent(0.199), port.unsent(0.201)) == (0, 3)
+        port._socket = really
+    transport.abort()
+    await recorder.lost()
 
 
 @both_loops

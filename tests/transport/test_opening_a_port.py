@@ -132,6 +132,20 @@ async def test_a_cancelled_opening_releases_its_port(pty_master: PtyMaster, slow
     await _is_released_in_the_end(pty_master.path, slow_driver)
 
 
+@pytest.mark.parametrize("exclusive", [True, False])
+@pytest.mark.asyncio
+async def test_an_opening_that_is_given_up_leaves_the_flags_to_a_program_that_shares_the_port(
+    pty_master: PtyMaster, slow_driver: threading.Event, exclusive: bool
+) -> None:
+    opening = asyncio.ensure_future(opened(pty_master.path, exclusive=exclusive))
+    await asyncio.sleep(0)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    await _is_released(slow_driver)
+    assert bool(termios.tcgetattr(pty_master.fd)[0] & termios.PARMRK) is not exclusive
+
+
 @pytest.mark.asyncio
 async def test_an_opening_cancelled_when_it_was_all_but_done_is_closed_again(pty_master: PtyMaster) -> None:
     class Cancels(Recorder):
@@ -148,6 +162,11 @@ async def test_an_opening_cancelled_when_it_was_all_but_done_is_closed_again(pty
 
 
 async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> None:
+    await _is_released(slow_driver)
+    await closed(*await opened(path))
+
+
+async def _is_released(slow_driver: threading.Event) -> None:
     released, really_release = threading.Event(), serial_port._release
 
     def release(device: serial.Serial, exclusive: bool) -> None:
@@ -158,7 +177,6 @@ async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> No
         patch.setattr(serial_port, "_release", release)
         slow_driver.set()
         assert await asyncio.to_thread(released.wait, PATIENCE)
-    await closed(*await opened(path))
 
 
 @pytest.mark.asyncio
@@ -248,6 +266,21 @@ async def test_both_locks_are_taken_and_given_back(pty_master: PtyMaster) -> Non
     os.close(bystander)
 
 
+@pytest.mark.parametrize("exclusive", [True, False])
+@pytest.mark.asyncio
+async def test_a_port_that_is_closed_or_refused_leaves_the_flags_to_a_program_that_shares_it(
+    pty_master: PtyMaster, exclusive: bool
+) -> None:
+    def marks() -> bool:
+        return bool(termios.tcgetattr(pty_master.fd)[0] & termios.PARMRK)
+
+    await closed(*await opened(pty_master.path, exclusive=exclusive))
+    assert marks() is not exclusive
+    with pytest.raises(LineDown, match="no low-latency flag"):
+        await opened(pty_master.path, exclusive=exclusive, low_latency=True)
+    assert marks() is not exclusive
+
+
 @pytest.mark.asyncio
 async def test_a_second_opening_says_that_this_program_has_it(pty_master: PtyMaster) -> None:
     transport, recorder = await opened(pty_master.path)
@@ -304,6 +337,19 @@ async def test_a_port_that_this_program_is_still_closing_is_said_to_be_and_opens
     with pytest.raises(LineDown, match="is in use by this program; "):
         await opened(pty_master.path)  # which closes nothing now
     await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_is_still_being_closed_is_known_by_another_name_too(
+    pty_master: PtyMaster, holding_driver: threading.Event, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(serial_port, "CLOSING_PATIENCE", 0.001)
+    (tmp_path / "line").symlink_to(pty_master.path)
+    transport, recorder = await opened(pty_master.path)
+    transport.close()
+    await recorder.lost()
+    with pytest.raises(LineDown, match=f"this program is still closing {tmp_path / 'line'}: "):
+        await opened(str(tmp_path / "line"))
 
 
 @pytest.mark.asyncio

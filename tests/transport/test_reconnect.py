@@ -139,6 +139,17 @@ def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_their_reason_
     run_in_virtual_time(fail())
 
 
+def test_a_device_that_was_there_all_the_time_has_not_returned() -> None:
+    async def fail() -> None:
+        told, recorder = Told(failures=3), Recorder()
+        told.seen = "there"
+        async with kept(told, recorder, first_delay=1.0, longest_delay=4.0, jitter=Even()):
+            await recorder.connected()
+        assert told.pauses == pytest.approx([1, 2, 4])
+
+    run_in_virtual_time(fail())
+
+
 def test_delays_are_spread_by_a_quarter_from_a_seeded_source() -> None:
     async def pauses(seed: int) -> list[float]:
         told, recorder = Told(failures=20), Recorder()

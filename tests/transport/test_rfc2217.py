@@ -105,6 +105,7 @@ async def scripted(*says: str) -> AsyncIterator[tuple[int, list[bytes], list[asy
         ({"stopbits": 3}, "framing"),
         ({"receive_latency": -1.0}, "receive_latency"),
         ({"rtscts": True, "rts": True}, "exclude each other"),
+        ({"rtscts": True, "rts": False}, "exclude each other"),
     ],
 )
 def test_values_that_no_port_can_have_are_rejected_when_it_is_built(values: dict[str, Any], says: str) -> None:
@@ -116,6 +117,7 @@ def test_values_that_no_port_can_have_are_rejected_when_it_is_built(values: dict
 def test_it_has_the_framing_that_it_sets() -> None:
     port = Rfc2217Port("server", 4001, baudrate=9600, bytesize=7, parity="E")
     assert port.settings == LineSettings(9600, 7, "E")
+    assert Rfc2217Port("server", 4001, baudrate=2**32 - 1).settings.baudrate == 2**32 - 1
     assert port.name == "server:4001"
 
 
@@ -154,6 +156,18 @@ async def test_rtscts_is_set_at_the_server() -> None:
     async with rfc2217_server() as server:
         await closed(*await opened(server.number, rtscts=True))
         assert server.port.rtscts
+
+
+@pytest.mark.asyncio
+async def test_flow_control_that_an_earlier_client_left_on_is_switched_off() -> None:
+    port = RemotePort()
+    port.rtscts = True
+    async with rfc2217_server(port=port) as server:
+        transport, recorder = await opened(server.number)
+        transport.write(b"x")
+        await until(server, lambda: server.sessions[0].received == b"x")
+        assert not server.port.rtscts
+        await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
@@ -264,6 +278,31 @@ async def test_output_that_the_server_suspends_is_held_and_sent_in_order() -> No
         await closed(transport, recorder)
 
 
+@pytest.mark.asyncio
+async def test_output_that_the_network_does_not_take_pauses_the_protocol_and_is_dropped_by_an_abort(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with scripted(AGREES, CONFIRMS) as (number, _, writers):
+        transport, recorder = await opened(number)
+        server: Any = writers[0].transport
+        for stops, size in ((1, 1_000_000), (2, 40_000_000)):  # the second is more than the kernel ever takes
+            with monkeypatch.context() as patch:
+                patch.setattr(server, "resume_reading", lambda: None)  # its stream would do so
+                server.pause_reading()
+                while recorder.flow.count("pause") < stops:
+                    transport.write(bytes(size))
+                assert transport.get_write_buffer_size() > 0
+                if stops == 2:
+                    transport.abort()
+                    async with asyncio.timeout(PATIENCE / 10):
+                        await recorder.lost()
+            server.resume_reading()
+            if stops == 1:
+                await recorder.until(lambda r: r.flow == ["pause", "resume"])
+                assert transport.get_write_buffer_size() == 0
+        assert recorder.losses == [None]
+
+
 class Chunks:
     """A tap that keeps what was received at a time."""
 
@@ -339,10 +378,11 @@ async def test_a_lost_connection_is_made_again_and_the_port_set_again() -> None:
 
 @pytest.mark.asyncio
 async def test_a_server_that_answers_no_masks_and_no_flow_control_is_used() -> None:
-    async with scripted(AGREES, CONFIRMS) as (number, heard, _):
+    async with scripted(AGREES + "ff fb 03 ff fd 03", CONFIRMS) as (number, heard, _):
         transport, recorder = await opened(number)
         assert transport.get_extra_info("modem_lines") is None
         assert heard[0] == bytes.fromhex("ff fb 2c ff fb 00 ff fd 00 ff fb 03 ff fd 03")
+        assert heard[1].startswith(bytes.fromhex("ff fa 2c 01")), "it does not answer agreements (RFC 854)"
         await closed(transport, recorder)
 
 
@@ -434,6 +474,51 @@ async def test_dtr_that_is_not_confirmed_is_an_error(monkeypatch: pytest.MonkeyP
     async with scripted(AGREES, CONFIRMS, "ff fa 2c 69 01 ff f0 ff fa 2c 69 09 ff f0") as (number, _, _):
         with pytest.raises(LineDown, match="does not take DTR ON: it confirms DTR OFF"):
             await opened(number, dtr=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "answer", "says"),
+    [
+        ({"rtscts": True}, "ff fa 2c 69 01 ff f0", "does not take RTS CTS: it confirms NO FLOW CONTROL"),
+        (
+            {"rts": False},
+            "ff fa 2c 69 01 ff f0 ff fa 2c 69 0b ff f0",
+            "does not take RTS OFF: it confirms RTS ON",
+        ),
+        ({"rtscts": True}, "ff fa 2c 69 03 ff f0 ff fc 00", "refuses binary transmission"),
+    ],
+)
+@pytest.mark.asyncio
+async def test_a_server_that_does_not_control_the_lines_as_set_or_refuses_in_the_end_is_not_used(
+    options: dict[str, Any], answer: str, says: str
+) -> None:
+    recorder = Recorder()
+    async with scripted(AGREES, CONFIRMS, answer) as (number, _, writers):
+        with pytest.raises(LineDown, match=says):
+            await opened(number, recorder, **options)
+        assert await asyncio.wait_for(_ended(writers), PATIENCE)
+    assert recorder.connections == 0
+
+
+@pytest.mark.asyncio
+async def test_a_change_of_settings_ends_only_when_the_server_has_answered_all_of_it() -> None:
+    """An answer that is left over would be taken for that to the next change."""
+    async with scripted(AGREES, CONFIRMS, "ff fa 2c 69 01 ff f0", "ff fa 2c 65 00 00 e1 00 ff f0 78") as (
+        number,
+        heard,
+        writers,
+    ):
+        transport, recorder = await opened(number)
+        async with asyncio.timeout(PATIENCE):
+            while len(heard) < 3:  # noqa: ASYNC110  # the server has no event for it
+                await asyncio.sleep(0.001)
+        tuning = asyncio.ensure_future(transport.tune(LineSettings(9600)))
+        await recorder.heard(b"x")
+        assert not (await asyncio.wait([tuning], timeout=0.02))[0]
+        writers[0].write(bytes.fromhex("ff fa 2c 66 08 ff f0 ff fa 2c 67 01 ff f0 ff fa 2c 68 01 ff f0"))
+        with pytest.raises(LineDown, match="does not take 9600 baud: it confirms 57600 baud"):
+            await tuning
+        await closed(transport, recorder)
 
 
 @pytest.mark.asyncio

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import array
 import asyncio
+import errno
+import itertools
+import os
 import termios
 import threading
 import time
@@ -26,6 +29,7 @@ from busmaster.registry import make_device
 from busmaster.transport import rs485
 from busmaster.transport.kernel import open_port
 from busmaster.transport.serial_port import SerialPort
+from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
 from tests.transport.rs485_driver import TERMINATE, FakeDriver
 
@@ -336,6 +340,71 @@ async def test_a_lost_port_is_reported_once_and_its_thread_ends(pty_master: PtyM
     transport.write(b"\x02")  # nothing is sent any more
     await closed(transport, recorder)
     assert len(recorder.losses) == 1
+
+
+@pytest.mark.asyncio
+async def test_a_driver_that_takes_a_frame_in_pieces_gets_all_of_it(
+    pty_master: PtyMaster, driver: FakeDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport, recorder = await opened(pty_master.path, rs485=SOFTWARE)
+    is_full = itertools.cycle([False, True])
+
+    def write(descriptor: int, data: bytes) -> int:
+        if descriptor != transport._fd:
+            return driver.write(descriptor, data)
+        if next(is_full):
+            raise BlockingIOError
+        return driver.write(descriptor, data[:2])
+
+    monkeypatch.setattr(os, "write", write)
+    driver.log.clear()
+    transport.write(bytes.fromhex("01 02 03 04 05"))
+    await driver.until("RTS low")
+    assert driver.log == ["RTS high", "write 01 02", "write 03 04", "write 05", "drained", "RTS low"]
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_is_lost_while_it_is_drained_is_reported(
+    pty_master: PtyMaster, driver: FakeDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: int) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    transport, recorder = await opened(pty_master.path, rs485=SOFTWARE)
+    monkeypatch.setattr(termios, "tcdrain", fail)
+    transport.write(b"\x01")
+    assert transport._switch is not None
+    await asyncio.to_thread(transport._switch.join)
+    await asyncio.sleep(0.01)
+    assert [str(loss) for loss in recorder.losses] == [f"{pty_master.path} was lost: it hung up"]
+    assert driver.log[-1] == "RTS low"
+
+
+@pytest.mark.asyncio
+async def test_a_close_discards_bytes_whose_end_the_switch_waits_for(
+    pty_master: PtyMaster, driver: FakeDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A driver that is stopped would drain them never, and the port would stay open."""
+    begun, discarded, in_time = threading.Event(), threading.Event(), list[bool]()
+    really_flush = termios.tcflush
+
+    def flush(descriptor: int, which: int) -> None:
+        if which == termios.TCOFLUSH:
+            discarded.set()
+        really_flush(descriptor, which)
+
+    def drain(_: int) -> None:
+        begun.set()
+        in_time.append(discarded.wait(1.0))
+
+    transport, recorder = await opened(pty_master.path, rs485=SOFTWARE)
+    monkeypatch.setattr(termios, "tcflush", flush)
+    monkeypatch.setattr(termios, "tcdrain", drain)
+    transport.write(b"\x01")
+    assert await asyncio.to_thread(begun.wait, PATIENCE)
+    await closed(transport, recorder)
+    assert in_time == [True]
 
 
 @pytest.mark.asyncio

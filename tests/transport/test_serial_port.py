@@ -35,6 +35,7 @@ def pty_master() -> Iterator[PtyMaster]:
 def test_a_port_is_a_value() -> None:
     assert SerialPort("/dev/ttyUSB0", baudrate=9600) == SerialPort("/dev/ttyUSB0", baudrate=9600)
     assert SerialPort("/dev/ttyUSB0", baudrate=9600, parity="E", bytesize=7).settings.framing == "7E1"
+    assert SerialPort("/dev/ttyUSB0", baudrate=9600, stopbits=2).settings == LineSettings(9600, stopbits=2)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,7 @@ def test_a_port_is_a_value() -> None:
         ({"stopbits": 3}, "framing"),
         ({"receive_latency": -0.1}, "receive_latency"),
         ({"receive_latency": float("nan")}, "receive_latency"),
+        ({"receive_latency": float("inf")}, "receive_latency"),
         ({"rtscts": True, "rs485": True}, "exclude each other"),
         ({"path": ""}, "path"),
     ],
@@ -84,6 +86,15 @@ async def test_a_pty_is_unpaced_unless_told(pty_master: PtyMaster) -> None:
     for told, expected in ((None, False), (True, True), (False, False)):
         transport, recorder = await opened(pty_master.path, paced=told)
         assert transport.get_extra_info("paced") is expected
+        assert is_paced(SerialPort(pty_master.path, baudrate=57600, paced=told), transport) is expected
+        await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_serial_device_is_paced_unless_told(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_port, "is_pty", lambda device: False)
+    for told, expected in ((None, True), (False, False)):
+        transport, recorder = await opened(pty_master.path, paced=told)
         assert is_paced(SerialPort(pty_master.path, baudrate=57600, paced=told), transport) is expected
         await closed(transport, recorder)
 

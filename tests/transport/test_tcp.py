@@ -61,6 +61,8 @@ async def done(happening: Awaitable[Any]) -> None:
         {"host": ""},
         {"port": 0},
         {"port": 65536},
+        {"port": "4001"},
+        {"port": 4001.0},
         {"baudrate": 0},
         {"receive_latency": -1.0},
         {"receive_latency": float("inf")},
@@ -93,7 +95,13 @@ async def test_bytes_go_both_ways_without_delay_and_a_dead_server_is_found_out()
         sock = transport.get_extra_info("socket")
         assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-        assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) <= 5
+        idle, interval, count, unacknowledged = (
+            sock.getsockopt(socket.IPPROTO_TCP, option)
+            for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT, socket.TCP_USER_TIMEOUT)
+        )
+        assert idle <= 5
+        assert idle + count * interval <= 10
+        assert 5_000 <= unacknowledged <= 10_000, "milliseconds"
         transport.write(b"ping")
         while server.said != b"ping":
             server.heard.clear()

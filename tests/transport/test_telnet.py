@@ -118,6 +118,7 @@ def test_settings_are_written_as_rfc_2217_has_them() -> None:
         Set.STOPSIZE: b"\x02",
     }
     assert values_of(LineSettings(9600, 8, "M", 1.5))[Set.STOPSIZE] == b"\x03"
+    assert [values_of(LineSettings(9600, 8, parity))[Set.PARITY][0] for parity in "NOEMS"] == [1, 2, 3, 4, 5]
     assert subnegotiation(1, bytes.fromhex("00 00 ff 00")).hex(" ") == "ff fa 2c 01 00 00 ff ff 00 ff f0"
 
 

@@ -75,7 +75,6 @@ class Search:
         stop_offered: Callable[[], Callable[[], bool]] = lambda: lambda: False,
     ) -> None:
         self._wire = wire
-        self._endpoint = endpoint
         self._report = report
         self._progress = progress
         self._echo = endpoint.echo
@@ -86,9 +85,7 @@ class Search:
     async def listen(self, tried: Sequence[Step]) -> str:
         """Return a description of another master, "" if there is none. Nothing is sent. Raises LineDown."""
         wire = self._wire
-        assert wire.port is not None
         await wire.hear_all(OPENING)
-        wire.port.reset()
         heard = await wire.hear_all(LISTENING)
         if not heard:
             return ""
@@ -234,7 +231,7 @@ class Search:
         return probe
 
     async def _confirmed(self, step: Step, address: int) -> Found | None:
-        """Send further requests to a node; None unless it replies to each, without a second reply."""
+        """Send further requests to a node; None unless it replies to each."""
         prober = self._prober(step)
         await self._wire.hear_all(step.kind.profile.timings.read.max_reply_delay)  # earlier replies are over then
         probes = [await prober.ask(address, alone=True) for _ in range(CONFIRMED)]

@@ -139,6 +139,7 @@ class ConfiguredLine:
         self.outputs = Distributor(self.bus, report, authorisation=self.authorisation, asks=asks)
         self._kept_times = KeptTimes(self.bus, self._report)
         self.authorisation.record = self.outputs.record
+        self._has_outputs = outputs
         if outputs:
             self._add_outputs()
 
@@ -196,7 +197,8 @@ class ConfiguredLine:
         self._start_groups()
         # Up to here in one turn of the loop. A command that an output still takes while it is closed is written by the
         # scale that it was sent for, within the limits of now: those are of the quantity.
-        await self.outputs.replace(dict(self._wanted_outputs()), self.groups.values())
+        outputs = dict(self._wanted_outputs()) if self._has_outputs else {}
+        await self.outputs.replace(outputs, self.groups.values())
 
     def point(self, name: str) -> NamedPoint:
         """Return the point with this name in the file: "winder/position", "press/2008:32".

@@ -22,6 +22,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
 import serial
 
@@ -46,10 +47,12 @@ from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import identity
+from busmaster.transport.rfc2217 import Rfc2217Port
 from busmaster.transport.serial_port import SerialPort
 from tests.app.cli.conftest import Command, without_time
 from tests.app.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged, without_rate
+from tests.transport.rfc2217_server import RemotePort, rfc2217_server
 from tests.transport.rs485_driver import FakeDriver
 from tests.transport.usb import UsbTree
 
@@ -353,6 +356,56 @@ def test_a_node_that_sometimes_does_not_answer_is_said_so() -> None:
     findings = examined(line_of("hcp2", [hcp2(5, lost=0.3)]), (5,))
     assert findings.wrong == {"node 5"}
     assert "requests, although it is alive: read element 1: 0" in findings.on("node 5").what
+
+
+class Stuttering(Device):
+    """Begins a reply to each request, and never ends it."""
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.attentive = True
+        profile = find("hcp2").profile
+        self._request = profile.probe.open(address, profile.timings).request
+        self._heard = b""
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        self._heard += bytes((byte,))
+        if self._heard.endswith(self._request):
+            self.reply(b"\x02\x30\x31", now, 0.002)
+
+
+def test_where_all_replies_are_garbled_other_settings_are_tried_too() -> None:
+    findings = examined(line_of("hcp2", [Stuttering(5)]), (5,))
+    assert findings.on("node 5").what == "25 of 25 replies garbled (cut short): 02 30 31"
+    assert findings.on("settings").what == "node 5: no reply with 20 other settings either"
+    assert "nodes" not in {finding.topic for finding in findings}
+
+
+class Vanishing(MemoryPort):
+    """A port that is unplugged while nodes are asked."""
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
+    ) -> MemoryTransport:
+        transport = await MemoryPort.open(self, protocol_factory, only)
+        asyncio.get_running_loop().call_later(0.8, transport.lose, OSError(5, "Input/output error"))
+        return transport
+
+
+def test_a_port_that_is_lost_meanwhile_is_the_last_finding() -> None:
+    line = line_of("hcp2", [])
+    findings = examined(line, range(1, 100), port=Vanishing(line))
+    assert [finding.topic for finding in findings] == ["open", "silence", "echo", "port"]
+    assert findings[-1] == Finding("port", False, "Input/output error", "start again when it is back")
+
+
+def test_a_port_that_this_user_may_not_open_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    findings = Findings()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with plugged() as pty_master:
+        asyncio.run(examine(Patient(SerialPort(pty_master.path, baudrate=57600)), findings.append))
+    assert [finding.topic for finding in findings] == ["port", "permission", "holders"]
+    assert findings.wrong == {"permission"}
 
 
 def test_a_named_node_that_is_not_there_is_named_and_the_others_are_measured() -> None:
@@ -728,6 +781,31 @@ def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
     assert LineSettings(9600, 7, "E") not in candidates
     framings = [candidate.framing for candidate in candidates]
     assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)
+    assert {candidate.stopbits for candidate in other_settings(LineSettings(9600, stopbits=2))} == {2}
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.asyncio
+async def test_other_rates_are_tried_at_a_server_with_rfc_2217_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(examination, "RATES", (9600,))
+    monkeypatch.setattr(examination, "FRAMINGS", ())
+    rates: list[object] = []
+
+    def takes(name: str, value: object) -> bool:
+        if name == "baudrate":
+            rates.append(value)
+        return True
+
+    remote = RemotePort(takes)
+    async with rfc2217_server(port=remote) as server:
+        findings = Findings()
+        port = Rfc2217Port("127.0.0.1", server.number, baudrate=57600)
+        await examine(Patient(port, "hcp2", addresses=(4,)), findings.append)
+    assert [finding.topic for finding in findings] == [
+        *("adapter", "open", "line errors", "modem lines", "silence", "echo", "nodes", "settings")
+    ]
+    assert findings.on("settings").what == "node 4: no reply with 1 other settings either"
+    assert (rates[-2:], remote.baudrate) == ([9600, 57600], 57600)
 
 
 @dataclass(frozen=True)
@@ -755,6 +833,44 @@ def test_a_node_at_other_settings_is_found_at_any_of_the_first_addresses(setting
     assert findings.on("nodes").what == "no reply from nodes 1, 2, 4, 5 at 57600 8N1"
     assert findings.on("settings").what == f"nodes 1, 2, 4, 5: node 4 replies at {diagnosis.speed(settings)}"
     assert line.host == LineSettings(57600), "the settings of the port are as they were"
+
+
+def test_the_wait_for_a_reply_begins_with_the_end_of_its_request_at_each_of_the_other_rates() -> None:
+    line = Line(LineSettings(2400), [hcp2(4, Delay(0.08))], chance=random.Random(1))  # it takes 33 ms there
+    assert examined(line, (4,), port=Tunable(line)).on("settings").what == "node 4: node 4 replies at 2400 8N1"
+
+
+@dataclass(frozen=True)
+class Slow(Tunable):
+    """A port that takes half a second to change its settings."""
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: identity.Identity | None = None
+    ) -> MemoryTransport:
+        transport = await Tunable.open(self, protocol_factory, only)
+        tune = transport.tune
+
+        async def slowly(settings: LineSettings) -> None:
+            await asyncio.sleep(0.5)
+            await tune(settings)
+
+        transport.tune = slowly  # type: ignore[method-assign]  # of this one
+        return transport
+
+
+def test_a_doctor_that_is_interrupted_leaves_the_port_as_it_was() -> None:
+    line = Line(LineSettings(9600), [], chance=random.Random(1))
+    hosts: list[LineSettings | None] = []
+
+    async def interrupt() -> None:
+        asyncio.get_running_loop().call_later(3.9, lambda: hosts.append(line.host))
+        with anyio.move_on_after(4.0) as interrupted:
+            await examine(Patient(Slow(line), "hcp2", addresses=(4,), named=True), lambda _: None)
+        assert interrupted.cancelled_caught
+
+    run_in_virtual_time(interrupt())
+    assert hosts != [HCP2_SETTINGS], "it was trying others"
+    assert line.host == HCP2_SETTINGS
 
 
 @dataclass(frozen=True)

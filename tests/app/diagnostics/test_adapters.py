@@ -12,6 +12,7 @@ import sys
 import termios
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,10 +26,13 @@ from busmaster.app.diagnostics.adapters import (
     opened_latency,
     rs485_mode,
 )
-from busmaster.app.diagnostics.examination import driver, rate, remote_port
+from busmaster.app.diagnostics.examination import Patient, driver, opening, rate, remote_port
 from busmaster.transport import identity
 from busmaster.transport.holders import Holder, holders, how_to_open, lock_owner, owning_group
-from busmaster.transport.rfc2217 import ModemLines
+from busmaster.transport.rfc2217 import ModemLines, Rfc2217Port
+from busmaster.transport.rs485 import Rs485
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
 from tests.transport.fakes import PtyMaster, plugged
 from tests.transport.usb import UsbTree
 
@@ -193,6 +197,7 @@ def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path
         ("python3.11", "python -I poll.py --password x", "python3.11 -I poll.py"),
         ("python", "python -u -c import@sys;print(1)", "python -u -c"),
         ("python", "python -m timeit", "python -m timeit"),
+        ("python", "python -Im busmaster safe line.toml", "python -Im busmaster safe"),
         ("python", "python -W error -X dev -m busmaster run x", "python -W error -X dev -m busmaster run"),
         ("python", "python -Xtracemalloc -Im busmaster run x", "python -Xtracemalloc -Im busmaster run"),
         ("python", "python -Xpycache_prefix=/tmp/m poll.py secret", "python -Xpycache_prefix=/tmp/m poll.py"),
@@ -242,7 +247,7 @@ def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, p
     in_another_container = (0, -1)
     for pid, owner in ((4711, Holder(4711, "another program")), *((number, None) for number in in_another_container)):
         (tmp_path / "locks").write_text(
-            f"1: POSIX ADVISORY WRITE 1 00:01:2 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
+            f"1: POSIX ADVISORY WRITE 1 {place} 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
         )
         assert lock_owner(pty_master.path, proc=tmp_path) == owner
     assert str(Holder(4711, "another program")) == "another program (process 4711)"
@@ -305,6 +310,11 @@ def test_a_rate_that_a_uart_cannot_make_is_told_where_its_driver_tells_what_it_d
     [finding] = rate(pty_master.fd, 76800)
     assert not finding.ok
     assert finding.what == "its UART makes 57600 baud of 76800, -25.0%"
+    [finding] = rate(pty_master.fd, 921600)
+    assert finding.what == "its UART makes 115200 baud of 921600, -87.5%"
+    for base, differs in ((10_190, False), (10_210, True), (9_810, False), (9_790, True), (0, False)):
+        monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, base=base: settings.__setitem__(7, base))
+        assert bool(list(rate(pty_master.fd, 10_000))) is differs
 
 
 def test_the_rs485_mode_of_a_driver_is_reported_unless_software_switches(
@@ -341,9 +351,61 @@ def test_what_an_rfc_2217_server_reports_of_its_port_is_shown() -> None:
     errors, lines = remote_port(Remote(object(), ModemLines(cts=True, dsr=False, ri=False, cd=True)))
     assert errors == Finding("line errors", True, "the server reports line errors")
     assert lines == Finding("modem lines", True, "the server reports CTS on, DSR off, RI off, CD on")
+    patient = Patient(Rfc2217Port("server", 4001, baudrate=19200), "msc")
+    opened = Finding("open", True, "it opens at 19200 8N1", "MSC nodes support only 9600 baud, not 19200")
+    wire: Any = SimpleNamespace(transport=Remote(None, ModemLines(cts=True, dsr=False, ri=False, cd=True)))
+    assert list(opening(patient, wire)) == [opened, *remote_port(wire.transport)]
     [errors] = remote_port(Remote(None, None))
     assert (errors.ok, errors.what) == (True, "the server has not confirmed that it reports line errors")
     assert errors.advice.startswith("parity and framing errors are not counted: each shows as a garbled reply")
+
+
+def test_a_rate_behind_a_raw_tcp_port_that_no_device_has_is_noted_too() -> None:
+    wire: Any = SimpleNamespace(transport=object())
+    [found] = opening(Patient(TcpPort("server", 4001, baudrate=19200), "msc"), wire)
+    assert found == Finding("open", True, "it opens", "MSC nodes support only 9600 baud, not 19200")
+    for patient in (Patient(TcpPort("server", 4001, baudrate=19200)), Patient(TcpPort("server", 4001), "msc")):
+        assert list(opening(patient, wire)) == [Finding("open", True, "it opens")]
+
+
+def test_an_open_serial_port_is_reported_with_its_rate_and_its_driver(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device: Any = SimpleNamespace(fileno=lambda: pty_master.fd)
+    wire: Any = SimpleNamespace(transport=SimpleNamespace(get_extra_info={"serial": device}.get))
+    port = SerialPort("/dev/ttyS0", baudrate=76800, low_latency=True, rs485=Rs485(by="software"))
+
+    def ioctl(_descriptor: int, request: int, settings: Any) -> int:
+        if request == termios.TIOCGSERIAL:
+            settings[7] = 115200
+            return 0
+        raise OSError("no such mode")
+
+    monkeypatch.setattr(fcntl, "ioctl", ioctl)
+    found = list(opening(Patient(port), wire))
+    assert [(one.topic, one.ok) for one in found] == [
+        ("open", True),
+        ("rate", False),
+        ("driver", True),
+        ("rs485", True),
+    ]
+    assert found[1].what == "its UART makes 57600 baud of 76800, -25.0%"
+    assert found[2].what == "its low-latency flag is not set, although low_latency=1 was given"
+    assert found[3].what == "software switches the transmitter by RTS"
+
+
+def test_every_program_that_holds_the_port_is_named_but_not_the_emulator_of_the_line(
+    tmp_path: Path, pty_master: PtyMaster
+) -> None:
+    for pid, program in ((4711, "gpsd"), (4712, "socat"), (4713, "ModemManager")):
+        for folder in ("fd", "fdinfo"):
+            (tmp_path / str(pid) / folder).mkdir(parents=True)
+        (tmp_path / str(pid) / "fd/3").symlink_to(pty_master.path)
+        (tmp_path / str(pid) / "fdinfo/3").write_text("flags:\t0100002\n")
+        (tmp_path / str(pid) / "comm").write_text(f"{program}\n")
+    (tmp_path / "4712/fdinfo/4").write_text(f"flags:\t0100002\ntty-index:\t{pty_master.number}\n")
+    [finding] = [one for one in inspect(pty_master.path, proc=tmp_path) if one.topic == "holders"]
+    assert (finding.ok, finding.what) == (False, "open in gpsd (process 4711), ModemManager (process 4713)")
 
 
 def test_who_is_not_root_is_told_that_other_users_programs_cannot_be_seen(
@@ -385,6 +447,23 @@ def test_an_adapter_without_a_serial_number_goes_by_its_place(
     link.symlink_to(pty_master.path)
     assert name_of(pty_master.path).advice.startswith(f"name it {link}, ")
     assert not name_of(str(link)).advice
+
+
+def test_a_link_by_id_is_a_name_that_stays_only_if_it_belongs_to_one_adapter(
+    usb: UsbTree, pty_master: PtyMaster, tmp_path: Path
+) -> None:
+    with plugged() as second:
+        link = tmp_path / "links/by-id/usb-FTDI_0001-if00-port0"
+        by_path = tmp_path / "links/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0"
+        for name in (link, by_path):
+            name.parent.mkdir(parents=True)
+            name.symlink_to(pty_master.path)
+        usb.plug(pty_master.path, "0001", place="1-1", number=0)
+        usb.plug(second.path, "0001", place="1-1", number=1)
+        assert name_of(str(link)).what == f"{link} is FTDI 0001, which {link} finds again"
+        usb.unplug(second.path)
+        usb.plug(second.path, "0001", place="1-2", number=0)
+        assert name_of(str(link)).advice == f"name it {by_path}, because {link} can change between adapters"
 
 
 def test_a_serial_number_that_is_not_there_is_all_that_is_said(usb: UsbTree) -> None:

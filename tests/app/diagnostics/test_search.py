@@ -13,7 +13,7 @@ from math import inf
 import pytest
 
 from busmaster.app.diagnostics.probing import opened
-from busmaster.app.diagnostics.search import Discovery, Search
+from busmaster.app.diagnostics.search import CONFIRMED, MEASURED, Discovery, Search
 from busmaster.app.diagnostics.steps import (
     LISTENING,
     Step,
@@ -30,7 +30,7 @@ from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.emulator.misheard import misheard
 from busmaster.emulator.traceable import TraceableMemory
-from busmaster.errors import InvalidCommand
+from busmaster.errors import InvalidCommand, LineDown
 from busmaster.registry import NodeKind, find, kinds, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.identity import Identity
@@ -247,6 +247,18 @@ def test_an_adapter_that_echoes_is_noticed() -> None:
     assert [(node.address, node.label) for node in discovery.found] == [(3, "node 3")]
 
 
+def test_an_echo_that_was_declared_is_not_news() -> None:
+    told: list[str] = []
+    port = MemoryPort(line_of(LineSettings(57600), make_device("hcp2", 3), echo=Echo()))
+
+    async def look() -> Discovery:
+        async with opened(port) as wire:
+            return await Search(wire, port, told.append).look(steps([find("hcp2")], (3,), LineSettings(57600)))
+
+    discovery = run_in_virtual_time(look())
+    assert (discovery.echo, [node.address for node in discovery.found], told) == (True, [3], [])
+
+
 def test_a_node_that_answers_after_the_window_is_found_under_its_own_address() -> None:
     """Its answer is heard behind the next node's request."""
     line = line_of(LineSettings(57600), make_device("hcp2", 2, delay=Delay(0.13)), make_device("hcp2", 5))
@@ -262,6 +274,7 @@ def test_the_time_to_a_reply_counts_from_the_requests_end_whatever_the_rate() ->
     discovery = looked(line, steps([find("hcp2")], (3,), settings))
     [node] = discovery.found
     assert node.starts[0] == pytest.approx(0.02, abs=0.002)
+    assert (len(node.starts), node.text, node.refuses) == (CONFIRMED + MEASURED, "read element 1: 0", False)
 
 
 def test_a_protocol_is_tried_though_another_ones_probe_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -481,6 +494,19 @@ def test_the_user_is_offered_to_stop_on_a_slow_line_and_what_was_found_is_kept()
     assert discovery.not_asked == {"modbus": tuple(range(39, 248))}
 
 
+def test_where_the_other_addresses_take_little_time_the_user_is_not_offered_to_stop() -> None:
+    def offered() -> Callable[[], bool]:
+        raise AssertionError("offered")
+
+    async def look() -> Discovery:
+        port = Undeclared(line_of(find("msc").profile.line, make_device("msc", 12), make_device("msc", 3)))
+        async with opened(port) as wire:
+            search = Search(wire, port, lambda _: None, stop_offered=offered)
+            return await search.look(steps([find("msc")], None, None))
+
+    assert [node.address for node in run_in_virtual_time(look()).found] == [3, 12]
+
+
 class Courses:
     """The courses of a search, each with the number of its steps and how many of these were shown."""
 
@@ -540,6 +566,61 @@ def test_settings_that_the_port_does_not_take_are_reported_and_left_out() -> Non
     discovery = run_in_virtual_time(look())
     assert [(node.address, discovery.settings) for node in discovery.found] == [(3, LineSettings(9600))]
     assert told == ["left out: 57600 baud: invalid argument"]
+
+
+class Fickle(Undeclared):
+    """A port that takes its settings once. `lost`: then it is gone."""
+
+    lost = False
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
+        transport = await MemoryPort.open(self, protocol_factory, only)
+        tune, taken = transport.tune, list[LineSettings]()
+
+        async def once(settings: LineSettings) -> None:
+            taken.append(settings)
+            if len(taken) == 1:
+                return await tune(settings)
+            if self.lost:
+                transport.lose(LineDown("it hung up", hint=""))
+                await asyncio.sleep(0.001)
+            raise LineDown("no such settings", hint="")
+
+        transport.tune = once  # type: ignore[method-assign]  # of this one
+        return transport
+
+
+class Vanishing(Fickle):
+    lost = True
+
+
+def test_addresses_whose_settings_are_not_taken_again_are_noted_as_not_tried() -> None:
+    told: list[str] = []
+    port = Fickle(line_of(LineSettings(57600), make_device("hcp2", 3)))
+
+    async def look() -> Discovery:
+        async with opened(port) as wire:
+            return await Search(wire, port, told.append).look(steps([find("hcp2")], None, LineSettings(57600)))
+
+    discovery = run_in_virtual_time(look())
+    assert [node.address for node in discovery.found] == [3]
+    assert discovery.not_asked == {"hcp2": (0, *range(9, 256))}
+    assert told[-1] == "left out: no such settings"
+
+
+def test_a_port_that_is_lost_while_it_is_set_ends_the_search() -> None:
+    told: list[str] = []
+    port = Vanishing(line_of(LineSettings(57600)))
+
+    async def look() -> None:
+        async with opened(port) as wire:
+            await Search(wire, port, told.append).look(steps([find("hcp2")], (3,), None))
+
+    with pytest.raises(LineDown, match="no such settings"):
+        run_in_virtual_time(look())
+    assert told == []
 
 
 def test_addresses_are_written_as_ranges() -> None:

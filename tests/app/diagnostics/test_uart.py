@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
 import termios
 
@@ -9,7 +10,7 @@ import pytest
 
 from busmaster.app.diagnostics import uart
 from busmaster.app.diagnostics.adapters import Finding
-from busmaster.app.diagnostics.examination import Patient, examine
+from busmaster.app.diagnostics.examination import OPENING, Patient, examine
 from busmaster.app.diagnostics.probing import opened
 from busmaster.arbiter.counters import DriverErrors, Mark
 from busmaster.emulator.line import Line
@@ -39,6 +40,15 @@ def test_of_a_port_that_cannot_tell_nothing_is_said() -> None:
 def test_of_a_driver_that_counted_nothing_it_is_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(OpenPort, "errors", lambda _: NOTHING)
     assert examined() == ["no byte was damaged or lost; "]
+
+
+def test_errors_from_the_opening_of_the_port_are_not_faults_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    resets: list[float] = []
+    monkeypatch.setattr(OpenPort, "reset", lambda _: resets.append(asyncio.get_running_loop().time()))
+    monkeypatch.setattr(OpenPort, "errors", lambda _: NOTHING if resets else DriverErrors(3, 0, 0, 0, 0))
+    assert examined() == ["no byte was damaged or lost; "]
+    [at] = resets
+    assert at >= OPENING
 
 
 def test_each_kind_of_error_says_what_to_look_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,6 +106,14 @@ def test_outputs_are_those_of_the_changed_file(tmp_path: Path) -> None:
     assert all(b"winder" in path.read_bytes() for path in tmp_path.iterdir())
 
 
+@in_virtual_time
+async def test_a_line_that_was_opened_without_outputs_has_none_of_the_changed_file_either() -> None:
+    text = WINDER + group("fast", "winder/speed") + '[outputs.jsonl]\npath = "never-written.jsonl"\n'
+    async with opened(text) as line:
+        await line.take(file(text.replace("never", "not")))
+        assert line.outputs.statistics() == ()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [

@@ -16,6 +16,7 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine, kept_times
 from busmaster.bus.node import Node
+from busmaster.emulator.line import Echo
 from busmaster.statistics import LearnedTimes
 from busmaster.testing import run_in_virtual_time
 
@@ -132,6 +133,20 @@ def test_what_was_learned_at_another_port_is_forgotten(text: str, monkeypatch: p
             patch.setattr(MemoryPort, attribute, other)
             assert run_for(text, SHORT) == set()
     assert run_for(text, SHORT) == {"winder", "drive"}
+
+
+def test_what_was_learned_without_an_echo_is_forgotten_where_there_is_one(text: str) -> None:
+    run_for(text, LONG)
+
+    async def main() -> set[str]:
+        file = read(Source("line.toml", text))
+        emulated = emulated_line(file)
+        emulated.echo = Echo()
+        async with ConfiguredLine(file, port=MemoryPort(emulated)) as line:
+            await asyncio.sleep(SHORT)
+            return trusted(line)
+
+    assert run_in_virtual_time(main()) == set()
 
 
 DAMAGED = [
@@ -256,6 +271,27 @@ def test_a_file_that_is_read_again_may_name_another_place_for_the_times(text: st
 
     run_in_virtual_time(main())
     assert json.loads(other.read_text())["nodes"].keys() == json.loads(kept.read_text())["nodes"].keys()
+
+
+def test_a_file_that_is_read_again_without_a_place_keeps_no_more_times(text: str, kept: Path) -> None:
+    reported: list[str] = []
+
+    async def main() -> None:
+        async with opened(text, reported.append) as line:
+            await asyncio.sleep(1.5 * OFTEN)
+            await line.take(read(Source("line.toml", text.replace(f'learned = "{kept}"\n', ""))))
+            asyncio.get_running_loop().call_soon(kept.unlink)
+            await asyncio.sleep(OFTEN)
+
+    run_in_virtual_time(main())
+    assert (list(kept.parent.iterdir()), reported) == ([], [])
+
+
+def test_what_a_killed_run_left_beside_the_file_is_not_in_the_next_one(text: str, kept: Path) -> None:
+    kept.with_name(f"{kept.name}.new").write_text("x" * 100_000)
+    run_for(text, LONG)
+    assert run_for(text, SHORT) == {"winder", "drive"}
+    assert list(kept.parent.iterdir()) == [kept]
 
 
 def test_the_times_of_each_kind_of_request_are_kept(text: str, kept: Path) -> None:

@@ -14,9 +14,12 @@ from busmaster import BusClosed, InvalidCommand, MemoryPort, NoReply, WriteUncon
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
-from busmaster.app.line import ConfiguredLine
+from busmaster.app.line import ConfiguredLine, configured_line
+from busmaster.app.line.kept_times import KeptTimes
+from busmaster.app.outputs.distributor import Distributor
 from busmaster.app.service.authorisation import WriteRequest
 from busmaster.bus.node import Node
+from busmaster.emulator.serve import serve_tcp
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing import run_in_virtual_time
 
@@ -106,14 +109,15 @@ def test_it_is_closed_when_it_is_left() -> None:
     run_in_virtual_time(main())
 
 
-def test_a_line_that_cannot_be_entered_is_closed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(_: object) -> None:
+@pytest.mark.parametrize("part", ["outputs", "learned times"])
+def test_a_line_that_cannot_be_entered_is_closed_again(monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+    def fails(*_: object) -> None:
         raise InvalidCommand("no thread can be started")
 
     async def main() -> None:
         before = asyncio.all_tasks()
         line = opened()
-        monkeypatch.setattr(line.outputs, "start", fails)
+        monkeypatch.setattr(line.outputs if part == "outputs" else KeptTimes, "start", fails)
         with pytest.raises(InvalidCommand, match="no thread can be started"):
             await line.__aenter__()
         with pytest.raises(BusClosed):
@@ -254,6 +258,46 @@ def test_a_tap_receives_the_bytes_of_a_line_that_is_opened() -> None:
 
     run_in_virtual_time(main())
     assert received
+
+
+@pytest.mark.parametrize("outputs", [True, False])
+@pytest.mark.asyncio
+async def test_open_line_opens_the_port_of_the_file_and_passes_its_options_on(tmp_path: Path, outputs: bool) -> None:
+    received: list[bytes] = []
+    tap: Any = SimpleNamespace(
+        transmitted=lambda now, data, attempt: None,
+        received=lambda now, data, attempt: received.append(data),
+        attempted=lambda attempt: None,
+    )
+    text = TEXT.partition("[groups.fast]")[0] + f'[outputs.jsonl]\npath = "{tmp_path / "line.jsonl"}"\n'
+    path = tmp_path / "line.toml"
+    emulated = emulated_line(read(Source("line.toml", text)))
+    emulated.paced = False
+    with serve_tcp(emulated) as server:
+        path.write_text(text.replace("/dev/ttyUSB0", server.path))
+        async with busmaster.open_line(path, outputs=outputs, tap=tap) as line:
+            assert await line.nodes["winder"].read(10) == 0
+            assert [output.kind for output in line.outputs.statistics()] == ["jsonl"] * outputs
+    assert received
+
+
+def test_outputs_report_the_state_of_a_line_only_in_the_process_that_polls_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[tuple[object, object]] = []
+
+    class Noted(Distributor):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            made.append((options.get("in_charge", True), options.get("asks", True)))
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr(configured_line, "Distributor", Noted)
+    kinds = ("csv", "jsonl", "sqlite")
+    outputs = "".join(f'[outputs.{kind}]\npath = "{tmp_path / kind}"\n' for kind in kinds)
+    file = read(Source("line.toml", TEXT + outputs))
+    assert [output.kind for output in ConfiguredLine(file).audit().statistics()] == ["jsonl", "sqlite"]
+    ConfiguredLine(file, asks=False)
+    assert made == [(True, True), (False, True), (True, False)]
 
 
 def test_a_symbol_that_looks_like_a_range_is_one_point() -> None:

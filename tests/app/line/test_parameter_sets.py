@@ -196,6 +196,13 @@ def test_a_set_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+def test_what_a_killed_save_left_beside_a_set_is_not_in_the_next_one(tmp_path: Path) -> None:
+    (tmp_path / "a.toml.new").write_text("x" * 10_000)
+    write_set(str(tmp_path / "a.toml"), EMPTY, KIND)
+    assert read_set(str(tmp_path / "a.toml")).set == EMPTY
+    assert [one.name for one in tmp_path.iterdir()] == ["a.toml"]
+
+
 def test_a_save_whose_set_cannot_be_written_keeps_what_it_has_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
