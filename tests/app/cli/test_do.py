@@ -14,6 +14,7 @@ import click
 import pytest
 
 from busmaster import Priority
+from busmaster.app.cli import do
 from busmaster.app.cli.do import RecordedNode, options_of
 from busmaster.app.cli.read import plain_lines
 from busmaster.app.service.authorisation import WriteRequest
@@ -168,6 +169,9 @@ def test_help_lists_the_actions_of_each_protocol(busmaster: Command) -> None:
         for name in kind.handle._actions:
             assert f"{kind.name} " in text
             assert f" {name}" in text
+    words = " ".join(text.split())
+    assert "hcp2 execute COMMAND DATA... Have the Mint program carry out a command" in words
+    assert "microflex enable Enable the drive, and wait" in words
 
 
 # by a file
@@ -240,6 +244,47 @@ def test_a_reply_of_0_is_printed(busmaster: Command, file: Path, drive: TcpServe
     quick_start(file)
     ran = busmaster("do", f"drive@{file}", "disable")
     assert (ran.status, ran.out, ran.err) == (0, "disable ok 0\n", "")
+    file.write_text(file.read_text() + '[nodes.drive.points]\ncontrol = { item = "108" }\n')
+    ran = busmaster("do", f"drive@{file}", "disable", "--json")
+    assert without_time(ran.out) == {"node": "drive", "action": "disable", "ok": True, "value": 0, "names": []}
+    assert [row[:3] for row in audit(file)] == [
+        ("busmaster do disable", "drive/command_word", 0),
+        ("busmaster do disable", "drive/control", 0),  # as the file names it
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text", "fields"),
+    [
+        ("", None, "move ok", {"node": 11}),
+        ("", 0, "move ok 0", {"node": 11, "value": 0}),
+        ("winder", None, "move ok", {"node": "winder"}),
+    ],
+)
+def test_an_action_is_reported_with_its_reply_and_by_the_name_of_its_node_or_its_address(
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+    value: int | None,
+    text: str,
+    fields: dict[str, Any],
+) -> None:
+    checked: list[Any] = []
+
+    async def run(handle: Any, *values: float, **options: float) -> int | None:
+        assert (values, options) == ((1, -2.5), {"within": 4.0})
+        return value
+
+    move = Action("move", run, lambda *given: checked.append(given), numbers=("AXIS", "DISTANCE..."))
+    handle = SimpleNamespace(node=SimpleNamespace(address=11))
+    target: Any = SimpleNamespace(line=None, owned=False, handle=handle, name=name, bus=nullcontext())
+    monkeypatch.setattr(do, "late_nodes", lambda bus, in_file: nullcontext())
+    for as_json in (False, True):
+        asyncio.run(do.carry_out(target, "move", move, (1, -2.5), {"within": 4.0}, as_json))
+    plain, json_ = capfd.readouterr().out.splitlines()
+    assert plain == text
+    assert without_time(json_) == {"action": "move", "ok": True} | fields
+    assert checked == [(handle, 1, -2.5)] * 2
 
 
 def test_a_late_reply_to_an_action_is_reported_with_the_key_of_the_file(
