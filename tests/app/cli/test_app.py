@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import logging
+import sys
 import warnings
 from importlib.metadata import EntryPoint
 from typing import Any
@@ -148,6 +149,31 @@ def test_logs_and_warnings_are_shown_only_where_debugging_is_on(
     assert busmaster("--version").status == 0
     assert configured == [{"level": logging.DEBUG}]
     assert warnings.showwarning is print
+
+
+def test_logs_of_libraries_are_not_printed(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # those of pytest, which hide what is printed without one
+    monkeypatch.delenv("BUSMASTER_DEBUG", raising=False)
+    assert busmaster("--version").status == 0
+    logging.getLogger("asyncio").warning("slow callback")
+    assert busmaster("--version").err == ""
+
+
+def test_a_reader_that_has_closed_the_pipe_is_no_error(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    forgotten: list[bool] = []
+    monkeypatch.setattr(app, "forget_standard_output", lambda: forgotten.append(True))
+    assert status_of(BrokenPipeError(32, "Broken pipe")) == 0
+    assert forgotten == [True]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_disk_that_is_full_under_the_version_is_one_line(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        ran = busmaster("--version")
+    assert (ran.status, ran.err) == (1, "busmaster: No space left on device\n")
 
 
 def test_only_warnings_for_the_user_are_printed(capfd: pytest.CaptureFixture[str]) -> None:

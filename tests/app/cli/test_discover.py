@@ -214,6 +214,8 @@ def test_the_plan_counts_reads_settings_and_names_each_protocol(capfd: pytest.Ca
         f"{msc.profile.title}"
     )
     assert rest == "busmaster: if a node replies, the other addresses of its protocol are tried too"
+    plan("COM1", Step(None, hcp2, (1, 2)), Step(None, hcp2, (3,)))
+    assert "then 3 reads, at the server's own rate, in Host Comms Protocol 2\n" in capfd.readouterr().err
 
 
 # the command, where a search has these results
@@ -269,12 +271,36 @@ def test_yes_asks_nothing_and_a_file_gets_the_result(
     monkeypatch.setattr(discover, "lasting", lambda port: replace(port, path="/dev/serial/by-id/adapter"))
     done = busmaster("discover", "/dev/ttyS0?echo=1", *HCP2, "--yes", "-o", str(path), "--capture", str(capture))
     assert (done.status, done.out) == (0, "")
+    assert "\nbusmaster: found Host Comms Protocol 2 at 9600 8N1, node 3\n" in done.err
     assert done.err.endswith(f"busmaster: written to {path}: `busmaster run {path}` polls it\n")
     assert [node.address for node in load(path).nodes.values()] == [3]
     assert load(path).port.name == "/dev/serial/by-id/adapter"
     [(_, recorder)] = searched
     assert recorder.path == str(capture)
     assert given == [{"port": "/dev/ttyS0", "protocol": "", "echo": True}]
+
+
+def test_a_search_without_a_result_is_a_failure_and_writes_no_file(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(discover, "until_ended", lambda *_: None)
+    path = tmp_path / "line.toml"
+    for output in ((), ("-o", str(path))):
+        done = busmaster("discover", "/dev/ttyS0", *HCP2, "--yes", *output)
+        assert (done.status, done.out) == (1, "")
+    assert not path.exists()
+
+
+def test_ctrl_c_at_the_question_is_its_status_and_nothing_is_sent(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, searched: list[Any]
+) -> None:
+    def confirm(*_: object, **__: object) -> bool:
+        raise click.Abort
+
+    monkeypatch.setattr(click, "confirm", confirm)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    assert busmaster("discover", "/dev/ttyS0", *HCP2).status == 130
+    assert searched == []
 
 
 def test_a_file_that_appears_during_the_search_is_kept(

@@ -109,8 +109,11 @@ async def test_a_view_that_is_cancelled_is_ended_before_the_terminal_is_given_ba
 @pytest.mark.asyncio
 async def test_a_view_of_a_line_that_is_not_shared_has_the_title_of_the_file() -> None:
     line = Line(Hcp2Controller.profile.line, [], paced=False)
-    async with Bus(MemoryPort(line)) as bus, served_here(Authorisation(bus), "Slitter 2") as service:
-        assert service.line.title == "Slitter 2"
+    async with Bus(MemoryPort(line)) as bus:
+        authorisation = Authorisation(bus)
+        async with served_here(authorisation, "Slitter 2") as service:
+            assert service.line.title == "Slitter 2"
+            assert service.line.authorisation is authorisation
 
 
 @pytest.fixture
