@@ -20,6 +20,7 @@ import pytest
 from busmaster.app.cli import discover
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.discover import EnterStops, Job, print_plan, what_to_try
+from busmaster.app.cli.progress import Bar
 from busmaster.app.config import load
 from busmaster.app.diagnostics.search import Discovery, Found
 from busmaster.app.diagnostics.steps import Step
@@ -115,6 +116,8 @@ def test_a_file_that_is_there_is_not_overwritten(busmaster: Command, unknown: Pt
     assert done.status == 2
     assert "exists and is not overwritten" in done.err
     assert path.read_text() == "mine"
+    folder = busmaster("discover", unknown.path, *HCP2, "--yes", "-o", str(tmp_path))
+    assert (folder.status, folder.err.count("\n")) == (2, 1), "nothing is searched"
 
 
 @pytest.mark.slow
@@ -326,6 +329,7 @@ class FakeSearch:
     looked = False
 
     def __init__(self, wire: object, port: object, report: object, progress: object, offered: Callable[[], Any]):
+        self.given = (wire, port, report, progress)
         self.offered = offered
 
     async def listen(self, tried: object) -> str:
@@ -438,5 +442,7 @@ def test_the_search_can_be_stopped_by_enter(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(discover, "opened", nothing_opened)
     monkeypatch.setattr(discover, "Search", Kept)
-    asyncio.run(discover.discover(Job(SerialPort("COM1", baudrate=9600), []), None))
+    port = SerialPort("COM1", baudrate=9600)
+    asyncio.run(discover.discover(Job(port, []), None))
+    assert searches[0].given == (None, port, discover.note, Bar)
     assert isinstance(searches[0].offered.__self__, EnterStops)  # type: ignore[attr-defined]  # a bound method

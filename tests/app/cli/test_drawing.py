@@ -33,7 +33,8 @@ class Process:
 
     def wait(self, timeout: float | None = None) -> int:
         if self.deaf and "kill" not in self.done:
-            raise subprocess.TimeoutExpired("top", timeout or 0.0)
+            assert timeout is not None, "it would wait for ever"
+            raise subprocess.TimeoutExpired("top", timeout)
         self.returncode = self.status
         return self.status
 
