@@ -20,6 +20,7 @@ import pytest
 from busmaster import LEARNED, Bus, Priority
 from busmaster.app.cli import bench
 from busmaster.app.cli.ending import until_ended
+from busmaster.app.cli.output import Level
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.errors import LineDown
@@ -231,6 +232,17 @@ def test_no_value_is_a_failure_though_no_budget_is_exceeded(busmaster: Command) 
     ran = busmaster(*VIRTUAL, "--fault", "dead=1", "--budget", "missed=0")
     assert ran.status == 1
     assert ran.err == "busmaster: no value was received; check the port, the protocol and the nodes\n"
+
+
+def test_budgets_that_are_exceeded_and_no_value_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    notes: list[tuple[str, Level]] = []
+    monkeypatch.setattr(bench, "note", lambda text, level=Level.INFO: notes.append((text, level)))
+    assert bench.print_excess([]) == 0
+    assert run_of("--budget", "missed=5")._status(dataclasses.replace(REPORT, values=0)) == 1
+    assert [(text.partition(":")[0], level) for text, level in notes] == [
+        ("budget exceeded", Level.ERROR),
+        ("no value was received; check the port, the protocol and the nodes", Level.ERROR),
+    ]
 
 
 def test_a_budget_that_is_kept_is_status_0_and_one_that_is_not_status_1(busmaster: Command) -> None:

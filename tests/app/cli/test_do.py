@@ -229,9 +229,10 @@ def test_advice_for_a_late_reply_is_a_key_only_for_a_node_of_a_file(
 
 def test_an_action_that_fails_is_on_record(busmaster: Command, file: Path, drive: TcpServer) -> None:
     drive.call(lambda line, now: line.cut(now, line.device(7)))
-    file.write_text(file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05"))
+    text = file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05")
+    file.write_text(text + '[nodes.drive.points]\ncontrol = { item = "108", factor = 0.5 }\n')
     assert busmaster("do", f"drive@{file}", "enable").status == 1
-    assert audit(file) == [("busmaster do enable", "drive/command_word", 128, "unconfirmed")]
+    assert audit(file) == [("busmaster do enable", "drive/control", 64, "unconfirmed")]
 
 
 def quick_start(file: Path, timing: str = "window = 0.3") -> None:
@@ -277,7 +278,8 @@ def test_an_action_is_reported_with_its_reply_and_by_the_name_of_its_node_or_its
 
     move = Action("move", run, lambda *given: checked.append(given), numbers=("AXIS", "DISTANCE..."))
     handle = SimpleNamespace(node=SimpleNamespace(address=11))
-    target: Any = SimpleNamespace(line=None, owned=False, handle=handle, name=name, bus=nullcontext())
+    line = object() if name else None  # of a file, whose line has an owner: it keeps the record
+    target: Any = SimpleNamespace(line=line, owned=True, handle=handle, name=name, bus=nullcontext())
     monkeypatch.setattr(do, "late_nodes", lambda bus, in_file: nullcontext())
     for as_json in (False, True):
         asyncio.run(do.carry_out(target, "move", move, (1, -2.5), {"within": 4.0}, as_json))
@@ -346,8 +348,8 @@ def test_the_owner_of_the_line_carries_it_out_and_keeps_the_record(
 
 def test_each_write_of_an_action_is_checked_before_the_first_is_sent() -> None:
     """As a node does: an action of two writes whose second is beyond its limit writes nothing."""
-    refused: list[str] = []
-    line = SimpleNamespace(authorisation=SimpleNamespace(refuse=lambda request, why: refused.append(why)))
+    refused: list[tuple[object, str]] = []
+    line = SimpleNamespace(authorisation=SimpleNamespace(refuse=lambda request, why: refused.append((request, why))))
 
     async def story(bus: Bus) -> None:
         controller = Hcp2Controller(bus, 1)
@@ -359,7 +361,9 @@ def test_each_write_of_an_action_is_checked_before_the_first_is_sent() -> None:
             node.check(hcp2.Write(10, (5.0,)), hcp2.Write(11, (50.0,)))
 
     on_a_bus(story, EmulatedMint(1))
-    assert len(refused) == 1
+    [(request, why)] = refused
+    assert request == hcp2.Write(11, (50.0,))
+    assert "pull = 50 is above its maximum of 10" in why
 
 
 class Kept:

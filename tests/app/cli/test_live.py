@@ -921,6 +921,25 @@ async def test_rows_stay_until_an_owner_that_is_back_has_told_its_own() -> None:
 
 
 @pytest.mark.asyncio
+async def test_a_command_that_fails_because_its_owner_ended_is_shown_with_the_next_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+
+        async def pause(group: str, paused: bool, /) -> None:
+            screen.picture = Picture()
+            raise LineDown("the connection is lost")
+
+        monkeypatch.setattr(line, "pause", pause)
+        await pilot.press("p")
+        await pilot.pause()
+        tell(screen.picture, row(), events=[])
+        screen.take_picture()
+        await pilot.pause()
+        assert "pause axes: the connection is lost" in lines(screen)[-2]
+
+
+@pytest.mark.asyncio
 async def test_keys_do_nothing_before_there_is_a_picture() -> None:
     async with drawn(Picture()) as (screen, line, pilot):
         assert "waiting for the program that owns the line" in lines(screen)[0]
