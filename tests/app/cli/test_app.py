@@ -51,6 +51,27 @@ def test_a_mistyped_interface_has_its_suggestion(busmaster: Command, monkeypatch
     assert ran.err == "busmaster: no such command 'profinte'; did you mean 'profinet'?\n"
 
 
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [
+        ("nowhere:command", "No module named 'nowhere'"),
+        ("json:dumps", "expected a click command, not a function"),
+    ],
+)
+def test_an_interface_that_cannot_be_used_is_named_with_its_error_in_the_help_too(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, place: str, why: str
+) -> None:
+    entry = EntryPoint("profinet", place, app.INTERFACES)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: [entry] if group == app.INTERFACES else [])
+    text = f"the interface 'profinet' cannot be used: {why}; fix or uninstall that package"
+    ran = busmaster("profinet")
+    assert (ran.status, ran.out) == (2, "")
+    assert ran.err.startswith(f"busmaster: {text}")
+    listed = busmaster("--help")
+    assert listed.status == 0
+    assert text in " ".join(listed.out.split())
+
+
 def test_completion_has_the_line_of_each_command() -> None:
     offered = {item.value: item.help for item in cli.shell_complete(click.Context(cli, **cli.context_settings), "re")}
     assert offered == {name: COMMANDS[name] for name in ("read", "replay")}
