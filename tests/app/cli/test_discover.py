@@ -20,6 +20,7 @@ import pytest
 from busmaster.app.cli import discover
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.discover import EnterStops, Job, print_plan, what_to_try
+from busmaster.app.cli.output import note
 from busmaster.app.cli.progress import Bar
 from busmaster.app.config import load
 from busmaster.app.diagnostics.search import Discovery, Found
@@ -407,6 +408,20 @@ def test_enter_stops_a_search_and_the_shell_does_not_get_the_line(
     assert capfd.readouterr().err == "busmaster: press Enter to stop and keep the nodes found so far\n"
 
 
+def test_a_search_that_is_not_stopped_gives_standard_input_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+
+    async def story() -> None:
+        async with EnterStops() as stops:
+            assert stops.offered()() is False
+        assert not asyncio.get_running_loop().remove_reader(slave), "it is not watched any more"
+
+    with open(slave, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        asyncio.run(story())
+    os.close(master)
+
+
 def test_without_a_terminal_nothing_is_offered(capfd: pytest.CaptureFixture[str]) -> None:
     async def story() -> None:
         async with EnterStops() as stops:
@@ -444,5 +459,5 @@ def test_the_search_can_be_stopped_by_enter(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(discover, "Search", Kept)
     port = SerialPort("COM1", baudrate=9600)
     asyncio.run(discover.discover(Job(port, []), None))
-    assert searches[0].given == (None, port, discover.note, Bar)
+    assert searches[0].given == (None, port, note, Bar)
     assert isinstance(searches[0].offered.__self__, EnterStops)  # type: ignore[attr-defined]  # a bound method

@@ -143,6 +143,20 @@ def test_a_terminal_gets_its_settings_and_its_page_back(
     assert os.read(master, 1000) == LEAVE_SCREEN
 
 
+def test_a_terminal_that_takes_no_text_gets_its_settings_back_all_the_same(
+    terminal: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = terminal_state()
+    changed = termios.tcgetattr(terminal[1].fileno())
+    changed[3] &= ~(termios.ECHO | termios.ICANON | termios.ISIG)
+    termios.tcsetattr(terminal[1].fileno(), termios.TCSANOW, changed)
+    with open("/dev/full", "wb", buffering=0) as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        restore_terminal(before)
+        monkeypatch.undo()
+    assert termios.tcgetattr(terminal[1].fileno()) == before
+
+
 def test_without_a_terminal_there_is_no_state_and_nothing_to_give_back(
     terminal: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
