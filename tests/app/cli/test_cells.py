@@ -219,7 +219,8 @@ def test_a_node_that_is_not_known_yet_is_named_as_its_point_does() -> None:
 
 
 def test_no_node_of_a_lost_line_is_up_and_the_age_of_a_paused_group_rests() -> None:
-    assert cells(point(), frame=replace(FRAME, state="offline"))["HEALTH"] == "offline"
+    for node in (NODE, None):
+        assert cells(point(), node, frame=replace(FRAME, state="offline"))["HEALTH"] == "offline"
     assert cells(point(), group=replace(GROUP, paused=True))["AGE"] == "rests"
 
 

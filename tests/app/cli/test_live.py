@@ -897,7 +897,8 @@ async def test_silence_of_the_owner_is_shown_without_a_key_or_a_message(monkeypa
 async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -> None:
     async with drawn(tell(Picture(), row())) as (screen, _, pilot):
         screen.away = "no program serves /run/line.sock"
-        screen.take_picture()
+        screen.heard -= 10
+        screen.draw()
         await pilot.pause()
         assert "its owner is not running" in lines(screen)[0]
         assert any("no program serves /run/line.sock" in line for line in lines(screen))
