@@ -202,9 +202,9 @@ class Show(Dialog[None]):
             yield Static(self.text, id="text")
 
     def update(self, text: Text) -> None:
-        """Show this text in its place."""
-        if self.is_mounted:
-            self.query_one("#text", Static).update(text)
+        """Show this text in its place. Ignored while the dialog opens or closes, when it has no place for a text."""
+        for shown in self.query("#text").results(Static):
+            shown.update(text)
 
     def action_scroll(self, lines: int) -> None:
         """Go up or down in a text that is longer than the terminal."""

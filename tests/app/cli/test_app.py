@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import logging
+import sys
 import warnings
 from importlib.metadata import EntryPoint
 from typing import Any
@@ -48,6 +49,27 @@ def test_a_mistyped_interface_has_its_suggestion(busmaster: Command, monkeypatch
     ran = busmaster("profinte")
     assert (ran.status, ran.out) == (2, "")
     assert ran.err == "busmaster: no such command 'profinte'; did you mean 'profinet'?\n"
+
+
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [
+        ("nowhere:command", "No module named 'nowhere'"),
+        ("json:dumps", "expected a click command, not a function"),
+    ],
+)
+def test_an_interface_that_cannot_be_used_is_named_with_its_error_in_the_help_too(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, place: str, why: str
+) -> None:
+    entry = EntryPoint("profinet", place, app.INTERFACES)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: [entry] if group == app.INTERFACES else [])
+    text = f"the interface 'profinet' cannot be used: {why}; fix or uninstall that package"
+    ran = busmaster("profinet")
+    assert (ran.status, ran.out) == (2, "")
+    assert ran.err.startswith(f"busmaster: {text}")
+    listed = busmaster("--help")
+    assert listed.status == 0
+    assert text in " ".join(listed.out.split())
 
 
 def test_completion_has_the_line_of_each_command() -> None:
@@ -148,6 +170,31 @@ def test_logs_and_warnings_are_shown_only_where_debugging_is_on(
     assert busmaster("--version").status == 0
     assert configured == [{"level": logging.DEBUG}]
     assert warnings.showwarning is print
+
+
+def test_logs_of_libraries_are_not_printed(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # those of pytest, which hide what is printed without one
+    monkeypatch.delenv("BUSMASTER_DEBUG", raising=False)
+    assert busmaster("--version").status == 0
+    logging.getLogger("asyncio").warning("slow callback")
+    assert busmaster("--version").err == ""
+
+
+def test_a_reader_that_has_closed_the_pipe_is_no_error(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    forgotten: list[bool] = []
+    monkeypatch.setattr(app, "forget_standard_output", lambda: forgotten.append(True))
+    assert status_of(BrokenPipeError(32, "Broken pipe")) == 0
+    assert forgotten == [True]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_disk_that_is_full_under_the_version_is_one_line(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        ran = busmaster("--version")
+    assert (ran.status, ran.err) == (1, "busmaster: No space left on device\n")
 
 
 def test_only_warnings_for_the_user_are_printed(capfd: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ from busmaster.app.cli.arguments import Connection, View, connected, nodes_to_as
 from busmaster.app.cli.protocols import NodeCommand
 from busmaster.app.cli.read import command as read
 from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
@@ -69,6 +70,13 @@ def test_retries_and_options_of_the_protocol_reach_the_handle() -> None:
     assert first.address_step == 4
     with pytest.raises(InvalidCommand, match="other retries"):
         Connection("/dev/ttyS0", "msc", retries=1).open_handle(bus, 3)
+
+
+def test_the_window_of_the_options_reaches_the_node() -> None:
+    bus = Bus(MemoryPort(Line(HCP2.line)))
+    longer = Connection("/dev/ttyS0", "hcp2", timeout=0.5)
+    assert Node.of(longer.open_handle(bus, 1)).timings == longer.timings
+    assert Node.of(Connection("/dev/ttyS0", "hcp2").open_handle(bus, 2)).timings == HCP2.timings
 
 
 def test_json_has_the_number_of_a_node_where_the_protocol_has_addresses() -> None:

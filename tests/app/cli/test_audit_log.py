@@ -118,6 +118,19 @@ def test_each_loss_is_reported_once_with_its_own_number(
     assert [line.split()[1] for line in said] == ["2", "1"]
 
 
+def test_a_loss_just_before_the_end_is_reported(
+    authorisation: Authorisation, printed: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit_log, "MOST_WAITING_ENTRIES", 1)
+    monkeypatch.setattr(audit_log, "TICK", PATIENCE)  # the thread waits for the end
+    with AuditLog(lambda: True):
+        for number in range(3):
+            write(authorisation, f"5/{number}")
+    first, lost = (line for line, _ in printed.lines)
+    assert first.startswith("audit: 5/0 = 7 ")
+    assert lost.startswith("audit: 2 writes are not listed here")
+
+
 def test_a_standard_error_that_stays_blocked_does_not_hold_up_the_end(
     authorisation: Authorisation, printed: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:

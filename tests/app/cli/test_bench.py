@@ -19,8 +19,11 @@ import pytest
 
 from busmaster import LEARNED, Bus, Priority
 from busmaster.app.cli import bench
+from busmaster.app.cli.ending import until_ended
+from busmaster.app.cli.output import Level
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
+from busmaster.errors import LineDown
 from busmaster.registry import find, make_device
 from busmaster.testing.bench import BenchReport, EmulatedLine, Workload
 from busmaster.testing.latency_report import Times
@@ -181,6 +184,23 @@ def test_each_option_of_the_emulated_line_defines_it(
     assert made == [line]
 
 
+@pytest.mark.parametrize("virtual", [False, True])
+def test_an_emulated_line_has_the_load_the_clock_and_the_handles_of_the_options(
+    monkeypatch: pytest.MonkeyPatch, virtual: bool
+) -> None:
+    given: list[tuple[Workload, dict[str, Any]]] = []
+
+    def emulated(line: EmulatedLine, workload: Workload, **options: Any) -> ExitStack:
+        given.append((workload, options))
+        return ExitStack()
+
+    monkeypatch.setattr(bench, "emulated", emulated)
+    run = run_of("--callers", "3", "--retries", "0", "--timeout", "250", *["--virtual"] * virtual)
+    with ExitStack() as lines:
+        run._measurement(lines)
+    assert given == [(run.workload, {"virtual": virtual, "handle": run.connection.open_handle})]
+
+
 def test_the_seed_is_that_of_a_bus_on_a_port_too(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[Any] = []
 
@@ -214,6 +234,17 @@ def test_no_value_is_a_failure_though_no_budget_is_exceeded(busmaster: Command) 
     assert ran.err == "busmaster: no value was received; check the port, the protocol and the nodes\n"
 
 
+def test_budgets_that_are_exceeded_and_no_value_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    notes: list[tuple[str, Level]] = []
+    monkeypatch.setattr(bench, "note", lambda text, level=Level.INFO: notes.append((text, level)))
+    assert bench.print_excess([]) == 0
+    assert run_of("--budget", "missed=5")._status(dataclasses.replace(REPORT, values=0)) == 1
+    assert [(text.partition(":")[0], level) for text, level in notes] == [
+        ("budget exceeded", Level.ERROR),
+        ("no value was received; check the port, the protocol and the nodes", Level.ERROR),
+    ]
+
+
 def test_a_budget_that_is_kept_is_status_0_and_one_that_is_not_status_1(busmaster: Command) -> None:
     kept = busmaster(*VIRTUAL, "--budget", "p99=20ms", "--budget", "1.max=20", "--budget", "errors=0")
     assert (kept.status, kept.err) == (0, "")
@@ -232,6 +263,8 @@ def test_a_port_is_only_read_from(busmaster: Command, served: TcpServer) -> None
     done = busmaster("bench", served.path, *HCP2, "--nodes", "1-3", "--seconds", "0.3", "--period", "0.1", "--json")
     assert done.status == 0
     report = BenchReport.from_json(done.out)
+    assert done.err == "busmaster: measuring for 0.3 s; Ctrl-C ends it and prints the result so far\n"
+    assert report.line["protocol"] == "hcp2"
     assert report.line["port"].endswith(str(served.port))
     assert report.values > 0
     assert report.errors == {}
@@ -265,6 +298,21 @@ def test_a_port_that_another_program_owns_is_not_measured(
         done = busmaster("bench", three_controllers.path, *HCP2, "--nodes", "1", "--seconds", "1")
     assert (done.status, done.out) == (1, "")
     assert f"is owned by process {os.getpid()}; stop that process first" in done.err
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), LineDown("port lost", hint="plug it in")])
+def test_a_measurement_that_does_not_end_by_itself_prints_the_result_so_far(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def ended(*arguments: Any, **options: Any) -> None:
+        until_ended(*arguments, **options)
+        raise error
+
+    monkeypatch.setattr(bench, "until_ended", ended)
+    done = busmaster(*VIRTUAL, "--json", "--budget", "p50=1")
+    assert BenchReport.from_json(done.out).values > 0
+    interrupted = isinstance(error, KeyboardInterrupt)
+    assert (done.status, done.err) == ((130, "") if interrupted else (1, "busmaster: port lost; plug it in\n"))
 
 
 @pytest.mark.slow
@@ -428,8 +476,15 @@ def test_a_comparison_has_each_figure_of_both_reports(busmaster: Command, tmp_pa
         "errors": [5, 8],
         "same_workload": False,
     }
+    wrong = busmaster("bench", "--compare", *paths, "--budget", "max=1000", "--budget", "9.p99=1")
+    assert (wrong.status, wrong.out) == (2, ""), "nothing is printed but the error"
     same = json.loads(busmaster("bench", "--compare", paths[0], paths[0], "--json").out)
     assert same["same_workload"] is True
+
+
+def test_a_figure_that_cannot_be_compared_is_a_dash() -> None:
+    [total] = [line for line in bench.comparison(REPORT, OTHER, {"": {"p90": 2.0}}) if line.startswith("total")]
+    assert total.split() == ["total", "-", "2.00", "-", "-", "-"]
 
 
 def test_a_comparison_that_exceeds_a_budget_is_a_failure_in_json_too(
@@ -495,7 +550,7 @@ def test_a_file_that_is_no_report_cannot_be_compared(
         (("/dev/x", *HCP2, "--nodes", "1", "--fault", "lost=1"), "--fault needs an emulated line"),
         (("/dev/x", *HCP2, "--nodes", "1", "--reply-delay", "2"), "--reply-delay needs an emulated line"),
         (("unix:/x", *HCP2, "--nodes", "1"), "is a line of another program"),
-        (("--compare", "a.json", "b.json", *HCP2), "--compare does not measure; leave out"),
+        (("--compare", "a.json", "b.json", *HCP2), "--compare does not measure; leave out protocol"),
         (("--compare", "a.json"), "compare"),
     ],
 )

@@ -129,6 +129,30 @@ def test_a_file_that_exists_is_kept_and_the_other_name_is_printed(
     assert capfd.readouterr().err == f"busmaster: {path} exists; the capture goes to {recorder.path}\n"
 
 
+class Failing(Recorder):
+    """A recorder whose disk becomes full."""
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        self.error = OSError(28, "No space left on device")
+        self.dropped = 3
+
+
+def test_a_capture_that_stopped_has_the_name_of_its_own_file_and_counts_what_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "Recorder", Failing)
+    path = tmp_path / "line.pcapng"
+    path.write_text("mine")
+    with capturing(str(path), port="COM1") as recorder:
+        assert recorder is not None
+        capfd.readouterr()
+    assert capfd.readouterr().err == (
+        f"busmaster: capture stopped: {recorder.path}: No space left on device\n"
+        "busmaster: the capture lacks 3 events that could not be written in time\n"
+    )
+
+
 @pytest.mark.parametrize(("count", "events"), [(1, "1 event"), (2, "2 events")])
 def test_events_that_are_not_in_the_capture_are_counted(
     count: int, events: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]

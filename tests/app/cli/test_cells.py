@@ -55,6 +55,7 @@ def test_of_several_values_whole_ones_are_shown() -> None:
     assert fit_value("1.5,100000,-7", 13) == "1.5,100000,-7"
     assert fit_value("100000000000000,2", 11) == "1e14,…"
     assert fit_value("65 PROGRAM_RUNNING|AUTO_START", 11) == "65 PROGRAM…"
+    assert [fit_value("12345,60", width) for width in (8, 7, 6)] == ["12345,60", "12345,…", "1e4,…"]
 
 
 @pytest.mark.parametrize("width", range(60, 140))
@@ -64,6 +65,24 @@ def test_the_columns_fill_a_terminal_as_far_as_they_may_grow(width: int) -> None
     assert total <= width
     assert ("TREND" in widths) == (width >= 75)
     assert total == min(width, 122)
+
+
+@pytest.mark.parametrize(
+    ("width", "wanted"),
+    [
+        (60, {"NODE": 9, "ITEM": 14, "VALUE": 11}),
+        (70, {"NODE": 9, "ITEM": 24, "VALUE": 11}),
+        (74, {"NODE": 11, "ITEM": 26, "VALUE": 11}),
+        (75, {"NODE": 9, "ITEM": 14, "VALUE": 11, "TREND": 8}),
+        (98, {"NODE": 16, "ITEM": 26, "VALUE": 15, "TREND": 8}),
+        (200, {"NODE": 16, "ITEM": 26, "VALUE": 19, "TREND": 28}),
+    ],
+)
+def test_items_grow_first_then_nodes_values_and_trends(width: int, wanted: dict[str, int]) -> None:
+    found = column_widths(width)
+    fixed = {"": 1, "UNIT": 5, "AGE": 5, "HEALTH": 9} | ({"P50ms": 5} if "TREND" in wanted else {})
+    assert found == wanted | fixed
+    assert list(found)[:5] == ["NODE", "ITEM", "", "VALUE", "UNIT"]
 
 
 def test_a_trend_spans_its_own_lowest_and_highest_and_shows_gaps() -> None:
@@ -81,6 +100,8 @@ def test_a_ripple_of_negative_numbers_is_no_trend_either() -> None:
 def test_ages_and_clocks_fit_their_columns() -> None:
     ages = (None, 0.04, 9.94, 9.96, 12.3, 599, 6000, 360_000)
     assert [age_text(age) for age in ages] == ["-", "0.0s", "9.9s", "10s", "12s", "599s", "100m", "100h"]
+    bounds = (9.949, 9.95, 599.4, 600, 35_999, 36_000)
+    assert [age_text(age) for age in bounds] == ["9.9s", "10s", "599s", "10m", "600m", "10h"]
     assert clock_text(3661.9) == "1:01:01"
     assert age_text(-0.2) == "0.0s", "a clock that was read before the request"
 
@@ -142,6 +163,14 @@ def test_the_line_of_a_group_has_its_times_in_milliseconds() -> None:
     assert len(group_line(GROUP, 30)) == 30
 
 
+def test_missed_cycles_a_paused_group_and_silence_stand_out() -> None:
+    assert styles(group_line(GROUP, 120))["missed 1"] == "bold"
+    assert "missed 0" not in styles(group_line(replace(GROUP, missed=0), 120))
+    assert styles(group_line(replace(GROUP, paused=True), 120))["paused"] == "bold reverse"
+    assert styles(title_line(FRAME, 80, "no data for 3 s"))["no data for 3 s"] == "bold reverse"
+    assert "0:01:01" not in styles(title_line(FRAME, 80))
+
+
 # the lines of the table
 
 
@@ -190,7 +219,8 @@ def test_a_node_that_is_not_known_yet_is_named_as_its_point_does() -> None:
 
 
 def test_no_node_of_a_lost_line_is_up_and_the_age_of_a_paused_group_rests() -> None:
-    assert cells(point(), frame=replace(FRAME, state="offline"))["HEALTH"] == "offline"
+    for node in (NODE, None):
+        assert cells(point(), node, frame=replace(FRAME, state="offline"))["HEALTH"] == "offline"
     assert cells(point(), group=replace(GROUP, paused=True))["AGE"] == "rests"
 
 
@@ -215,6 +245,12 @@ def test_of_an_error_an_alarm_and_a_quality_the_first_has_the_mark(known: dict[s
 def test_a_value_older_than_three_periods_of_its_group_stands_out(age: float, style: str | None) -> None:
     line = row_line(point(asked=200.0 - age), NODE, GROUP, FRAME, column_widths(120))
     assert styles(line).get(f"{age:.1f}s") == style
+
+
+def test_the_value_of_a_paused_group_is_never_too_old() -> None:
+    line = row_line(point(asked=1.0), NODE, replace(GROUP, paused=True), FRAME, column_widths(120))
+    assert "rests" in line.plain
+    assert "rests" not in styles(line)
 
 
 def test_states_of_health_and_the_selected_row_stand_out() -> None:

@@ -178,9 +178,10 @@ def test_a_port_that_is_not_there_is_status_1(busmaster: Command, tmp_path: Path
 
 def test_a_tcp_port_that_is_taken_is_said_so(busmaster: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        outcome = busmaster("emulate", *HCP2, "--tcp", f"127.0.0.1:{taken.getsockname()[1]}")
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        outcome = busmaster("emulate", *HCP2, "--tcp", address)
     assert (outcome.status, outcome.out) == (1, "")
-    assert "Address already in use; use another port" in outcome.err
+    assert f"cannot serve on {address}: Address already in use; use another port" in outcome.err
 
 
 @pytest.mark.slow

@@ -17,11 +17,22 @@ import pytest
 
 from busmaster.app.cli import demo, demo_line
 from busmaster.app.cli.arguments import View
-from busmaster.app.cli.demo import COMMAND_EVERY, MOST_TAKEN, SPEEDS, attempt, command_drives, devices, emulated_line
-from busmaster.app.cli.demo_line import DRIVES, LOSES_ITS_WIRE, input_ended, make_line, plug_in, unplug
+from busmaster.app.cli.demo import (
+    COMMAND_EVERY,
+    MOST_TAKEN,
+    PERIOD,
+    SPEEDS,
+    attempt,
+    command_drives,
+    devices,
+    emulated_line,
+)
+from busmaster.app.cli.demo_line import DRIVES, LOSES_ITS_WIRE, SETTINGS, input_ended, make_line, plug_in, unplug
+from busmaster.app.cli.watching import Watch
 from busmaster.bus.bus import Bus
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import LineDown, NoReply
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.app.cli.conftest import Command
 
@@ -129,6 +140,59 @@ def test_position_velocity_speed_and_torque_are_polled() -> None:
         *(f"{node}/axis0.{item}" for node in (1, 2, 3) for item in ("position", "velocity")),
         *(f"{node}/{item}" for node in (4, 5, 6, 7, 8) for item in ("speed_measured", "torque_demand")),
     ]
+
+
+def test_the_line_is_polled_under_the_name_of_the_demo_while_its_drives_are_commanded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ports: list[tuple[str, int]] = []
+    commanded: list[tuple[object, list[int]]] = []
+
+    def port(path: str, *, baudrate: int) -> MemoryPort:
+        ports.append((path, baudrate))
+        return MemoryPort(make_line())
+
+    async def command(watch: Watch, drives: list[MicroFlexDrive]) -> None:
+        commanded.append((watch, [drive.node.address for drive in drives]))
+
+    async def follow(watch: Watch, beside: Any) -> int:
+        await beside()
+        [group] = watch.groups
+        assert (watch.title, watch.view, group.name, group.period) == ("busmaster demo", view, "drives", PERIOD)
+        assert len(group.points) == 16
+        assert commanded == [(watch, list(DRIVES))]
+        return 7
+
+    monkeypatch.setattr(demo, "SerialPort", port)
+    monkeypatch.setattr(demo, "follow", follow)
+    monkeypatch.setattr(demo, "command_drives", command)
+    view = View(seconds=2.5, plain=True)
+    assert run_in_virtual_time(demo.demo("/dev/pts/9", view)) == 7
+    assert ports == [("/dev/pts/9", SETTINGS.baudrate)]
+
+
+def test_the_first_terminal_that_is_not_taken_is_used(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths: list[str] = []
+    given_back: list[str] = []
+
+    async def shown(path: str, view: View) -> int:
+        if path != "/dev/pts/3":
+            raise LineDown(f"{path} is in use")
+        assert given_back == [], "else the next one would be the same"
+        return 0
+
+    @contextmanager
+    def line() -> Iterator[str]:
+        paths.append(f"/dev/pts/{len(paths) + 1}")
+        path = paths[-1]
+        yield path
+        given_back.append(path)
+
+    monkeypatch.setattr(demo, "demo", shown)
+    monkeypatch.setattr(demo, "emulated_line", line)
+    ran = busmaster("demo")
+    assert (ran.status, ran.err) == (0, "")
+    assert sorted(given_back) == paths == ["/dev/pts/1", "/dev/pts/2", "/dev/pts/3"]
 
 
 class Watched:

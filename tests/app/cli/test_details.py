@@ -160,3 +160,16 @@ def test_a_point_without_writes_is_read_only() -> None:
 )
 def test_exchange_shows_why_it_took_as_long_as_it_did(times: dict[str, Any], text: str) -> None:
     assert facts(point(), timeline=TIMELINE | times)["exchange"] == text
+
+
+def test_without_a_picture_of_a_new_owner_neither_age_nor_state_of_the_line_is_shown() -> None:
+    found = facts(point(value=3, asked=197.5), Node("node 5", "hcp2", 5, "up"))
+    assert found["value"] == "3"
+    assert found["node"].startswith("hcp2 5, up: ")
+
+
+@pytest.mark.parametrize("name", ["command", "hint", "gone"])
+def test_no_text_of_the_owner_reaches_the_terminal_as_a_command(name: str) -> None:
+    text = details_text(point(error="no reply"), None, None, DETAILS | {name: "\x1b[2J\x9b31m"}, None, 80).plain
+    assert text.replace("\n", "").isprintable()
+    assert r"\u001b[2J" in text

@@ -20,6 +20,8 @@ import pytest
 from busmaster.app.cli import discover
 from busmaster.app.cli.capturing import capturing
 from busmaster.app.cli.discover import EnterStops, Job, print_plan, what_to_try
+from busmaster.app.cli.output import note
+from busmaster.app.cli.progress import Bar
 from busmaster.app.config import load
 from busmaster.app.diagnostics.search import Discovery, Found
 from busmaster.app.diagnostics.steps import Step
@@ -115,6 +117,8 @@ def test_a_file_that_is_there_is_not_overwritten(busmaster: Command, unknown: Pt
     assert done.status == 2
     assert "exists and is not overwritten" in done.err
     assert path.read_text() == "mine"
+    folder = busmaster("discover", unknown.path, *HCP2, "--yes", "-o", str(tmp_path))
+    assert (folder.status, folder.err.count("\n")) == (2, 1), "nothing is searched"
 
 
 @pytest.mark.slow
@@ -214,6 +218,8 @@ def test_the_plan_counts_reads_settings_and_names_each_protocol(capfd: pytest.Ca
         f"{msc.profile.title}"
     )
     assert rest == "busmaster: if a node replies, the other addresses of its protocol are tried too"
+    plan("COM1", Step(None, hcp2, (1, 2)), Step(None, hcp2, (3,)))
+    assert "then 3 reads, at the server's own rate, in Host Comms Protocol 2\n" in capfd.readouterr().err
 
 
 # the command, where a search has these results
@@ -269,12 +275,36 @@ def test_yes_asks_nothing_and_a_file_gets_the_result(
     monkeypatch.setattr(discover, "lasting", lambda port: replace(port, path="/dev/serial/by-id/adapter"))
     done = busmaster("discover", "/dev/ttyS0?echo=1", *HCP2, "--yes", "-o", str(path), "--capture", str(capture))
     assert (done.status, done.out) == (0, "")
+    assert "\nbusmaster: found Host Comms Protocol 2 at 9600 8N1, node 3\n" in done.err
     assert done.err.endswith(f"busmaster: written to {path}: `busmaster run {path}` polls it\n")
     assert [node.address for node in load(path).nodes.values()] == [3]
     assert load(path).port.name == "/dev/serial/by-id/adapter"
     [(_, recorder)] = searched
     assert recorder.path == str(capture)
     assert given == [{"port": "/dev/ttyS0", "protocol": "", "echo": True}]
+
+
+def test_a_search_without_a_result_is_a_failure_and_writes_no_file(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(discover, "until_ended", lambda *_: None)
+    path = tmp_path / "line.toml"
+    for output in ((), ("-o", str(path))):
+        done = busmaster("discover", "/dev/ttyS0", *HCP2, "--yes", *output)
+        assert (done.status, done.out) == (1, "")
+    assert not path.exists()
+
+
+def test_ctrl_c_at_the_question_is_its_status_and_nothing_is_sent(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, searched: list[Any]
+) -> None:
+    def confirm(*_: object, **__: object) -> bool:
+        raise click.Abort
+
+    monkeypatch.setattr(click, "confirm", confirm)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    assert busmaster("discover", "/dev/ttyS0", *HCP2).status == 130
+    assert searched == []
 
 
 def test_a_file_that_appears_during_the_search_is_kept(
@@ -300,6 +330,7 @@ class FakeSearch:
     looked = False
 
     def __init__(self, wire: object, port: object, report: object, progress: object, offered: Callable[[], Any]):
+        self.given = (wire, port, report, progress)
         self.offered = offered
 
     async def listen(self, tried: object) -> str:
@@ -377,6 +408,20 @@ def test_enter_stops_a_search_and_the_shell_does_not_get_the_line(
     assert capfd.readouterr().err == "busmaster: press Enter to stop and keep the nodes found so far\n"
 
 
+def test_a_search_that_is_not_stopped_gives_standard_input_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+
+    async def story() -> None:
+        async with EnterStops() as stops:
+            assert stops.offered()() is False
+        assert not asyncio.get_running_loop().remove_reader(slave), "it is not watched any more"
+
+    with open(slave, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        asyncio.run(story())
+    os.close(master)
+
+
 def test_without_a_terminal_nothing_is_offered(capfd: pytest.CaptureFixture[str]) -> None:
     async def story() -> None:
         async with EnterStops() as stops:
@@ -412,5 +457,7 @@ def test_the_search_can_be_stopped_by_enter(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(discover, "opened", nothing_opened)
     monkeypatch.setattr(discover, "Search", Kept)
-    asyncio.run(discover.discover(Job(SerialPort("COM1", baudrate=9600), []), None))
+    port = SerialPort("COM1", baudrate=9600)
+    asyncio.run(discover.discover(Job(port, []), None))
+    assert searches[0].given == (None, port, note, Bar)
     assert isinstance(searches[0].offered.__self__, EnterStops)  # type: ignore[attr-defined]  # a bound method

@@ -14,6 +14,7 @@ import click
 import pytest
 
 from busmaster import Priority
+from busmaster.app.cli import do
 from busmaster.app.cli.do import RecordedNode, options_of
 from busmaster.app.cli.read import plain_lines
 from busmaster.app.service.authorisation import WriteRequest
@@ -168,6 +169,9 @@ def test_help_lists_the_actions_of_each_protocol(busmaster: Command) -> None:
         for name in kind.handle._actions:
             assert f"{kind.name} " in text
             assert f" {name}" in text
+    words = " ".join(text.split())
+    assert "hcp2 execute COMMAND DATA... Have the Mint program carry out a command" in words
+    assert "microflex enable Enable the drive, and wait" in words
 
 
 # by a file
@@ -225,9 +229,10 @@ def test_advice_for_a_late_reply_is_a_key_only_for_a_node_of_a_file(
 
 def test_an_action_that_fails_is_on_record(busmaster: Command, file: Path, drive: TcpServer) -> None:
     drive.call(lambda line, now: line.cut(now, line.device(7)))
-    file.write_text(file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05"))
+    text = file.read_text().replace("window = 1.0", "window = 0.05, max_reply_delay = 0.05")
+    file.write_text(text + '[nodes.drive.points]\ncontrol = { item = "108", factor = 0.5 }\n')
     assert busmaster("do", f"drive@{file}", "enable").status == 1
-    assert audit(file) == [("busmaster do enable", "drive/command_word", 128, "unconfirmed")]
+    assert audit(file) == [("busmaster do enable", "drive/control", 64, "unconfirmed")]
 
 
 def quick_start(file: Path, timing: str = "window = 0.3") -> None:
@@ -240,6 +245,48 @@ def test_a_reply_of_0_is_printed(busmaster: Command, file: Path, drive: TcpServe
     quick_start(file)
     ran = busmaster("do", f"drive@{file}", "disable")
     assert (ran.status, ran.out, ran.err) == (0, "disable ok 0\n", "")
+    file.write_text(file.read_text() + '[nodes.drive.points]\ncontrol = { item = "108" }\n')
+    ran = busmaster("do", f"drive@{file}", "disable", "--json")
+    assert without_time(ran.out) == {"node": "drive", "action": "disable", "ok": True, "value": 0, "names": []}
+    assert [row[:3] for row in audit(file)] == [
+        ("busmaster do disable", "drive/command_word", 0),
+        ("busmaster do disable", "drive/control", 0),  # as the file names it
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text", "fields"),
+    [
+        ("", None, "move ok", {"node": 11}),
+        ("", 0, "move ok 0", {"node": 11, "value": 0}),
+        ("winder", None, "move ok", {"node": "winder"}),
+    ],
+)
+def test_an_action_is_reported_with_its_reply_and_by_the_name_of_its_node_or_its_address(
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+    value: int | None,
+    text: str,
+    fields: dict[str, Any],
+) -> None:
+    checked: list[Any] = []
+
+    async def run(handle: Any, *values: float, **options: float) -> int | None:
+        assert (values, options) == ((1, -2.5), {"within": 4.0})
+        return value
+
+    move = Action("move", run, lambda *given: checked.append(given), numbers=("AXIS", "DISTANCE..."))
+    handle = SimpleNamespace(node=SimpleNamespace(address=11))
+    line = object() if name else None  # of a file, whose line has an owner: it keeps the record
+    target: Any = SimpleNamespace(line=line, owned=True, handle=handle, name=name, bus=nullcontext())
+    monkeypatch.setattr(do, "late_nodes", lambda bus, in_file: nullcontext())
+    for as_json in (False, True):
+        asyncio.run(do.carry_out(target, "move", move, (1, -2.5), {"within": 4.0}, as_json))
+    plain, json_ = capfd.readouterr().out.splitlines()
+    assert plain == text
+    assert without_time(json_) == {"action": "move", "ok": True} | fields
+    assert checked == [(handle, 1, -2.5)] * 2
 
 
 def test_a_late_reply_to_an_action_is_reported_with_the_key_of_the_file(
@@ -301,8 +348,8 @@ def test_the_owner_of_the_line_carries_it_out_and_keeps_the_record(
 
 def test_each_write_of_an_action_is_checked_before_the_first_is_sent() -> None:
     """As a node does: an action of two writes whose second is beyond its limit writes nothing."""
-    refused: list[str] = []
-    line = SimpleNamespace(authorisation=SimpleNamespace(refuse=lambda request, why: refused.append(why)))
+    refused: list[tuple[object, str]] = []
+    line = SimpleNamespace(authorisation=SimpleNamespace(refuse=lambda request, why: refused.append((request, why))))
 
     async def story(bus: Bus) -> None:
         controller = Hcp2Controller(bus, 1)
@@ -314,7 +361,9 @@ def test_each_write_of_an_action_is_checked_before_the_first_is_sent() -> None:
             node.check(hcp2.Write(10, (5.0,)), hcp2.Write(11, (50.0,)))
 
     on_a_bus(story, EmulatedMint(1))
-    assert len(refused) == 1
+    [(request, why)] = refused
+    assert request == hcp2.Write(11, (50.0,))
+    assert "pull = 50 is above its maximum of 10" in why
 
 
 class Kept:

@@ -33,7 +33,8 @@ class Process:
 
     def wait(self, timeout: float | None = None) -> int:
         if self.deaf and "kill" not in self.done:
-            raise subprocess.TimeoutExpired("top", timeout or 0.0)
+            assert timeout is not None, "it would wait for ever"
+            raise subprocess.TimeoutExpired("top", timeout)
         self.returncode = self.status
         return self.status
 
@@ -109,8 +110,11 @@ async def test_a_view_that_is_cancelled_is_ended_before_the_terminal_is_given_ba
 @pytest.mark.asyncio
 async def test_a_view_of_a_line_that_is_not_shared_has_the_title_of_the_file() -> None:
     line = Line(Hcp2Controller.profile.line, [], paced=False)
-    async with Bus(MemoryPort(line)) as bus, served_here(Authorisation(bus), "Slitter 2") as service:
-        assert service.line.title == "Slitter 2"
+    async with Bus(MemoryPort(line)) as bus:
+        authorisation = Authorisation(bus)
+        async with served_here(authorisation, "Slitter 2") as service:
+            assert service.line.title == "Slitter 2"
+            assert service.line.authorisation is authorisation
 
 
 @pytest.fixture
@@ -137,6 +141,20 @@ def test_a_terminal_gets_its_settings_and_its_page_back(
     assert termios.tcgetattr(file.fileno()) == before
     os.set_blocking(master, False)
     assert os.read(master, 1000) == LEAVE_SCREEN
+
+
+def test_a_terminal_that_takes_no_text_gets_its_settings_back_all_the_same(
+    terminal: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = terminal_state()
+    changed = termios.tcgetattr(terminal[1].fileno())
+    changed[3] &= ~(termios.ECHO | termios.ICANON | termios.ISIG)
+    termios.tcsetattr(terminal[1].fileno(), termios.TCSANOW, changed)
+    with open("/dev/full", "wb", buffering=0) as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        restore_terminal(before)
+        monkeypatch.undo()
+    assert termios.tcgetattr(terminal[1].fileno()) == before
 
 
 def test_without_a_terminal_there_is_no_state_and_nothing_to_give_back(

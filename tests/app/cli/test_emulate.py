@@ -189,6 +189,13 @@ def test_a_file_that_run_would_refuse_is_refused(busmaster: Command, served: lis
     assert "axis9.position" in ran.err
 
 
+def test_outputs_of_the_file_need_not_be_possible_where_its_line_is_emulated(
+    busmaster: Command, served: list[Served], file: Path, tmp_path: Path
+) -> None:
+    file.write_text(f'{file.read_text()}[outputs.sqlite]\npath = "{tmp_path / "absent" / "line.sqlite"}"\n')
+    assert len(one(busmaster, served, str(file)).line.devices) == 2
+
+
 def test_without_file_and_protocol_there_is_nothing_to_emulate(busmaster: Command) -> None:
     ran = busmaster("emulate")
     assert ran.status == 2

@@ -37,9 +37,16 @@ def ending() -> Iterator[Ending]:
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+@pytest.mark.parametrize(
+    ("number", "raised", "second"),
+    [
+        (signal.SIGINT, KeyboardInterrupt, signal.SIGINT),
+        (signal.SIGTERM, SystemExit, signal.SIGTERM),
+        (signal.SIGINT, KeyboardInterrupt, signal.SIGTERM),
+    ],
+)
 def test_a_signal_cancels_what_runs_and_a_second_one_does_not_break_its_unwinding(
-    ending: Ending, number: signal.Signals, raised: type[BaseException]
+    ending: Ending, number: signal.Signals, raised: type[BaseException], second: signal.Signals
 ) -> None:
     steps = []
 
@@ -48,7 +55,7 @@ def test_a_signal_cancels_what_runs_and_a_second_one_does_not_break_its_unwindin
         try:
             await anyio.sleep_forever()
         finally:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), second)
             with anyio.CancelScope(shield=True):
                 await anyio.lowlevel.checkpoint()
             steps.append("given back")
@@ -56,6 +63,7 @@ def test_a_signal_cancels_what_runs_and_a_second_one_does_not_break_its_unwindin
     with pytest.raises(raised):
         ending.run(work)
     assert steps == ["given back"]
+    assert ending.number == number
 
 
 def test_a_signal_outside_a_loop_unwinds_the_thread_once(ending: Ending) -> None:

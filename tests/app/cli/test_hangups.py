@@ -41,6 +41,20 @@ def test_signals_before_anything_waits_are_kept_as_one() -> None:
         hang_up()  # no loop runs any more that it could wake
 
 
+def test_a_signal_at_the_moment_at_which_the_wait_is_cancelled_is_kept() -> None:
+    async def story(hangups: Hangups) -> None:
+        waiting = asyncio.ensure_future(hangups.next())
+        await asyncio.sleep(0)
+        hang_up()
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        await asyncio.wait_for(hangups.next(), 1.0)
+
+    with Hangups() as hangups:
+        asyncio.run(story(hangups))
+
+
 def test_the_handler_is_as_before_at_the_end() -> None:
     def ours(*_: object) -> None:
         """Nothing."""

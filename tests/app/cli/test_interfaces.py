@@ -122,3 +122,10 @@ def test_a_line_that_is_not_named_stays_the_same_once_there_is_one(running: list
     assert meant() == "unix:/a"
     running[:] = ["unix:/b"]
     assert meant() == "unix:/a"
+
+
+def test_a_line_that_is_named_is_looked_for_again_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    addresses = iter(("unix:/a", "unix:/b"))
+    monkeypatch.setattr(interfaces, "address_of", lambda line: f"{line} at {next(addresses)}")
+    meant = interfaces._Meant("slitter")
+    assert [meant(), meant()] == ["slitter at unix:/a", "slitter at unix:/b"]

@@ -109,9 +109,10 @@ def test_a_protocol_that_documents_nothing_says_what_an_item_is(
     busmaster: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(items, "find", lambda name: replace(find(name), documented=()))
-    shown = busmaster("items", "dc104")
-    assert (shown.status, shown.out) == (0, "")
-    assert shown.err == "busmaster: dc104: its documents define no items; use a parameter, 1 to 255\n"
+    for words in ((), ("speed",), ("speed", "--json")):
+        shown = busmaster("items", "dc104", *words)
+        assert (shown.status, shown.out) == (0, "")
+        assert shown.err == "busmaster: dc104: its documents define no items; use a parameter, 1 to 255\n"
 
 
 MADE_UP = (

@@ -21,10 +21,11 @@ from busmaster.bus.node import Health
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty, serve_tcp
-from busmaster.errors import NoReply
+from busmaster.errors import LineDown, NoReply
 from busmaster.events import MaxReplyDelayRaised, NodeChanged, RepliesLate
 from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Command, owner_here
+from tests.patience import PATIENCE
 
 LATE = Delay(0.13)
 TOO_LATE = Delay(0.2)
@@ -238,6 +239,49 @@ def test_events_of_the_last_moment_are_reported(capfd: pytest.CaptureFixture[str
 
         async with late_nodes(Quiet()):  # type: ignore[arg-type]  # a stand-in
             came.set()
+
+    asyncio.run(story())
+    assert capfd.readouterr().err.startswith("busmaster: node 1: late reply, 200 ms")
+
+
+@pytest.mark.parametrize("owner", ["replies", "is gone", "is silent"])
+def test_an_owner_is_waited_for_at_the_end_as_long_as_it_may_take(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], owner: str
+) -> None:
+    """Its event comes after the reply that has caused it, and before the next reply."""
+
+    class Remote(Late):
+        async def events(self) -> AsyncIterator[object]:
+            await asked.wait()
+            async for event in super().events():
+                yield event
+
+        async def statistics(self) -> None:
+            asked.set()
+            if owner == "is gone":
+                raise LineDown("the owner has ended")
+            if owner == "is silent":
+                await asyncio.Event().wait()
+
+    async def story() -> None:
+        async with asyncio.timeout(PATIENCE), late_nodes(Remote([RepliesLate(node(1), 0.2, 0.1)])):  # type: ignore[arg-type]  # a stand-in
+            pass
+
+    monkeypatch.setattr(late, "RemoteBus", Remote)
+    monkeypatch.setattr(late, "OWNER_REPLIES_WITHIN", 0.01)
+    asked = asyncio.Event()
+    asyncio.run(story())
+    assert capfd.readouterr().err.startswith("busmaster: node 1: late reply, 200 ms")
+
+
+def test_advice_is_printed_though_the_command_fails(capfd: pytest.CaptureFixture[str]) -> None:
+    async def story() -> None:
+        with pytest.raises(NoReply):
+            async with late_nodes(Late([RepliesLate(node(1), 0.2, 0.1)])):  # type: ignore[arg-type]  # a stand-in
+                raise NoReply("no reply")
+        for _ in range(3):
+            await asyncio.sleep(0)
+        assert len(asyncio.all_tasks()) == 1, "it does not listen any more"
 
     asyncio.run(story())
     assert capfd.readouterr().err.startswith("busmaster: node 1: late reply, 200 ms")

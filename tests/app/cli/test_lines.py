@@ -53,7 +53,7 @@ def kept(outputs: Any, *records: Any) -> None:
 
 
 def test_records_are_stored_before_the_outputs_are_closed(notes: list[tuple[str, Level]]) -> None:
-    outputs = Outputs([counts(waiting=2)], [counts("mqtt"), counts(waiting=1)], [counts()])
+    outputs = Outputs([counts(waiting=2)], *[[counts("mqtt"), counts(waiting=1)]] * 3, [counts()])
     kept(outputs, "first", "second")
     assert outputs.done == ["started", "first", "second", "closed"]
     assert len(outputs.left) == 1, "it has waited until nothing waits"

@@ -45,6 +45,8 @@ class Wishes:
 
     async def suspend(self, protocol: str, address: int, for_: float, /) -> None:
         self.said.append(("suspend", protocol, address, for_))
+        if self.error is not None:
+            raise self.error
 
     async def details(self, group: str, key: str, /) -> Mapping[str, Any]:
         self.asked.add((group, key))
@@ -114,6 +116,7 @@ async def test_the_whole_of_a_wide_terminal_is_used_and_columns_stay_aligned() -
         shown = lines(screen)
     header = next(line for line in shown if "VALUE" in line)
     drawn_row = next(line for line in shown if "1.5" in line)
+    assert header.index("HEALTH") == 120 - 9, "the last column ends at the edge"
     assert header.index("VALUE") + len("VALUE") == drawn_row.index("1.5") + len("1.5")
     assert header.index("HEALTH") == drawn_row.index("up")
     assert {cell_len(line) for line in shown} == {120}
@@ -239,9 +242,13 @@ async def test_the_row_in_its_place_is_selected_where_the_selected_one_is_gone()
         assert [words[1] for words in table(screen)] == ["20", *map(str, range(1, 11))]
         assert await after(4, 1, 2, 3) == "3"
         assert await after(5) == ""
+        assert await after(6, 1, 2, 3) == "3"  # it is back
+        assert await after(7) == ""
         assert table(screen) == []
         await pilot.press("down", "pagedown")
-        assert await after(6, 7, 8, 9) == "7"
+        assert await after(8, 7, 8, 9) == "7"
+        assert await after(9, *range(20, 60), 7) == "7"
+        assert table(screen)[-1][1] == "7", "it is in sight"
 
 
 @pytest.mark.slow
@@ -334,6 +341,39 @@ async def test_trouble_is_first_an_error_then_a_node_that_is_not_up_then_an_alar
 
 
 @pytest.mark.asyncio
+async def test_rows_of_nodes_that_are_not_known_yet_are_the_last_and_count_as_trouble() -> None:
+    async with drawn(tell(Picture(), row(7), row(1), row(2), nodes=(node(1), node(2)))) as (screen, _, pilot):
+        assert [words[1] for words in table(screen)] == ["1", "2", "7"]
+        screen.order = "oldest"
+        await pilot.press("o")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["7", "1", "2"]
+
+
+@pytest.mark.asyncio
+async def test_a_filter_begins_with_the_present_words_and_stands_beside_the_order() -> None:
+    async with drawn(tell(Picture(), row(1), row(8), row(9))) as (screen, _, pilot):
+        await pilot.press("slash", "9", "enter", "slash", "enter", "o")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9"]
+        assert lines(screen)[-1].startswith(" filter: 9, item ")
+        await pilot.press("slash", "backspace", "space", "enter")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["1", "8", "9"]
+        assert lines(screen)[-1].startswith(" item ")
+
+
+@pytest.mark.asyncio
+async def test_the_selection_moves_by_a_page_of_the_table_and_back() -> None:
+    async with drawn(tell(Picture(), *(row(number) for number in range(1, 41))), (60, 20)) as (screen, _, pilot):
+        page = screen.table.size.height - 1
+        for key, number in (("pagedown", 1 + page), ("down", 2 + page), ("pageup", 2), ("pageup", 1)):
+            await pilot.press(key)
+            assert screen.table.selected is not None
+            assert screen.table.selected.name == f"node {number} outputs"
+
+
+@pytest.mark.asyncio
 async def test_the_foot_has_the_error_of_the_selected_row_and_the_last_events_since_the_start() -> None:
     events = [[1000.0 + number, f"event {number}"] for number in (4, 1, 3, 2)]
     async with drawn(tell(Picture(), *three_drives(), events=events)) as (screen, _, pilot):
@@ -358,6 +398,19 @@ async def test_the_foot_has_the_error_of_the_selected_row_and_the_last_events_si
 async def test_points_beyond_those_that_are_shown_are_counted() -> None:
     async with drawn(tell(Picture(), *three_drives(), left_out=7)) as (screen, _, _):
         assert " 7 points more than are shown" in "\n".join(lines(screen))
+
+
+@pytest.mark.asyncio
+async def test_q_closes_the_help_and_not_the_view() -> None:
+    async with drawn(tell(Picture(), row()), leave="end the run") as (screen, _, pilot):
+        await pilot.press("question_mark")
+        await pilot.pause()
+        assert "q       end the run" in "\n".join(lines(screen))
+        await pilot.press("q")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+        assert screen.is_running
+    assert screen.return_value is None
 
 
 @pytest.mark.slow
@@ -424,6 +477,20 @@ async def test_many_groups_leave_room_for_the_points_and_that_of_the_row_is_show
 
 
 @pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("height", "shown"), [(40, ["group1", "group0", "group2", "group3", "and"]), (10, ["group1", "and"])]
+)
+async def test_an_eighth_of_the_screen_is_for_groups_the_first_of_which_is_that_of_the_row(
+    height: int, shown: list[str]
+) -> None:
+    groups = tuple({**GROUP, "name": f"group{number}"} for number in range(30))
+    async with drawn(tell(Picture(), row(group="group1"), groups=groups), (60, height)) as (screen, _, _):
+        head = lines(screen)[2 : 3 + len(shown)]
+    assert [line.split()[0] for line in head] == [*shown, "NODE"]
+    assert head[-2].startswith(f" and {31 - len(shown)} more groups")
+
+
+@pytest.mark.asyncio
 async def test_groups_that_fit_are_shown_all() -> None:
     groups = tuple({**GROUP, "name": f"group{number}"} for number in range(3))
     async with drawn(tell(Picture(), row(group="group2"), groups=groups), (80, 24)) as (screen, _, _):
@@ -472,6 +539,22 @@ async def test_a_command_that_fails_is_named_with_its_group_and_why() -> None:
             await pilot.press(*keys)
             await pilot.pause()
             assert f" {what}: this role may only read" in "\n".join(lines(screen))
+        await pilot.press("s", "y")
+        await pilot.pause()
+        assert " suspend node 6 for 60 s, all its polls: this role may only read" in "\n".join(lines(screen))
+
+
+@pytest.mark.asyncio
+async def test_a_pause_that_succeeded_is_no_event_and_an_error_has_no_advice_in_its_line() -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+        await pilot.press("p")
+        await pilot.pause()
+        assert line.said == [("pause", "axes", True)]
+        assert screen.last_message is None
+        line.error = LineDown("port lost", hint="plug it in")
+        await pilot.press("p")
+        await pilot.pause()
+        assert lines(screen)[-2].rstrip().endswith(" s  pause axes: port lost")
 
 
 @pytest.mark.asyncio
@@ -569,6 +652,21 @@ async def test_it_is_said_what_became_of_a_write() -> None:
         assert "node 5 outputs = 2: no reply within 100 ms" in "\n".join(lines(screen))
 
 
+@pytest.mark.asyncio
+async def test_the_dialog_of_a_write_names_the_point_its_unit_and_the_value() -> None:
+    async with drawn(tell(Picture(), row(unit="mm"))) as (screen, line, pilot):
+        await pilot.press("w", "space", "enter")  # nothing is not a value
+        await pilot.pause()
+        assert "write node 5 outputs in mm  (Enter; Esc cancels)" in "\n".join(lines(screen))
+        await pilot.press("backspace", "x", "enter")
+        await pilot.pause()
+        assert "write node 5 outputs: 'x' is not a number  (Enter" in "\n".join(lines(screen))
+        await pilot.press("backspace", "7", "space", "enter")
+        await pilot.pause()
+        assert "write node 5 outputs = 7 mm?  y or n" in "\n".join(lines(screen))
+    assert line.said == []
+
+
 @pytest.mark.slow
 @pytest.mark.asyncio
 async def test_the_dialog_of_a_write_shows_the_unit_and_why_a_value_is_none() -> None:
@@ -640,6 +738,43 @@ async def test_details_follow_the_value_and_say_that_a_point_is_gone(
         assert "no point 5/outputs" in shown
         assert "value    4" in shown
         assert "limits" not in shown
+
+
+@pytest.mark.asyncio
+async def test_details_are_requested_only_while_they_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "ASKED_EVERY", 0.0)
+    second, closed = asyncio.Event(), asyncio.Event()
+    asked: list[str] = []
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+
+        async def details(group: str, key: str, /) -> Mapping[str, Any]:
+            asked.append(key)
+            if len(asked) > 1:
+                second.set()
+                await closed.wait()
+            assert len(asked) < 3, "it is closed"
+            return {}
+
+        monkeypatch.setattr(line, "details", details)
+        await pilot.press("enter")
+        await asyncio.wait_for(second.wait(), PATIENCE)
+        [worker] = screen.workers
+        await pilot.press("escape")
+        await pilot.pause()
+        closed.set()
+        await worker.wait()
+    assert asked == ["5/outputs"] * 2
+
+
+@pytest.mark.asyncio
+async def test_the_trend_of_a_point_is_one_line_of_its_details() -> None:
+    picture = tell(Picture(), row())
+    picture.rows[0].past.extend((1000.0 + second, float(second)) for second in range(60))
+    async with drawn(picture, (40, 30)) as (screen, _, pilot):
+        await pilot.press("enter")
+        await pilot.pause()
+        trend = [line for line in lines(screen) if {"▄", "█"} & set(line)]
+    assert [len(line.strip("│ ")) for line in trend] == [36]
 
 
 @pytest.mark.asyncio
@@ -762,7 +897,8 @@ async def test_silence_of_the_owner_is_shown_without_a_key_or_a_message(monkeypa
 async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -> None:
     async with drawn(tell(Picture(), row())) as (screen, _, pilot):
         screen.away = "no program serves /run/line.sock"
-        screen.take_picture()
+        screen.heard -= 10
+        screen.draw()
         await pilot.pause()
         assert "its owner is not running" in lines(screen)[0]
         assert any("no program serves /run/line.sock" in line for line in lines(screen))
@@ -786,6 +922,25 @@ async def test_rows_stay_until_an_owner_that_is_back_has_told_its_own() -> None:
         screen.take_picture()
         await pilot.pause()
         assert len(table(screen)) == 2
+
+
+@pytest.mark.asyncio
+async def test_a_command_that_fails_because_its_owner_ended_is_shown_with_the_next_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+
+        async def pause(group: str, paused: bool, /) -> None:
+            screen.picture = Picture()
+            raise LineDown("the connection is lost")
+
+        monkeypatch.setattr(line, "pause", pause)
+        await pilot.press("p")
+        await pilot.pause()
+        tell(screen.picture, row(), events=[])
+        screen.take_picture()
+        await pilot.pause()
+        assert "pause axes: the connection is lost" in lines(screen)[-2]
 
 
 @pytest.mark.asyncio
