@@ -275,6 +275,24 @@ async def test_a_value_is_written_in_each_type_that_means_it(
             assert await asyncio.to_thread(opened.client.type_of, "1/coil:5") == ("DataItemType", "DataItemType")
 
 
+async def test_a_point_shows_the_type_of_its_values_and_whether_they_are_lists(opened: Opened) -> None:
+    def types(*names: str) -> list[tuple[str, int]]:
+        nodes = [opened.client.node(name) for name in names]
+        kinds = [ua.ObjectIdNames[node.get_data_type().Identifier] for node in nodes]
+        return [(kind, int(node.get_value_rank())) for kind, node in zip(kinds, nodes, strict=True)]
+
+    line = Line(ModbusUnit.profile.line, [make_device("modbus", 1)], paced=False)
+    async with Bus(MemoryPort(line)) as bus, Service(bus, path=opened.folder / "line.sock"):
+        unit = ModbusUnit(bus, 1)
+        items = ("holding:20", "holding:30:3", "holding:40:float32", "coil:9")
+        bus.poll_group("press", period=0.02, points=[unit.point(item) for item in items])
+        for item in items:
+            await opened.is_(f"1/{item}", "Good")
+        assert await asyncio.to_thread(types, *(f"1/{item}" for item in items)) == [
+            *(("Int64", -1), ("Int64", 1), ("Double", -1), ("Boolean", -1))
+        ]
+
+
 async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
     opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:

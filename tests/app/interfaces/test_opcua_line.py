@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any, cast
@@ -154,7 +155,10 @@ async def test_each_point_has_the_value_and_status_of_its_last_read() -> None:
     assert story.server.has_points.is_set()
     assert story.shown.described["winder/2"] == "winder 2 (read winder/2)"
     # a value of a point that is not shown, 3, and one that has no type, before one that has
-    await story.show(read_cycle(1.5, NoReply("no reply"), 3.0, 4.5))
+    read = read_cycle(1.5, NoReply("no reply"), 3.0, 4.5)
+    await story.show(read)
+    times = {point.item: sample.wall for point, sample in read.samples.items()}
+    assert {key: story.shown.values[f"winder/{key}"][2] for key in "124"} == {key: times[key] for key in "124"}
     assert story.shown.state("winder/1", "winder/2", "winder/4") == [
         *((1.5, "Good"), (None, "BadNoCommunication"), (4.5, "Good"))
     ]
@@ -184,6 +188,22 @@ async def test_a_write_makes_the_value_of_its_point_uncertain_until_it_was_read_
     assert story.shown.state("winder/1", "winder/2") == [(1.0, "UncertainLastUsableValue"), (2.0, "Good")]
     await story.show(read_cycle(1.0, 2.0, at=100.6))
     assert story.shown.state("winder/1", "winder/2") == [(1.0, "Good"), (2.0, "Good")]
+    await story.end()
+
+
+async def test_a_value_that_was_requested_before_a_write_and_came_after_it_is_uncertain() -> None:
+    story = Story(row_of("1"), row_of("2"))
+    await story.show()
+    snapshot = read_cycle(1.0, 2.0)
+    later = {point: sample._replace(started=100.0, finished=100.4) for point, sample in snapshot.samples.items()}
+    late = replace(snapshot, samples=later)
+    await story.show(late)
+    assert story.shown.state("winder/1", "winder/2") == [(1.0, "Good"), (2.0, "Good")]
+    story.server._receive_touched(touched("1", 100.2))
+    await story.show()
+    assert story.shown.state("winder/1", "winder/2") == [(1.0, "UncertainLastUsableValue"), (2.0, "Good")]
+    await story.show(late)
+    assert story.shown.state("winder/1", "winder/2") == [(1.0, "UncertainLastUsableValue"), (2.0, "Good")]
     await story.end()
 
 

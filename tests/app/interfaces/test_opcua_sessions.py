@@ -24,6 +24,7 @@ from busmaster.app.interfaces.opcua_access import Rules, Writes, guard
 from busmaster.app.interfaces.opcua_connections import Requests
 from busmaster.app.interfaces.opcua_sessions import Session, use_sessions
 from busmaster.app.interfaces.opcua_terms import CODES
+from busmaster.app.service.permission import digest_of
 
 pytestmark = pytest.mark.asyncio
 NUMBER, OTHER, TEXT, UNKNOWN = (ua.NodeId(name, 2) for name in ("number", "other", "text", "unknown"))
@@ -144,6 +145,25 @@ async def test_a_session_has_a_bounded_number_of_subscriptions_whatever_others_h
     await one.delete_subscriptions([first.SubscriptionId])
     assert await code_of(clients.subscribe(one)) == ""
     await clients.end()
+
+
+async def test_a_failed_login_is_of_the_address_of_its_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    server: Any = Guarded(has_key=False)
+    failed: list[str] = []
+
+    async def write(*_: object) -> int:
+        return int(CODES.Good)
+
+    guard(server, Rules(secrets={"scada": digest_of("0123456789abcdef")}), write, failed.append)
+    server.iserver.supported_tokens = (ua.UserNameIdentityToken,)
+    server.iserver.decrypt_user_token = lambda _session, _token: ("scada", "wrong")
+    for address in ("10.0.0.1", "10.0.0.2"):
+        session = server.iserver.create_session((address, 50_000))
+        login = ua.ActivateSessionParameters(UserIdentityToken=ua.UserNameIdentityToken())
+        assert await code_of(lambda session=session, login=login: session.activate_session(login, None)) == (
+            "BadUserAccessDenied"
+        )
+    assert failed == ["10.0.0.1", "10.0.0.2"]
 
 
 async def test_a_session_that_was_not_activated_ends_with_its_connection(clients: Clients) -> None:
