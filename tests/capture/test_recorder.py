@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from busmaster.capture.recorder import Recorder
 from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.outputs.cycles import until
+from tests.patience import PATIENCE
 
 READ = hcp2.Read(1)
 REQUEST = READ.open(2, hcp2.PROFILE.timings).request
@@ -98,6 +100,35 @@ def test_a_full_disk_stops_the_capture_and_nothing_else() -> None:
     assert isinstance(tap.error, OSError)
     tap.transmitted(time.monotonic(), REQUEST, attempt())
     assert tap.dropped > 0
+
+
+def test_a_disk_that_has_room_again_when_the_recorder_is_closed_gets_all_that_waited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Disk(CaptureFiles):
+        is_full = True
+
+        def flush(self) -> None:
+            if Disk.is_full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            super().flush()
+
+    monkeypatch.setattr(recorder, "CaptureFiles", Disk)
+    monkeypatch.setattr(recorder, "TICK", 0.001)
+    monkeypatch.setattr(recorder, "RETRY", PATIENCE)
+    said: list[str] = []
+    with Recorder(tmp_path / "line.pcapng", report=said.append) as tap:
+        tap.transmitted(time.monotonic(), REQUEST, attempt())
+        until(lambda: tap.error is not None)
+        tap.transmitted(time.monotonic(), REQUEST, attempt())
+        Disk.is_full = False
+    with (tmp_path / "line.pcapng").open("rb") as file:
+        assert sum(packet.frame == REQUEST for packet in read_packets(file)) == 2
+    assert (tap.error, tap.dropped) == (None, 0)
+    assert said == [
+        f"the capture rests: {tap.path}: No space left on device",
+        f"the capture goes on: {tap.path}; nothing is lost",
+    ]
 
 
 def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
