@@ -343,6 +343,13 @@ def test_a_protocol_that_nobody_knows_here_is_recorded_as_it_passed() -> None:
     assert [packet.micros for packet in tape.packets] == [101_000_000, 101_010_000, 101_020_000]
 
 
+def test_an_exchange_of_an_unknown_protocol_without_a_verdict_is_not_judged() -> None:
+    tape = Tape()
+    tape.asked(1.0, replace(hcp2.PROFILE, name="of my own"), hcp2.Read(1), 2)
+    tape.heard(1.01, VALUE)
+    assert tape.lines() == [(HOST, READ, NONE, ""), (NODE, VALUE, NONE, "")]
+
+
 def test_overheard_bytes_without_a_known_protocol_have_the_times_at_which_they_passed() -> None:
     tape = Tape()
     tape.overheard(1.0, READ)
