@@ -21,7 +21,7 @@ from busmaster.app.interfaces import opcua as interface
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua import serving
 from busmaster.app.interfaces.opcua_access import Rules
-from busmaster.app.interfaces.opcua_connections import OpcuaServer
+from busmaster.app.interfaces.opcua_connections import Acceptor, OpcuaServer
 from busmaster.app.service import overview
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.owner_messages import StreamMessage
@@ -118,6 +118,7 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
             return servers[-1]
 
         patch.setattr(interface, "OpcuaServer", made)
+        patch.setattr(interface, "LISTEN_AFTER", 0.0)  # no line is served yet
         folder, said = tmp_path_factory.mktemp("opcua"), list[str]()
         line = Following(lambda: f"unix:{folder}/line.sock")
         async with serving(line, Rules(allow=("5/1*", "1/*")), ("127.0.0.1", 0), said.append) as url:
@@ -502,6 +503,45 @@ async def test_nobody_comes_by_the_session_of_another(opened: Opened) -> None:
 
         await asyncio.to_thread(intrude)
         assert line.audit() == []
+
+
+async def test_clients_are_accepted_when_the_points_of_the_line_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(interface, "LISTEN_AFTER", PATIENCE)
+    monkeypatch.setattr(following, "FIRST_PAUSE", 0.001)
+    monkeypatch.setattr(following, "LONGEST_PAUSE", 0.001)
+    ports, end = list[int](), asyncio.Event()
+    urls: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    line, start = Following(lambda: f"unix:{tmp_path}/line.sock"), Acceptor.start
+
+    async def started(acceptor: Acceptor) -> None:
+        await start(acceptor)
+        ports.append(acceptor.port)
+
+    async def serve_line() -> None:
+        async with serving(line, Rules(), ("127.0.0.1", 0), lambda _: None) as url:
+            urls.set_result(url)
+            await end.wait()
+
+    def status(url: str) -> str:
+        with other_client(url) as client:
+            return client.read("5/10").status
+
+    monkeypatch.setattr(Acceptor, "start", started)
+    serving_it = asyncio.create_task(serve_line())
+    await until(lambda: "no program serves" in getattr(line.state, "why", ""))
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection("127.0.0.1", ports[0])
+    devices = [make_device("hcp2", 5)]
+    async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, devices, paced=False))) as bus:
+        bus.poll_group("axes", period=0.02, points=[Hcp2Controller(bus, 5).point("10")])
+        async with Service(bus, path=tmp_path / "line.sock"):
+            async with asyncio.timeout(PATIENCE):
+                url = await urls
+            assert await asyncio.to_thread(status, url) != "BadNodeIdUnknown"
+            end.set()
+            await serving_it
 
 
 @pytest.mark.slow

@@ -296,6 +296,8 @@ def closes(address: tuple[str, int], sent: bytes) -> int:
         pytest.param(b"MSGF" + struct.pack("<I", 1 << 30) + bytes(100), id="a chunk of 1 GB"),
         pytest.param(b"MSGC" + struct.pack("<III", 32, 0, 0) + bytes(16), id="a message before the channel"),
         pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="another protocol"),
+        pytest.param(b"HELF" + struct.pack("<I", 16) + b"\xff" * 8, id="a Hello of something else"),
+        pytest.param(b"OPNF" + struct.pack("<I", 64) + b"\xff" * 56, id="a channel of something else"),
     ],
 )
 async def test_a_message_that_is_too_long_or_out_of_order_ends_its_connection(opened: Opened, sent: bytes) -> None:
