@@ -572,6 +572,62 @@ def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.M
     assert with_server(story, Long()) == [("connections", "127.0.0.1")]
 
 
+def test_the_time_in_which_a_client_must_read_its_replies_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "GATEWAY_SEND_WITHIN", 0.01)
+
+    class Unread:
+        """The end of a client that reads nothing."""
+
+        def __init__(self) -> None:
+            self.transport = self
+            self.sent: list[bytes] = []
+            self.aborted = False
+
+        def get_extra_info(self, _name: str) -> tuple[str, int]:
+            return "10.0.0.1", 50_000
+
+        def set_write_buffer_limits(self, high: int) -> None:
+            """Have a small buffer."""
+
+        def write(self, data: bytes) -> None:
+            self.sent.append(data)
+
+        async def drain(self) -> None:
+            await asyncio.get_running_loop().create_future()
+
+        def abort(self) -> None:
+            self.aborted = True
+
+    async def run() -> Unread:
+        reader, writer = asyncio.StreamReader(), Unread()
+        reader.feed_data(2 * frame(READ))
+        note: Any = lambda *refusal: refused.append(refusal)  # noqa: E731
+        async with asyncio.timeout(PATIENCE):
+            await ModbusTcpServer(cast("Any", Echo()), reports.append, note).accept(reader, cast("Any", writer))
+        return writer
+
+    reports: list[str] = []
+    refused: list[tuple[str, str]] = []
+    writer = asyncio.run(run())
+    assert (writer.sent, writer.aborted) == ([frame(READ)], True)
+    assert reports == ["Modbus TCP connections closed: 1 (replies not read for 0.01 s)"]
+    assert refused == [("connections", "10.0.0.1")]
+
+
+def test_a_client_that_leaves_has_done_no_wrong_wherever_its_request_ends(caplog: pytest.LogCaptureFixture) -> None:
+    async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        for sent in (b"", frame(READ)[:3], frame(READ)[:9], frame(READ)):
+            reader, writer = await connect()
+            writer.write(sent)
+            writer.write_eof()
+            with contextlib.suppress(ConnectionError):
+                assert await reader.read() == (sent if sent == frame(READ) else b"")
+        assert reports == []
+
+    assert with_server(story) == []
+    assert not caplog.records
+
+
 def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_PER_PEER", 3)
 
@@ -1668,6 +1724,15 @@ def test_of_several_points_in_one_request_each_gets_its_own_registers_and_an_err
     assert reports[-1] == f"client 127.0.0.1: a/x = 7: {given.error}"
     given.is_connected = False
     assert answer("06 0000 0007") == bytes.fromhex("86 0b")
+
+
+def test_a_number_that_cannot_be_written_keeps_the_points_before_it_from_being_written() -> None:
+    given, answer, _, refused = answering(allow=("a/*",))
+    given.map = RegisterMap.of([Entry("a/x", 0, type="int16"), Entry("a/y", 1, type="float32")], False)
+    assert answer("10 0000 0003 06 0007 7fc0 0000") == bytes.fromhex("90 03")  # a NaN
+    assert (given.writes, refused) == ([], [])
+    assert answer("10 0000 0003 06 0007 3fc0 0000") == bytes.fromhex("10 0000 0003")
+    assert given.writes == [("axes", "a/x", 7), ("axes", "a/y", 1.5)]
 
 
 @pytest.mark.parametrize(

@@ -764,6 +764,21 @@ async def test_times_of_the_line_are_times_of_day_and_none_while_they_are_unknow
     assert (said["connected"], said["since"], said["why"]) == (False, 900.0, "gone")
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [
+        ("POST", "/api/points/axes/winder/10", {"GET", "HEAD", "PUT"}),
+        ("PUT", "/api/line", {"GET", "HEAD"}),
+        ("POST", "/page/page.js", {"GET", "HEAD"}),
+    ],
+)
+@pytest.mark.asyncio
+async def test_another_method_is_refused_with_those_that_there_are(method: str, path: str, allowed: set[str]) -> None:
+    answer = await Local().client.request(method, path)
+    assert (answer.status_code, answer.json()["error"]) == (405, "NotServed")
+    assert set(answer.headers["allow"].split(", ")) == allowed
+
+
 @pytest.mark.asyncio
 async def test_a_point_of_two_groups_is_found_by_its_group() -> None:
     of = Local(row(value=7), row(group="slow", value=8))
