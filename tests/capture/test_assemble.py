@@ -400,6 +400,17 @@ def test_a_line_that_is_only_listened_to_is_recorded_the_same() -> None:
     assert {packet.transaction for packet in untold.packets} == {0}
 
 
+def test_that_nothing_replied_has_the_time_at_which_it_was_known() -> None:
+    tape = Tape("hcp2")
+    tape.overheard(1.0, READ)
+    tape.overheard(2.0, READ)
+    tape.assembler.idle(5.0)
+    tape.overheard(6.0, READ)
+    assert [line[2] for line in tape.lines()] == [NONE, NO_REPLY] * 3
+    times = [packet.micros / 1e6 - 100.0 for packet in tape.packets]
+    assert times == [1.0, 2.0, 2.0, 5.0, 6.0, 9.0]
+
+
 def test_a_damaged_request_on_a_line_that_is_only_listened_to_has_its_fault_as_a_comment() -> None:
     tape = Tape("hcp2")
     tape.overheard(1.0, READ[:-1] + b"\x07")

@@ -254,8 +254,19 @@ async def test_a_connection_with_many_requests_is_read_again_when_these_have_the
     async with opened.owned() as line:
         line.poll("10")
         await opened.is_("5/10", "Good")
+        [connection] = [one for one in opened.server.acceptor.clients if one.processor.has_session]
+        pauses: list[int] = []
+        pause = connection.transport.pause_reading
+
+        def noted() -> None:
+            pauses.append(connection.messages.qsize())
+            pause()
+
+        monkeypatch.setattr(connection.transport, "pause_reading", noted)
         for _ in range(3):
             assert (await asyncio.to_thread(opened.client.read, "5/10")).status == "Good"
+        assert len(pauses) >= 3
+        assert min(pauses) >= 1
 
 
 async def test_monitored_items_beyond_the_bounds_are_refused(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -338,6 +349,22 @@ async def test_a_second_hello_and_one_with_too_short_buffers_end_the_connection(
             return found
 
     assert (await asyncio.to_thread(received)).count(b"ACKF") == acknowledged
+
+
+async def test_the_reply_to_a_hello_has_the_bounds_of_messages(opened: Opened) -> None:
+    host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
+
+    def received() -> tuple[int, ...]:
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+            connection.sendall(hello(1 << 24, 1 << 24))
+            reply = connection.recv(28, socket.MSG_WAITALL)
+            assert reply[:4] == b"ACKF"
+            return struct.unpack("<IIII", reply[12:])
+
+    receive, send, message, chunks = await asyncio.to_thread(received)
+    assert (receive, send) == (bounds.LONGEST_OPCUA_CHUNK, bounds.LONGEST_OPCUA_CHUNK)
+    assert message == bounds.LONGEST_OPCUA_REQUEST
+    assert chunks * 8_192 > message > (chunks - 2) * 8_192, "also for a client with the shortest chunks"
 
 
 async def test_a_message_that_arrives_byte_by_byte_is_one(opened: Opened) -> None:
