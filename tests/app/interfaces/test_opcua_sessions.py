@@ -99,10 +99,16 @@ def clients() -> Clients:
 
 
 def item(
-    node: ua.NodeId = NUMBER, filter_: Any = None, *, queue: int = 10, attribute: Any = ua.AttributeIds.Value
+    node: ua.NodeId = NUMBER,
+    filter_: Any = None,
+    *,
+    queue: int = 10,
+    attribute: Any = ua.AttributeIds.Value,
+    part: str | None = None,
+    encoding: str | None = None,
 ) -> ua.MonitoredItemCreateRequest:
     wanted = ua.MonitoredItemCreateRequest()
-    wanted.ItemToMonitor = ua.ReadValueId(node, attribute)
+    wanted.ItemToMonitor = ua.ReadValueId(node, attribute, part, ua.QualifiedName(encoding))
     wanted.MonitoringMode = ua.MonitoringMode.Reporting
     wanted.RequestedParameters = ua.MonitoringParameters(ClientHandle=3, Filter=filter_, QueueSize=queue)
     return wanted
@@ -297,8 +303,10 @@ async def test_the_access_of_a_user_is_without_writing_for_one_that_may_not_writ
     session = clients.session()
     attributes = (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel, ua.AttributeIds.Value)
     reads = [ua.ReadValueId(NUMBER, attribute) for attribute in attributes]
-    of_point, of_user, value = await session.read(ua.ReadParameters(NodesToRead=reads))
+    reads.append(ua.ReadValueId(ua.NodeId("gone", 2), ua.AttributeIds.UserAccessLevel))
+    of_point, of_user, value, gone = await session.read(ua.ReadParameters(NodesToRead=reads))
     assert (of_point.Value.Value, of_user.Value.Value, value.Value.Value) == (of_a_point, access, 1.0)
+    assert gone.StatusCode.name == "BadNodeIdUnknown"
 
 
 async def test_items_are_bounded_in_all_subscriptions_of_a_session_and_in_all_sessions(
@@ -326,6 +334,8 @@ async def test_items_are_bounded_in_all_subscriptions_of_a_session_and_in_all_se
         (item(), "Good"),
         (item(TEXT), "Good"),
         (item(ua.NodeId("gone", 2)), "BadNodeIdUnknown"),
+        (item(part="0:1"), "BadIndexRangeInvalid"),
+        (item(encoding="Default XML"), "BadDataEncodingUnsupported"),
         (item(filter_=deadband(0.0, ua.DeadbandType.None_)), "Good"),
         (item(TEXT, deadband(0.0, ua.DeadbandType.None_)), "Good"),
         (item(filter_=deadband(0.0)), "Good"),
