@@ -1569,7 +1569,11 @@ def test_every_entry_of_the_map_that_is_no_point_is_reported() -> None:
     asyncio.run(story())
 
 
-def test_the_values_follow_the_line_until_they_are_cancelled() -> None:
+def test_the_values_follow_each_change_of_the_line_at_once_until_they_are_cancelled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(modbus_tcp, "LOOK_EVERY", PATIENCE)
+
     async def story() -> None:
         owner = Owner()
         line = connected(owner)
@@ -1582,6 +1586,20 @@ def test_the_values_follow_the_line_until_they_are_cancelled() -> None:
                 await asyncio.sleep(0)
         line._receive_touched({"protocol": "hcp2", "address": 5, "when": 100.2, "items": ["1"], "all": False})
         assert values.look_up(["winder/1"]) == {"winder/1": (1.0, 1)}
+        show(line, row_of("1"), row_of("2"))
+        for method, points in (("rows", 3), ("frame", 2)):  # a part of the rows is still to come
+            assert "winder/2" not in values.rows
+            line.picture.frame = shown_frame(points=points)
+            for receive in list(line._listeners):
+                receive(method, {})
+            for _ in range(5):
+                await asyncio.sleep(0)
+        assert "winder/2" in values.rows
+        line._remote = None
+        line._change(Lost("gone"))
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert owner.groups["axes"].closes == 1
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         assert (line._listeners, line._watchers, line._touch_listeners) == ([], [], [])

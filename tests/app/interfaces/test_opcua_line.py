@@ -25,6 +25,7 @@ from busmaster.bus.polling import Quality
 from busmaster.errors import InvalidCommand, LineDown, NoReply, NotStarted, WriteUnconfirmed
 from tests.app.interfaces.test_following import connected, row, shown_frame
 from tests.app.interfaces.test_modbus_tcp import Owner, read_cycle, row_of
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.asyncio
 GONE = CODES.BadOutOfService
@@ -484,20 +485,39 @@ async def test_the_state_of_the_line_its_groups_and_its_nodes_is_shown() -> None
     await story.end()
 
 
-async def test_a_line_is_shown_until_it_is_cancelled() -> None:
+async def test_each_change_of_a_line_is_shown_at_once_until_it_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opcua, "LOOK_EVERY", PATIENCE)
     story = Story(row_of("1"))
 
     async def begin() -> None:
         """Make nothing."""
 
     story.shown.begin = begin  # type: ignore[attr-defined]  # of the subclass
+
+    async def shows(key: str, value: Any, status: str) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while key not in story.shown.values or story.shown.state(key) != [(value, status)]:  # noqa: ASYNC110
+                await asyncio.sleep(0)
+
     running = asyncio.ensure_future(story.server.run())
     await story.server.has_points.wait()
     story.owner.groups["axes"].cycles.put_nowait(read_cycle(1.0))
-    while "winder/1" not in story.shown.values:  # noqa: ASYNC110  nothing reports it
-        await asyncio.sleep(0)
+    await shows("winder/1", 1.0, "Good")
     story.line._receive_touched(touched("1", 100.5))
-    while story.shown.state("winder/1") != [(1.0, "UncertainLastUsableValue")]:  # noqa: ASYNC110  nothing reports it
+    await shows("winder/1", 1.0, "UncertainLastUsableValue")
+    await shows("Line Backlog", 3, "Good")
+    story.line.picture.frame = shown_frame(points=1, backlog=4)
+    for receive in list(story.line._listeners):
+        receive("frame", {})
+    await shows("Line Backlog", 4, "Good")
+    story.line._remote = None
+    story.line._change(Lost("gone"))
+    await shows("winder/1", None, "BadOutOfService")
+    await shows("Line Connected", False, "Good")
+    story.replace_owner(7.0)
+    story.line._change(Connected({"read_only": False, "name": "slitter"}))
+    await shows("Line Connected", True, "Good")
+    while "axes" not in story.owner.groups:  # noqa: ASYNC110  nothing reports it
         await asyncio.sleep(0)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
