@@ -140,7 +140,6 @@ class Assembler:
     def attempted(self, attempt: Attempt) -> None:
         """Process the end of an attempt."""
         if attempt is self._exchange.attempt:  # that of an exchange before was read from the attempt itself
-            self._now = max(self._now, attempt.ended_at)
             self._rest()
             self._release()
 

@@ -343,6 +343,13 @@ def test_a_protocol_that_nobody_knows_here_is_recorded_as_it_passed() -> None:
     assert [packet.micros for packet in tape.packets] == [101_000_000, 101_010_000, 101_020_000]
 
 
+def test_an_exchange_of_an_unknown_protocol_without_a_verdict_is_not_judged() -> None:
+    tape = Tape()
+    tape.asked(1.0, replace(hcp2.PROFILE, name="of my own"), hcp2.Read(1), 2)
+    tape.heard(1.01, VALUE)
+    assert tape.lines() == [(HOST, READ, NONE, ""), (NODE, VALUE, NONE, "")]
+
+
 def test_overheard_bytes_without_a_known_protocol_have_the_times_at_which_they_passed() -> None:
     tape = Tape()
     tape.overheard(1.0, READ)
@@ -391,6 +398,17 @@ def test_a_line_that_is_only_listened_to_is_recorded_the_same() -> None:
         untold.overheard(now + 0.01, reply[1:])
     assert [line[1:3] for line in untold.lines()] == [line[1:3] for line in told.lines()]
     assert {packet.transaction for packet in untold.packets} == {0}
+
+
+def test_that_nothing_replied_has_the_time_at_which_it_was_known() -> None:
+    tape = Tape("hcp2")
+    tape.overheard(1.0, READ)
+    tape.overheard(2.0, READ)
+    tape.assembler.idle(5.0)
+    tape.overheard(6.0, READ)
+    assert [line[2] for line in tape.lines()] == [NONE, NO_REPLY] * 3
+    times = [packet.micros / 1e6 - 100.0 for packet in tape.packets]
+    assert times == [1.0, 2.0, 2.0, 5.0, 6.0, 9.0]
 
 
 def test_a_damaged_request_on_a_line_that_is_only_listened_to_has_its_fault_as_a_comment() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.capture.pcapng import CaptureError, Outcome, Packet, PcapngWriter, read_packets
+from busmaster.capture.pcapng import CaptureError, CutOff, Outcome, Packet, PcapngWriter, read_packets
 from busmaster.contract.frames import Direction
 from busmaster.registry import kinds
 
@@ -115,6 +115,24 @@ def test_a_big_endian_file_in_nanoseconds_is_read_too() -> None:
 def test_a_file_that_is_no_capture_of_ours_is_refused(data: bytes, complaint: str) -> None:
     with pytest.raises(CaptureError, match=complaint):
         list(read_packets(io.BytesIO(data)))
+
+
+def test_the_packets_before_the_place_where_a_file_is_cut_are_read() -> None:
+    """The recorder was killed, or after a loss of power the rest of the file is zeros."""
+    packets = [Packet(number, "hcp2", NODE, b"\x06", 5, transaction=number) for number in (1, 2, 3)]
+    whole = written(*packets)
+    [last] = struct.unpack("<I", whole[-4:])
+    for lost in range(1, last):
+        for rest in (b"", bytes(400)):
+            found: list[Packet] = []
+            with pytest.raises(CutOff, match="cut in mid-block"):
+                found.extend(read_packets(io.BytesIO(whole[:-lost] + rest)))
+            # the last three bytes of a block are zeros anyway
+            assert found == packets[: 3 if rest and lost <= 3 else 2], (lost, rest)
+
+
+def test_a_packet_of_no_known_protocol_is_read_back() -> None:
+    assert list(read_packets(io.BytesIO(written(EMPTY)))) == [EMPTY]
 
 
 @pytest.mark.parametrize(

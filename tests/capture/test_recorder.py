@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from busmaster.capture import recorder
 from busmaster.capture.files import CaptureFiles
-from busmaster.capture.pcapng import Outcome, read_packets
+from busmaster.capture.pcapng import CaptureError, Outcome, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.contract.tap import Attempt, Verdict
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.app.outputs.cycles import until
+from tests.patience import PATIENCE
 
 READ = hcp2.Read(1)
 REQUEST = READ.open(2, hcp2.PROFILE.timings).request
@@ -100,6 +103,35 @@ def test_a_full_disk_stops_the_capture_and_nothing_else() -> None:
     assert tap.dropped > 0
 
 
+def test_a_disk_that_has_room_again_when_the_recorder_is_closed_gets_all_that_waited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Disk(CaptureFiles):
+        is_full = True
+
+        def flush(self) -> None:
+            if Disk.is_full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            super().flush()
+
+    monkeypatch.setattr(recorder, "CaptureFiles", Disk)
+    monkeypatch.setattr(recorder, "TICK", 0.001)
+    monkeypatch.setattr(recorder, "RETRY", PATIENCE)
+    said: list[str] = []
+    with Recorder(tmp_path / "line.pcapng", report=said.append) as tap:
+        tap.transmitted(time.monotonic(), REQUEST, attempt())
+        until(lambda: tap.error is not None)
+        tap.transmitted(time.monotonic(), REQUEST, attempt())
+        Disk.is_full = False
+    with (tmp_path / "line.pcapng").open("rb") as file:
+        assert sum(packet.frame == REQUEST for packet in read_packets(file)) == 2
+    assert (tap.error, tap.dropped) == (None, 0)
+    assert said == [
+        f"the capture rests: {tap.path}: No space left on device",
+        f"the capture goes on: {tap.path}; nothing is lost",
+    ]
+
+
 def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Recorder(tmp_path / "nowhere" / "line.pcapng")
@@ -116,11 +148,16 @@ def test_a_capture_of_a_silent_line_is_on_disk_before_it_is_closed(
     monkeypatch.setattr(recorder, "TICK", 0.001)
     monkeypatch.setattr(recorder, "IDLE", 0.01)
     path = tmp_path / "line.pcapng"
+
+    def silences() -> int:
+        with path.open("rb") as file, suppress(CaptureError):  # it is being written
+            return sum(packet.outcome is Outcome.NO_REPLY for packet in list(read_packets(file)))
+        return 0
+
     with Recorder(path, protocol="hcp2") as tap:
-        for _ in range(2):  # the silence is noticed each time
-            size = path.stat().st_size
+        for number in (1, 2):  # the silence is noticed each time
             tap.overheard(time.monotonic(), REQUEST)
-            until_larger(path, size)
+            until(lambda number=number: silences() == number)  # type: ignore[misc]
     with path.open("rb") as file:
         packets = list(read_packets(file))
     assert [(packet.protocol, packet.frame, packet.outcome) for packet in packets] == [

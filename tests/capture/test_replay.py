@@ -291,6 +291,34 @@ def test_the_masters_own_verdict_is_what_counts() -> None:
     assert (str(one.recorded), str(one.now)) == ("no reply: read element 105: no reply", "ok: 4096.0")
 
 
+@pytest.mark.parametrize(
+    ("replies", "recorded_", "now"),
+    [
+        ((), Verdict.GARBLED, "no reply"),
+        (("02 36 39 34",), Verdict.GARBLED, ""),
+        (("02 36 39 34",), Verdict.NO_REPLY, ""),
+    ],
+)
+def test_that_nothing_was_received_and_that_it_was_damaged_differ_if_there_were_no_bytes(
+    replies: tuple[str, ...], recorded_: Verdict, now: str
+) -> None:
+    one = told(recorded_, "whatever", *read(*replies))
+    assert one.judged
+    assert one.changed is bool(now)
+    assert str(one.now).startswith(now)
+
+
+def test_frames_that_came_in_one_piece_are_read_together() -> None:
+    packet = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
+    for replies, now in (
+        ([f"{NAK} {packet}"], "garbled: 19 bytes that are not a packet"),
+        ([NAK, packet], "garbled: a packet for another request"),
+    ):
+        one = told(Verdict.GARBLED, "whatever", *exchange(msc.DataRead(2008), 1, MSC, *replies))
+        assert not one.changed
+        assert str(one.now).startswith(now)
+
+
 def test_an_answer_that_was_not_believed_is_read_as_one_and_still_not_believed() -> None:
     one = told(Verdict.AMBIGUOUS, "two replies received, one expected", *read(VALUE))
     assert one.judged

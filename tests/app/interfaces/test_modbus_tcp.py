@@ -411,18 +411,45 @@ def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
         serving = asyncio.ensure_future(modbus_tcp.serve(values, Rules(), listen, opened.set_result, print))
         async with asyncio.timeout(PATIENCE):
             host, _, port = (await opened).rpartition(":")
-            reader, writer = await asyncio.open_connection(host, int(port))
-            writer.write(frame(b"\x63"))  # there is no such function
-            assert (await reader.readexactly(9))[7:] == b"\xe3\x01"
+            ends = [await asyncio.open_connection(host, int(port)) for _ in range(2)]
+            for reader, writer in ends:
+                writer.write(frame(b"\x63"))  # there is no such function
+                assert (await reader.readexactly(9))[7:] == b"\xe3\x01"
             serving.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await serving
-            assert await is_closed(reader)
-            writer.transport.abort()
+            for reader, writer in ends:
+                assert await is_closed(reader)
+                writer.transport.abort()
             with pytest.raises(ConnectionRefusedError):
                 await asyncio.open_connection(host, int(port))
 
     asyncio.run(run())
+
+
+def test_the_time_without_a_request_is_the_one_that_the_server_is_given() -> None:
+    async def forever() -> None:
+        await asyncio.get_running_loop().create_future()
+
+    async def run() -> None:
+        opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        line: Any = SimpleNamespace(follow=forever, on_state=lambda _: None)
+        values: Any = SimpleNamespace(run=forever, line=line)
+        listen = ("127.0.0.1", 0)
+        serving = asyncio.ensure_future(
+            modbus_tcp.serve(values, Rules(), listen, opened.set_result, reports.append, 0.05)
+        )
+        async with asyncio.timeout(PATIENCE):
+            host, _, port = (await opened).rpartition(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            assert await is_closed(reader)
+        writer.transport.abort()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+
+    reports: list[str] = []
+    asyncio.run(run())
+    assert reports == ["Modbus TCP connections closed: 1 (no request for 0.05 s)"]
 
 
 def test_what_a_server_refuses_is_reported_here_and_to_the_owner(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -463,6 +490,26 @@ def test_what_a_server_refuses_is_reported_here_and_to_the_owner(monkeypatch: py
         "1 write requests of Modbus TCP were refused",
         "Modbus TCP connections closed: 1 (not Modbus TCP)",
     ]
+
+
+def test_rights_are_of_an_address_and_bounds_and_refusals_of_its_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "peer_of", lambda host: f"the network of {host}")
+    peers: list[str] = []
+
+    class Noted(Echo):
+        async def reply(self, peer: str, unit: int, pdu: bytes) -> bytes:
+            peers.append(peer)
+            return await super().reply(peer, unit, pdu)
+
+    async def story(connect: Connect, _echo: Echo, _reports: list[str]) -> None:
+        reader, writer = await connect()
+        writer.write(frame(READ, transaction=0x1234, unit=2))
+        assert await reader.readexactly(len(frame(READ))) == frame(READ, transaction=0x1234, unit=2)
+        writer.write(frame(READ, protocol=1))
+        assert await is_closed(reader)
+
+    assert with_server(story, Noted()) == [("connections", "the network of 127.0.0.1")]
+    assert peers == ["127.0.0.1"]
 
 
 @pytest.mark.parametrize(
@@ -523,6 +570,62 @@ def test_a_client_that_does_not_read_its_replies_is_closed(monkeypatch: pytest.M
         assert "replies not read" in reports[0]
 
     assert with_server(story, Long()) == [("connections", "127.0.0.1")]
+
+
+def test_the_time_in_which_a_client_must_read_its_replies_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "GATEWAY_SEND_WITHIN", 0.01)
+
+    class Unread:
+        """The end of a client that reads nothing."""
+
+        def __init__(self) -> None:
+            self.transport = self
+            self.sent: list[bytes] = []
+            self.aborted = False
+
+        def get_extra_info(self, _name: str) -> tuple[str, int]:
+            return "10.0.0.1", 50_000
+
+        def set_write_buffer_limits(self, high: int) -> None:
+            """Have a small buffer."""
+
+        def write(self, data: bytes) -> None:
+            self.sent.append(data)
+
+        async def drain(self) -> None:
+            await asyncio.get_running_loop().create_future()
+
+        def abort(self) -> None:
+            self.aborted = True
+
+    async def run() -> Unread:
+        reader, writer = asyncio.StreamReader(), Unread()
+        reader.feed_data(2 * frame(READ))
+        note: Any = lambda *refusal: refused.append(refusal)  # noqa: E731
+        async with asyncio.timeout(PATIENCE):
+            await ModbusTcpServer(cast("Any", Echo()), reports.append, note).accept(reader, cast("Any", writer))
+        return writer
+
+    reports: list[str] = []
+    refused: list[tuple[str, str]] = []
+    writer = asyncio.run(run())
+    assert (writer.sent, writer.aborted) == ([frame(READ)], True)
+    assert reports == ["Modbus TCP connections closed: 1 (replies not read for 0.01 s)"]
+    assert refused == [("connections", "10.0.0.1")]
+
+
+def test_a_client_that_leaves_has_done_no_wrong_wherever_its_request_ends(caplog: pytest.LogCaptureFixture) -> None:
+    async def story(connect: Connect, _echo: Echo, reports: list[str]) -> None:
+        for sent in (b"", frame(READ)[:3], frame(READ)[:9], frame(READ)):
+            reader, writer = await connect()
+            writer.write(sent)
+            writer.write_eof()
+            with contextlib.suppress(ConnectionError):
+                assert await reader.read() == (sent if sent == frame(READ) else b"")
+        assert reports == []
+
+    assert with_server(story) == []
+    assert not caplog.records
 
 
 def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1466,7 +1569,11 @@ def test_every_entry_of_the_map_that_is_no_point_is_reported() -> None:
     asyncio.run(story())
 
 
-def test_the_values_follow_the_line_until_they_are_cancelled() -> None:
+def test_the_values_follow_each_change_of_the_line_at_once_until_they_are_cancelled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(modbus_tcp, "LOOK_EVERY", PATIENCE)
+
     async def story() -> None:
         owner = Owner()
         line = connected(owner)
@@ -1479,6 +1586,20 @@ def test_the_values_follow_the_line_until_they_are_cancelled() -> None:
                 await asyncio.sleep(0)
         line._receive_touched({"protocol": "hcp2", "address": 5, "when": 100.2, "items": ["1"], "all": False})
         assert values.look_up(["winder/1"]) == {"winder/1": (1.0, 1)}
+        show(line, row_of("1"), row_of("2"))
+        for method, points in (("rows", 3), ("frame", 2)):  # a part of the rows is still to come
+            assert "winder/2" not in values.rows
+            line.picture.frame = shown_frame(points=points)
+            for receive in list(line._listeners):
+                receive(method, {})
+            for _ in range(5):
+                await asyncio.sleep(0)
+        assert "winder/2" in values.rows
+        line._remote = None
+        line._change(Lost("gone"))
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert owner.groups["axes"].closes == 1
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         assert (line._listeners, line._watchers, line._touch_listeners) == ([], [], [])
@@ -1623,6 +1744,15 @@ def test_of_several_points_in_one_request_each_gets_its_own_registers_and_an_err
     assert answer("06 0000 0007") == bytes.fromhex("86 0b")
 
 
+def test_a_number_that_cannot_be_written_keeps_the_points_before_it_from_being_written() -> None:
+    given, answer, _, refused = answering(allow=("a/*",))
+    given.map = RegisterMap.of([Entry("a/x", 0, type="int16"), Entry("a/y", 1, type="float32")], False)
+    assert answer("10 0000 0003 06 0007 7fc0 0000") == bytes.fromhex("90 03")  # a NaN
+    assert (given.writes, refused) == ([], [])
+    assert answer("10 0000 0003 06 0007 3fc0 0000") == bytes.fromhex("10 0000 0003")
+    assert given.writes == [("axes", "a/x", 7), ("axes", "a/y", 1.5)]
+
+
 @pytest.mark.parametrize(
     ("rules", "peer", "code"),
     [
@@ -1632,6 +1762,9 @@ def test_of_several_points_in_one_request_each_gets_its_own_registers_and_an_err
         ({"allow": ("a/x",), "peers": (ipaddress.ip_network("10.0.0.0/8"),)}, "10.1.2.3", 0),
         ({"allow": ("a/x",), "units": frozenset((3,))}, "127.0.0.1", 0),
         ({"units": frozenset((3,))}, "127.0.0.1", 1),
+        ({}, "2001:db8::7", 1),
+        ({"allow": ("a/x",), "peers": (ipaddress.ip_network("2001:db8::7"),)}, "2001:db8::8", 1),
+        ({"allow": ("a/x",), "peers": (ipaddress.ip_network("2001:db8::7"),)}, "2001:db8::7", 0),
     ],
 )
 def test_a_write_that_is_not_allowed_is_refused_counted_and_reported(
@@ -1640,8 +1773,11 @@ def test_a_write_that_is_not_allowed_is_refused_counted_and_reported(
     given, answer, reports, refused = answering(**rules)
     assert answer("06 0000 0007", peer=peer) == bytes.fromhex(f"86 {code:02x}" if code else "06 0000 0007")
     assert len(given.writes) == (not code)
-    assert refused == ([("requests", peer)] if code else [])
-    assert any(text.startswith("1 write requests of Modbus TCP were refused") for text in reports) is bool(code)
+    network = "2001:db8::/64" if ":" in peer else peer
+    assert refused == ([("requests", network)] if code else [])
+    why = "--allow does not name the point, or --allow-from does not include the client"
+    refusal = f"1 write requests of Modbus TCP were refused, because {why}: 1 from {network}"
+    assert reports == [refusal if code else f"client {peer}: a/x = 7: written"]
     given.read_only = True
     assert answer("06 0000 0007", peer=peer) == bytes.fromhex("86 01")
 
@@ -1719,6 +1855,7 @@ def test_the_map_as_csv_has_the_unit_of_each_point_and_who_may_write_it() -> Non
 def test_values_are_rounded_to_registers_and_shown_with_the_digits_that_they_have() -> None:
     assert Entry("a/x", 0, type="int16").registers(2.6) == [3]
     assert Entry("a/x", 0, type="int16").registers(-2.6) == [0xFFFD]
+    assert Entry("a/on", 0, type="int16", scale=0.5).registers(True) == [2]
     assert Entry("a/x", 0).value(Entry("a/x", 0).registers(16777215)) == 16777215
     assert type(Entry("a/x", 0).value([0x40E0, 0])) is int  # a point of whole numbers is written 7 and not 7.0
     assert read_reply(1, 8 * [1]) == bytes.fromhex("01 01 ff")

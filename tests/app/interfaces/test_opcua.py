@@ -21,7 +21,7 @@ from busmaster.app.interfaces import opcua as interface
 from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua import serving
 from busmaster.app.interfaces.opcua_access import Rules
-from busmaster.app.interfaces.opcua_connections import OpcuaServer
+from busmaster.app.interfaces.opcua_connections import Acceptor, OpcuaServer
 from busmaster.app.service import overview
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.owner_messages import StreamMessage
@@ -118,6 +118,7 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
             return servers[-1]
 
         patch.setattr(interface, "OpcuaServer", made)
+        patch.setattr(interface, "LISTEN_AFTER", 0.0)  # no line is served yet
         folder, said = tmp_path_factory.mktemp("opcua"), list[str]()
         line = Following(lambda: f"unix:{folder}/line.sock")
         async with serving(line, Rules(allow=("5/1*", "1/*")), ("127.0.0.1", 0), said.append) as url:
@@ -273,6 +274,24 @@ async def test_a_value_is_written_in_each_type_that_means_it(
         assert await unit.read(item) == stored
         if item == "coil:5":
             assert await asyncio.to_thread(opened.client.type_of, "1/coil:5") == ("DataItemType", "DataItemType")
+
+
+async def test_a_point_shows_the_type_of_its_values_and_whether_they_are_lists(opened: Opened) -> None:
+    def types(*names: str) -> list[tuple[str, int]]:
+        nodes = [opened.client.node(name) for name in names]
+        kinds = [ua.ObjectIdNames[node.get_data_type().Identifier] for node in nodes]
+        return [(kind, int(node.get_value_rank())) for kind, node in zip(kinds, nodes, strict=True)]
+
+    line = Line(ModbusUnit.profile.line, [make_device("modbus", 1)], paced=False)
+    async with Bus(MemoryPort(line)) as bus, Service(bus, path=opened.folder / "line.sock"):
+        unit = ModbusUnit(bus, 1)
+        items = ("holding:20", "holding:30:3", "holding:40:float32", "coil:9")
+        bus.poll_group("press", period=0.02, points=[unit.point(item) for item in items])
+        for item in items:
+            await opened.is_(f"1/{item}", "Good")
+        assert await asyncio.to_thread(types, *(f"1/{item}" for item in items)) == [
+            *(("Int64", -1), ("Int64", 1), ("Double", -1), ("Boolean", -1))
+        ]
 
 
 async def test_cycles_that_the_interface_was_too_slow_for_are_counted(
@@ -484,6 +503,45 @@ async def test_nobody_comes_by_the_session_of_another(opened: Opened) -> None:
 
         await asyncio.to_thread(intrude)
         assert line.audit() == []
+
+
+async def test_clients_are_accepted_when_the_points_of_the_line_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(interface, "LISTEN_AFTER", PATIENCE)
+    monkeypatch.setattr(following, "FIRST_PAUSE", 0.001)
+    monkeypatch.setattr(following, "LONGEST_PAUSE", 0.001)
+    ports, end = list[int](), asyncio.Event()
+    urls: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    line, start = Following(lambda: f"unix:{tmp_path}/line.sock"), Acceptor.start
+
+    async def started(acceptor: Acceptor) -> None:
+        await start(acceptor)
+        ports.append(acceptor.port)
+
+    async def serve_line() -> None:
+        async with serving(line, Rules(), ("127.0.0.1", 0), lambda _: None) as url:
+            urls.set_result(url)
+            await end.wait()
+
+    def status(url: str) -> str:
+        with other_client(url) as client:
+            return client.read("5/10").status
+
+    monkeypatch.setattr(Acceptor, "start", started)
+    serving_it = asyncio.create_task(serve_line())
+    await until(lambda: "no program serves" in getattr(line.state, "why", ""))
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection("127.0.0.1", ports[0])
+    devices = [make_device("hcp2", 5)]
+    async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, devices, paced=False))) as bus:
+        bus.poll_group("axes", period=0.02, points=[Hcp2Controller(bus, 5).point("10")])
+        async with Service(bus, path=tmp_path / "line.sock"):
+            async with asyncio.timeout(PATIENCE):
+                url = await urls
+            assert await asyncio.to_thread(status, url) != "BadNodeIdUnknown"
+            end.set()
+            await serving_it
 
 
 @pytest.mark.slow

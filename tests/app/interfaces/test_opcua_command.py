@@ -9,8 +9,8 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -173,19 +173,53 @@ def test_clients_connect_to_an_ipv6_address_as_it_is_reported(monkeypatch: pytes
     asyncio.run(story())
 
 
-@pytest.mark.slow
-def test_a_port_that_is_in_use_leaves_no_task_and_no_thread() -> None:
+def test_a_port_that_is_in_use_leaves_no_task_and_no_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[tuple[str, str]] = []
+    load = opcua.load_certificate
+
+    async def load_certificate(server: Any, own: str, key: str) -> None:
+        await load(server, own, key)
+        loaded.append((own, key))
+
     async def story(address: tuple[str, int]) -> None:
-        tasks = asyncio.all_tasks()
+        tasks, line = asyncio.all_tasks(), Following(lambda: "unix:/nobody")
         with pytest.raises(OSError, match="in use"):
-            async with opcua.serving(Following(lambda: "unix:/nobody"), Rules(), address, lambda _: None):
+            async with opcua.serving(line, Rules(), address, lambda _: None, certificate=files):
                 pass
         assert asyncio.all_tasks() == tasks
 
+    monkeypatch.setattr(opcua, "load_certificate", load_certificate)
+    files = certificate(tmp_path / "own", "interface")
     threads = set(threading.enumerate())
     with socket.create_server(("127.0.0.1", 0)) as taken:
         asyncio.run(story(taken.getsockname()))
     assert set(threading.enumerate()) == threads
+    assert loaded == [files]
+
+
+def test_a_line_is_served_with_what_the_command_gives_until_it_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[tuple[Any, ...]] = []
+    urls: list[str] = []
+
+    @asynccontextmanager
+    async def serving(*what: Any, certificate: tuple[str, str] | None) -> AsyncIterator[str]:
+        served.append((*what, certificate))
+        yield "opc.tcp://127.0.0.1:4840/"
+        served.append(())
+
+    async def story() -> None:
+        what: Any = ("line", "rules", ("127.0.0.1", 0), urls.append, "report", ("own", "key"))
+        task = asyncio.ensure_future(opcua.serve(*what))
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert served == [("line", "rules", ("127.0.0.1", 0), "report", ("own", "key"))]
+        assert urls == ["opc.tcp://127.0.0.1:4840/"]
+        assert not task.done()
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    monkeypatch.setattr(opcua, "serving", serving)
+    asyncio.run(story())
 
 
 def read_certificate(path: str) -> x509.Certificate:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any, cast
@@ -24,6 +25,7 @@ from busmaster.bus.polling import Quality
 from busmaster.errors import InvalidCommand, LineDown, NoReply, NotStarted, WriteUnconfirmed
 from tests.app.interfaces.test_following import connected, row, shown_frame
 from tests.app.interfaces.test_modbus_tcp import Owner, read_cycle, row_of
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.asyncio
 GONE = CODES.BadOutOfService
@@ -154,7 +156,10 @@ async def test_each_point_has_the_value_and_status_of_its_last_read() -> None:
     assert story.server.has_points.is_set()
     assert story.shown.described["winder/2"] == "winder 2 (read winder/2)"
     # a value of a point that is not shown, 3, and one that has no type, before one that has
-    await story.show(read_cycle(1.5, NoReply("no reply"), 3.0, 4.5))
+    read = read_cycle(1.5, NoReply("no reply"), 3.0, 4.5)
+    await story.show(read)
+    times = {point.item: sample.wall for point, sample in read.samples.items()}
+    assert {key: story.shown.values[f"winder/{key}"][2] for key in "124"} == {key: times[key] for key in "124"}
     assert story.shown.state("winder/1", "winder/2", "winder/4") == [
         *((1.5, "Good"), (None, "BadNoCommunication"), (4.5, "Good"))
     ]
@@ -184,6 +189,22 @@ async def test_a_write_makes_the_value_of_its_point_uncertain_until_it_was_read_
     assert story.shown.state("winder/1", "winder/2") == [(1.0, "UncertainLastUsableValue"), (2.0, "Good")]
     await story.show(read_cycle(1.0, 2.0, at=100.6))
     assert story.shown.state("winder/1", "winder/2") == [(1.0, "Good"), (2.0, "Good")]
+    await story.end()
+
+
+async def test_a_value_that_was_requested_before_a_write_and_came_after_it_is_uncertain() -> None:
+    story = Story(row_of("1"), row_of("2"))
+    await story.show()
+    snapshot = read_cycle(1.0, 2.0)
+    later = {point: sample._replace(started=100.0, finished=100.4) for point, sample in snapshot.samples.items()}
+    late = replace(snapshot, samples=later)
+    await story.show(late)
+    assert story.shown.state("winder/1", "winder/2") == [(1.0, "Good"), (2.0, "Good")]
+    story.server._receive_touched(touched("1", 100.2))
+    await story.show()
+    assert story.shown.state("winder/1", "winder/2") == [(1.0, "UncertainLastUsableValue"), (2.0, "Good")]
+    await story.show(late)
+    assert story.shown.state("winder/1", "winder/2") == [(1.0, "UncertainLastUsableValue"), (2.0, "Good")]
     await story.end()
 
 
@@ -464,20 +485,39 @@ async def test_the_state_of_the_line_its_groups_and_its_nodes_is_shown() -> None
     await story.end()
 
 
-async def test_a_line_is_shown_until_it_is_cancelled() -> None:
+async def test_each_change_of_a_line_is_shown_at_once_until_it_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opcua, "LOOK_EVERY", PATIENCE)
     story = Story(row_of("1"))
 
     async def begin() -> None:
         """Make nothing."""
 
     story.shown.begin = begin  # type: ignore[attr-defined]  # of the subclass
+
+    async def shows(key: str, value: Any, status: str) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while key not in story.shown.values or story.shown.state(key) != [(value, status)]:  # noqa: ASYNC110
+                await asyncio.sleep(0)
+
     running = asyncio.ensure_future(story.server.run())
     await story.server.has_points.wait()
     story.owner.groups["axes"].cycles.put_nowait(read_cycle(1.0))
-    while "winder/1" not in story.shown.values:  # noqa: ASYNC110  nothing reports it
-        await asyncio.sleep(0)
+    await shows("winder/1", 1.0, "Good")
     story.line._receive_touched(touched("1", 100.5))
-    while story.shown.state("winder/1") != [(1.0, "UncertainLastUsableValue")]:  # noqa: ASYNC110  nothing reports it
+    await shows("winder/1", 1.0, "UncertainLastUsableValue")
+    await shows("Line Backlog", 3, "Good")
+    story.line.picture.frame = shown_frame(points=1, backlog=4)
+    for receive in list(story.line._listeners):
+        receive("frame", {})
+    await shows("Line Backlog", 4, "Good")
+    story.line._remote = None
+    story.line._change(Lost("gone"))
+    await shows("winder/1", None, "BadOutOfService")
+    await shows("Line Connected", False, "Good")
+    story.replace_owner(7.0)
+    story.line._change(Connected({"read_only": False, "name": "slitter"}))
+    await shows("Line Connected", True, "Good")
+    while "axes" not in story.owner.groups:  # noqa: ASYNC110  nothing reports it
         await asyncio.sleep(0)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import socket
 import struct
@@ -174,6 +175,40 @@ async def test_write_requests_beyond_the_bound_are_refused_until_others_have_the
         assert [value for _, _, value in waiting_requests] == [1.0, 2.0, 0.0, 1.0, 2.0], "in their order"
 
 
+async def test_the_waiting_writes_of_a_client_whose_connection_is_lost_are_not_carried_out(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+        go_on, requested = asyncio.Event(), list[float]()
+        write = opened.line.write
+
+        async def held(group: str, key: str, value: float) -> None:
+            requested.append(value)
+            await go_on.wait()
+            await write(group, key, value)
+
+        monkeypatch.setattr(opened.line, "write", held)
+        known = set(opened.server.acceptor.clients)
+        entered = other_client(opened.url)
+        client = await asyncio.to_thread(entered.__enter__)
+        [connection] = set(opened.server.acceptor.clients) - known
+        writing = [asyncio.create_task(asyncio.to_thread(client.write, "5/10", value)) for value in (1.0, 2.0)]
+        await until(lambda: connection.processor._writes.qsize() == 1)
+        client.client.keepalive.stop()
+        processor = connection.processor
+        connection.transport.abort()
+        await until(lambda: not processor.has_session)
+        go_on.set()
+        assert await opened.write("5/10", 3.0) == "Good"
+        assert (len(requested), requested[-1]) == (2, 3.0)
+        assert line.audit() == [("5/10", "written")]
+        await asyncio.gather(*writing, return_exceptions=True)
+        with contextlib.suppress(Exception):
+            await asyncio.to_thread(entered.__exit__, None, None, None)
+
+
 async def test_a_session_ends_after_the_writes_before_it(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     async with opened.owned() as line:
         line.poll("10")
@@ -219,8 +254,19 @@ async def test_a_connection_with_many_requests_is_read_again_when_these_have_the
     async with opened.owned() as line:
         line.poll("10")
         await opened.is_("5/10", "Good")
+        [connection] = [one for one in opened.server.acceptor.clients if one.processor.has_session]
+        pauses: list[int] = []
+        pause = connection.transport.pause_reading
+
+        def noted() -> None:
+            pauses.append(connection.messages.qsize())
+            pause()
+
+        monkeypatch.setattr(connection.transport, "pause_reading", noted)
         for _ in range(3):
             assert (await asyncio.to_thread(opened.client.read, "5/10")).status == "Good"
+        assert len(pauses) >= 3
+        assert min(pauses) >= 1
 
 
 async def test_monitored_items_beyond_the_bounds_are_refused(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,6 +307,8 @@ def closes(address: tuple[str, int], sent: bytes) -> int:
         pytest.param(b"MSGF" + struct.pack("<I", 1 << 30) + bytes(100), id="a chunk of 1 GB"),
         pytest.param(b"MSGC" + struct.pack("<III", 32, 0, 0) + bytes(16), id="a message before the channel"),
         pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="another protocol"),
+        pytest.param(b"HELF" + struct.pack("<I", 16) + b"\xff" * 8, id="a Hello of something else"),
+        pytest.param(b"OPNF" + struct.pack("<I", 64) + b"\xff" * 56, id="a channel of something else"),
     ],
 )
 async def test_a_message_that_is_too_long_or_out_of_order_ends_its_connection(opened: Opened, sent: bytes) -> None:
@@ -268,9 +316,9 @@ async def test_a_message_that_is_too_long_or_out_of_order_ends_its_connection(op
     await asyncio.to_thread(closes, (host, int(port)), sent)
 
 
-def hello(receive: int, send: int) -> bytes:
+def hello(receive: int, send: int, url: bytes = b"") -> bytes:
     """A Hello with these sizes of buffers, in bytes."""
-    return b"HELF" + struct.pack("<IIIIIIi", 32, 0, receive, send, 0, 0, -1)
+    return b"HELF" + struct.pack("<IIIIIIi", 32 + len(url), 0, receive, send, 0, 0, len(url) or -1) + url
 
 
 @pytest.mark.parametrize(
@@ -280,6 +328,11 @@ def hello(receive: int, send: int) -> bytes:
         pytest.param(hello(8_191, 65_536), 0, id="a client that receives short chunks"),
         pytest.param(hello(65_536, 8_191), 0, id="a client that sends short chunks"),
         pytest.param(hello(8_192, 8_192) * 2, 1, id="the shortest buffers that are taken"),
+        pytest.param(
+            hello(65_536, 65_536, (bounds.LONGEST_OPCUA_HELLO - 32) * b"x") + hello(65_536, 65_536),
+            1,
+            id="the longest Hello that is taken",
+        ),
     ],
 )
 async def test_a_second_hello_and_one_with_too_short_buffers_end_the_connection(
@@ -296,6 +349,22 @@ async def test_a_second_hello_and_one_with_too_short_buffers_end_the_connection(
             return found
 
     assert (await asyncio.to_thread(received)).count(b"ACKF") == acknowledged
+
+
+async def test_the_reply_to_a_hello_has_the_bounds_of_messages(opened: Opened) -> None:
+    host, _, port = opened.url.removeprefix("opc.tcp://").rstrip("/").rpartition(":")
+
+    def received() -> tuple[int, ...]:
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+            connection.sendall(hello(1 << 24, 1 << 24))
+            reply = connection.recv(28, socket.MSG_WAITALL)
+            assert reply[:4] == b"ACKF"
+            return struct.unpack("<IIII", reply[12:])
+
+    receive, send, message, chunks = await asyncio.to_thread(received)
+    assert (receive, send) == (bounds.LONGEST_OPCUA_CHUNK, bounds.LONGEST_OPCUA_CHUNK)
+    assert message == bounds.LONGEST_OPCUA_REQUEST
+    assert chunks * 8_192 > message > (chunks - 2) * 8_192, "also for a client with the shortest chunks"
 
 
 async def test_a_message_that_arrives_byte_by_byte_is_one(opened: Opened) -> None:

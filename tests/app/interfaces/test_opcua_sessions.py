@@ -24,6 +24,7 @@ from busmaster.app.interfaces.opcua_access import Rules, Writes, guard
 from busmaster.app.interfaces.opcua_connections import Requests
 from busmaster.app.interfaces.opcua_sessions import Session, use_sessions
 from busmaster.app.interfaces.opcua_terms import CODES
+from busmaster.app.service.permission import digest_of
 
 pytestmark = pytest.mark.asyncio
 NUMBER, OTHER, TEXT, UNKNOWN = (ua.NodeId(name, 2) for name in ("number", "other", "text", "unknown"))
@@ -98,10 +99,16 @@ def clients() -> Clients:
 
 
 def item(
-    node: ua.NodeId = NUMBER, filter_: Any = None, *, queue: int = 10, attribute: Any = ua.AttributeIds.Value
+    node: ua.NodeId = NUMBER,
+    filter_: Any = None,
+    *,
+    queue: int = 10,
+    attribute: Any = ua.AttributeIds.Value,
+    part: str | None = None,
+    encoding: str | None = None,
 ) -> ua.MonitoredItemCreateRequest:
     wanted = ua.MonitoredItemCreateRequest()
-    wanted.ItemToMonitor = ua.ReadValueId(node, attribute)
+    wanted.ItemToMonitor = ua.ReadValueId(node, attribute, part, ua.QualifiedName(encoding))
     wanted.MonitoringMode = ua.MonitoringMode.Reporting
     wanted.RequestedParameters = ua.MonitoringParameters(ClientHandle=3, Filter=filter_, QueueSize=queue)
     return wanted
@@ -144,6 +151,25 @@ async def test_a_session_has_a_bounded_number_of_subscriptions_whatever_others_h
     await one.delete_subscriptions([first.SubscriptionId])
     assert await code_of(clients.subscribe(one)) == ""
     await clients.end()
+
+
+async def test_a_failed_login_is_of_the_address_of_its_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    server: Any = Guarded(has_key=False)
+    failed: list[str] = []
+
+    async def write(*_: object) -> int:
+        return int(CODES.Good)
+
+    guard(server, Rules(secrets={"scada": digest_of("0123456789abcdef")}), write, failed.append)
+    server.iserver.supported_tokens = (ua.UserNameIdentityToken,)
+    server.iserver.decrypt_user_token = lambda _session, _token: ("scada", "wrong")
+    for address in ("10.0.0.1", "10.0.0.2"):
+        session = server.iserver.create_session((address, 50_000))
+        login = ua.ActivateSessionParameters(UserIdentityToken=ua.UserNameIdentityToken())
+        assert await code_of(lambda session=session, login=login: session.activate_session(login, None)) == (
+            "BadUserAccessDenied"
+        )
+    assert failed == ["10.0.0.1", "10.0.0.2"]
 
 
 async def test_a_session_that_was_not_activated_ends_with_its_connection(clients: Clients) -> None:
@@ -277,8 +303,10 @@ async def test_the_access_of_a_user_is_without_writing_for_one_that_may_not_writ
     session = clients.session()
     attributes = (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel, ua.AttributeIds.Value)
     reads = [ua.ReadValueId(NUMBER, attribute) for attribute in attributes]
-    of_point, of_user, value = await session.read(ua.ReadParameters(NodesToRead=reads))
+    reads.append(ua.ReadValueId(ua.NodeId("gone", 2), ua.AttributeIds.UserAccessLevel))
+    of_point, of_user, value, gone = await session.read(ua.ReadParameters(NodesToRead=reads))
     assert (of_point.Value.Value, of_user.Value.Value, value.Value.Value) == (of_a_point, access, 1.0)
+    assert gone.StatusCode.name == "BadNodeIdUnknown"
 
 
 async def test_items_are_bounded_in_all_subscriptions_of_a_session_and_in_all_sessions(
@@ -306,6 +334,8 @@ async def test_items_are_bounded_in_all_subscriptions_of_a_session_and_in_all_se
         (item(), "Good"),
         (item(TEXT), "Good"),
         (item(ua.NodeId("gone", 2)), "BadNodeIdUnknown"),
+        (item(part="0:1"), "BadIndexRangeInvalid"),
+        (item(encoding="Default XML"), "BadDataEncodingUnsupported"),
         (item(filter_=deadband(0.0, ua.DeadbandType.None_)), "Good"),
         (item(TEXT, deadband(0.0, ua.DeadbandType.None_)), "Good"),
         (item(filter_=deadband(0.0)), "Good"),

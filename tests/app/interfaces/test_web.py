@@ -602,13 +602,14 @@ async def test_the_wire_is_looked_at_again_when_the_owner_is_back(tmp_path: Path
                 assert tapped(line)
 
 
-@pytest.mark.parametrize("text", ["{", '{"exchanges": 1}', "x" * 2000])
+@pytest.mark.parametrize(("text", "code"), [("{", 1008), ('{"exchanges": 1}', 1008), ("x" * 2000, 1009)])
 @pytest.mark.asyncio
-async def test_a_page_that_says_anything_else_is_let_go(tmp_path: Path, text: str) -> None:
+async def test_a_page_that_says_anything_else_is_let_go(tmp_path: Path, text: str, code: int) -> None:
     async with page(tmp_path) as of, stream_of(of) as stream:
         await stream.send(text)
         with pytest.raises(ConnectionClosed):
             await hear(stream, "farewell")
+        assert stream.close_code == code
         assert (await of.client.get("/api/line")).status_code == 200
 
 
@@ -724,8 +725,12 @@ class Local:
         self.line.picture._rows = {0: list(rows or (row(value=7, writable=True),))}
         self.line.picture.frame = shown_frame(events=((90.0, "winder is down"),))
         self.reports: list[str] = []
-        guarded = application(self.line, Guard(HERE, secrets or {}), self.reports.append, history)
-        self.client = httpx.AsyncClient(transport=httpx.ASGITransport(app=guarded), base_url="http://localhost")
+        self.application = application(self.line, Guard(HERE, secrets or {}), self.reports.append, history)
+        self.client = self.client_at("127.0.0.1")
+
+    def client_at(self, address: str) -> httpx.AsyncClient:
+        transport = httpx.ASGITransport(app=self.application, client=(address, 50_000))
+        return httpx.AsyncClient(transport=transport, base_url="http://localhost")
 
     async def get(self, path: str) -> Any:
         answer = await self.client.get(f"/api/{path}")
@@ -757,6 +762,21 @@ async def test_times_of_the_line_are_times_of_day_and_none_while_they_are_unknow
     of.line.state = Lost("gone", since=900.0)
     said = await of.get("line")
     assert (said["connected"], said["since"], said["why"]) == (False, 900.0, "gone")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [
+        ("POST", "/api/points/axes/winder/10", {"GET", "HEAD", "PUT"}),
+        ("PUT", "/api/line", {"GET", "HEAD"}),
+        ("POST", "/page/page.js", {"GET", "HEAD"}),
+    ],
+)
+@pytest.mark.asyncio
+async def test_another_method_is_refused_with_those_that_there_are(method: str, path: str, allowed: set[str]) -> None:
+    answer = await Local().client.request(method, path)
+    assert (answer.status_code, answer.json()["error"]) == (405, "NotServed")
+    assert set(answer.headers["allow"].split(", ")) == allowed
 
 
 @pytest.mark.asyncio
@@ -819,6 +839,9 @@ async def test_points_are_not_known_in_the_moment_in_which_the_owner_is_found() 
     answer = await of.client.get("/api/points/axes/winder/10")
     assert answer.status_code == 503
     assert "not known yet: its program was found a moment ago" in answer.json()["what"]
+    assert await of.get("events") == []
+    said = await of.get("line")
+    assert (said["connected"], said["since"], said["frame"]) == (True, None, None)
 
 
 @pytest.mark.parametrize(
@@ -887,6 +910,26 @@ async def test_who_waits_as_long_as_the_reply_advises_can_log_in(monkeypatch: py
 
 
 @pytest.mark.asyncio
+async def test_a_client_that_guesses_tokens_does_not_lock_out_another_address() -> None:
+    of = Local(secrets={"hmi": digest_of(TOKEN)})
+    while (await of.put(authorization="Bearer wrong")).status_code == 401:
+        pass
+    assert (await of.put(authorization=f"Bearer {TOKEN}")).status_code == 429
+    of.client = of.client_at("10.0.0.2")
+    assert (await of.put(authorization=f"Bearer {TOKEN}")).status_code == 200
+    assert of.reports[-1] == "winder/10 = 1, from token hmi from 10.0.0.2: written"
+
+
+@pytest.mark.asyncio
+async def test_the_first_and_the_last_time_and_the_least_number_of_samples_can_be_requested() -> None:
+    past = Past()
+    of = Local(history=past)
+    found = await of.get("history/axes/winder/10?from=0&to=100000000000&limit=1")
+    assert past.requests == [("winder/10", "", 0.0, 1e11, 1)]
+    assert (found["from"], found["to"]) == (0.0, 1e11)
+
+
+@pytest.mark.asyncio
 async def test_history_is_requested_in_the_unit_of_the_point_for_the_last_hour_unless_it_has_a_range() -> None:
     past = Past(History(labels=(("1", "jog"),)))
     of = Local(row(unit="mm"), history=past)
@@ -912,6 +955,35 @@ async def test_pages_beyond_the_bound_are_refused_until_another_one_has_left(
             with pytest.raises(InvalidStatus, match="403"):
                 await stream_of(of)
             await stream.close()
+
+
+@pytest.mark.asyncio
+async def test_a_page_that_has_left_leaves_no_task(tmp_path: Path) -> None:
+    async with page(tmp_path) as of:
+        await of.client.get("/api/line")
+        before = len(asyncio.all_tasks())
+        async with stream_of(of) as stream:
+            await hear(stream, "state")
+        await until(lambda: len(asyncio.all_tasks()) <= before)
+
+
+@pytest.mark.asyncio
+async def test_the_server_ends_though_a_reply_is_not_ready_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "CLOSE_WITHIN", 0.01)
+    past = Past()
+    past.held.clear()
+    of = Local(history=past)
+    try:
+        async with (
+            asyncio.timeout(PATIENCE),
+            serving(of.application, HERE) as url,
+            httpx.AsyncClient(base_url=url, timeout=PATIENCE, trust_env=False) as client,
+        ):
+            waiting = asyncio.ensure_future(client.get("/api/history/axes/winder/10"))
+            await until(lambda: past.requests)
+        await asyncio.gather(waiting, return_exceptions=True)
+    finally:
+        past.held.set()
 
 
 async def joined(of: Page) -> ClientConnection:
