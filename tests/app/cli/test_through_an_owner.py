@@ -18,9 +18,10 @@ import click
 import pytest
 
 from busmaster import Priority
-from busmaster.app.cli import output, poll, reaching, status, top, write
+from busmaster.app.cli import output, poll, reaching, safe, status, top, write
 from busmaster.app.cli.arguments import Connection
 from busmaster.app.cli.ending import SIGNALS
+from busmaster.app.cli.output import Level
 from busmaster.app.cli.parsing import Assignment
 from busmaster.app.service.folder import Owner
 from busmaster.app.service.remote import RemoteBus, connect
@@ -404,6 +405,59 @@ def test_a_process_that_does_not_reply_makes_the_status_1_and_another_line_is_li
     assert "none.sock" in ran.lines[1]
 
 
+class Asked:
+    """The owner of a line whose port is lost, or of an older version, which does not report all of its counts."""
+
+    def __init__(self, **different: Any) -> None:
+        nodes = [{"health": health} for health in ("up", "suspect", "up")]
+        self.about = {"nodes": nodes, "tcp": "tcp://127.0.0.1:7420", "clients": 3, "refused_requests": 2, **different}
+
+    async def __aenter__(self) -> Asked:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    async def statistics(self) -> Any:
+        return SimpleNamespace(utilisation=0.25)
+
+
+@pytest.mark.parametrize(
+    ("different", "state", "up", "row"),
+    [({}, "ready", 2, ["2", "25.0%", "2/3"]), ({"state": "offline"}, "offline", 0, ["2", "offline", "0/3"])],
+)
+def test_of_a_line_that_is_offline_no_node_is_up(
+    busmaster: Command,
+    owners: list[Owner],
+    monkeypatch: pytest.MonkeyPatch,
+    different: dict[str, Any],
+    state: str,
+    up: int,
+    row: list[str],
+) -> None:
+    owners.append(Owner("slitter", "/dev/ttyUSB0", "/run/slitter.sock", 7))
+    monkeypatch.setattr(status, "connect", lambda address: Asked(**different))
+    assert without_time(busmaster("status", "--json").out) == {
+        "name": "slitter",
+        "port": "/dev/ttyUSB0",
+        "address": "unix:/run/slitter.sock",
+        "process": 7,
+        "tcp": "tcp://127.0.0.1:7420",
+        "programs": 2,
+        "utilisation": 0.25,
+        "state": state,
+        "refused_connections": None,
+        "refused_requests": 2,
+        "failed_logins": None,
+        "up": up,
+        "nodes": 3,
+        "error": None,
+    }
+    ran = busmaster("status")
+    assert (ran.status, ran.err) == (0, "busmaster: slitter: 2 requests refused\n")
+    assert ran.lines[1].split() == ["slitter", "/dev/ttyUSB0", "7", *row]
+
+
 def test_what_each_line_has_refused_is_reported(
     busmaster: Command, owners: list[Owner], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -614,6 +668,25 @@ def test_the_owner_sends_its_safe_state_and_is_not_recorded(
         ran = busmaster("safe", str(other))
         assert (ran.status, ran.out) == (2, "")
         assert held(three_controllers, 10) == [15]
+
+
+def test_a_safe_state_has_a_place_of_its_own_at_the_owner_and_a_missing_recording_is_a_warning(
+    busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.write_text(file.read_text() + SAFE)
+    connected: list[dict[str, Any]] = []
+    noted: list[Level] = []
+
+    def counted(address: str, **options: Any) -> RemoteBus:
+        connected.append(options)
+        return connect(address, **options)
+
+    monkeypatch.setattr(safe, "connect", counted)
+    monkeypatch.setattr(safe, "note", lambda text, level: noted.append(level))
+    with owner_here(file):
+        assert busmaster("safe", str(file), "--capture", "x.pcapng").status == 0
+    assert connected == [{"safe_only": True}]  # though programs have taken all other places
+    assert noted == [Level.WARNING]
 
 
 def test_the_safe_state_goes_to_the_given_port_and_only_to_the_owner_of_that_port(
