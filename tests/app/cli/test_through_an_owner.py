@@ -516,7 +516,7 @@ def test_top_names_the_lines_of_which_one_is_to_be_named(owners: list[Owner], mo
     with pytest.raises(LineDown, match="no running line of this user"):
         top.address_of(None)
     owners += [Owner(name, f"/dev/{name}", f"/run/{name}.sock", 1) for name in ("one", "two", "closed")]
-    monkeypatch.setattr(os, "access", lambda path, mode: "closed" not in str(path))
+    monkeypatch.setattr(os, "access", lambda path, mode: mode == os.F_OK or "closed" not in str(path))
     with pytest.raises(click.UsageError, match=r"several lines are running; name one of one, two$"):
         top.address_of(None)
     del owners[1]
