@@ -874,6 +874,27 @@ def test_the_options_of_a_read_reach_each_item(
     assert requested == [("1.17", {}), ("1.18", {})]
 
 
+@pytest.mark.parametrize("decimals", [0, 1])
+def test_a_number_of_decimals_is_that_of_each_item_of_a_write(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, decimals: int
+) -> None:
+    options: list[dict[str, Any]] = []
+    usual = Connection.open_handle
+
+    def open_handle(self: Connection, bus: Any, address: int) -> Any:
+        options.append(dict(self.options))
+        return usual(self, bus, address)
+
+    monkeypatch.setattr(Connection, "open_handle", open_handle)
+    nobody, items = ("socket://127.0.0.1:1", "--node", "12"), ("1.17=1", "1.18:2=2,3", "1.21=4,5")
+    ran = busmaster("write", *nobody, "--protocol", "mentor", *items, "--decimals", str(decimals))
+    assert (ran.status, ran.out) == (1, "")
+    assert options[-1] == {"decimals": dict.fromkeys(("1.17", "1.18", "1.19", "1.21", "1.22"), decimals)}
+    ran = busmaster("write", *nobody, *HCP2, "1=2", "--decimals", str(decimals))
+    assert ran.status == 2
+    assert "hcp2 sends the decimal point itself; leave out --decimals" in ran.err
+
+
 @pytest.mark.slow
 def test_the_decimals_of_a_write_are_those_of_each_item(busmaster: Command, mentor: TcpServer) -> None:
     node = (mentor.path, "--protocol", "mentor", "--node", "12")
