@@ -305,10 +305,21 @@ def test_a_poll_through_the_owner_prints_each_value_and_a_summary(
         assert all(0 <= cycle["due"] <= cycle["started"] + 0.001 < PATIENCE for cycle in cycles)
 
 
-def test_a_poll_through_the_owner_ends_by_itself_with_1_if_there_was_no_value(busmaster: Command, file: Path) -> None:
-    options = ("--nodes", "9", "--items", "1", "--period", "0.05", "--seconds", "0.2")
+def test_a_poll_through_the_owner_ends_by_itself_with_1_if_there_was_no_value(
+    busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ("--nodes", "9,12", "--items", "1,2", "--period", "0.05", "--seconds", "0.2")
+    requested: list[tuple[float, list[str]]] = []
+    usual = RemoteBus.poll_group
+
+    def poll_group(self: RemoteBus, name: str, *, period: float, points: Any, **more: Any) -> Any:
+        requested.append((period, [point.key for point in points]))
+        return usual(self, name, period=period, points=points, **more)
+
+    monkeypatch.setattr(RemoteBus, "poll_group", poll_group)
     with owner_here(file) as service:
         ran = busmaster("poll", service.address, *HCP2, *options)
+    assert requested == [(0.05, ["9/1", "9/2", "12/1", "12/2"])]
     assert ran.status == 1
     assert "no value was received" in ran.err
 
