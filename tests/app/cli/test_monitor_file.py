@@ -290,6 +290,19 @@ def test_a_reply_that_an_open_request_could_have_caused_is_no_value(
     assert [sample.value for sample in overheard_of(tmp_path, *pieces)] == values
 
 
+@pytest.mark.parametrize(
+    "passed",
+    [
+        pytest.param(b"\x07FF\x0200\x05\x07", id="element 0"),
+        pytest.param(b"\x07FF\x0229--1417\x03\x09", id="a value that is not a number"),
+    ],
+)
+def test_a_request_that_no_command_sends_is_open_and_does_not_end_the_listener(tmp_path: Path, passed: bytes) -> None:
+    for later, values in ((0.03, []), (5.0, [0.5])):
+        samples = overheard_of(tmp_path, (0, passed), (later, asked(2)), (later + 0.01, REPLY))
+        assert [sample.value for sample in samples] == values
+
+
 def test_a_request_is_open_while_its_reply_may_have_come_before_it_was_read(tmp_path: Path) -> None:
     late = MAX_REPLY_DELAY + 0.06
     pieces = [(0.0, asked(3)), (late, asked(2)), (late + 0.01, REPLY)]

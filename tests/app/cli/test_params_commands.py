@@ -148,6 +148,27 @@ def test_two_nodes_of_a_line_and_two_files_are_compared(
     assert busmaster("params", "diff", str(one), str(at)).status == 0
 
 
+def test_differences_are_a_table_with_the_values_flush_right(busmaster: Command, tmp_path: Path) -> None:
+    text = '"10" = {{ value = {}, name = "force", unit = "N" }}\n"11" = {{ value = {} }}'
+    one = str(written(tmp_path / "one.toml", text.format(1, 2000000)))
+    other = str(written(tmp_path / "other.toml", text.format(1250.5, 3)))
+    assert busmaster("params", "diff", one, other).lines == [
+        "ITEM  NAME       ONE   OTHER  UNIT",
+        "10    force        1  1250.5  N",
+        "11           2000000       3",
+    ]
+
+
+def test_an_item_is_what_each_of_two_nodes_calls_so(
+    busmaster: Command, file: Path, three_controllers: TcpServer
+) -> None:
+    spare = '[nodes.spare]\nprotocol = "hcp2"\naddress = 2\npoints.force = { item = "12" }\n'
+    file.write_text(file.read_text().replace("[groups.fast]", f"{spare}[groups.fast]"))
+    for nodes in (("winder", "spare"), ("spare", "winder")):
+        ran = busmaster("params", "diff", *(f"{node}@{file}" for node in nodes), "--items", "force")
+        assert (ran.status, {line.split()[0] for line in ran.lines[1:]}) == (1, {"10", "12"}), ran.err
+
+
 def test_nodes_of_two_ports_are_compared(
     busmaster: Command, controllers: TcpServer, three_controllers: TcpServer
 ) -> None:
@@ -248,7 +269,10 @@ def test_an_interrupted_save_reports_how_many_it_has_and_continues_with_the_othe
     Walk(monkeypatch, Found(ten, 5.0), Found(eleven, 6.0), Found(twelve, why="the port was lost"))
     assert f"2 of 3 are in {path}.part; the same command continues there" in busmaster(*save).err
     walk = Walk(monkeypatch, Found(twelve, 7.0))
+    counted: list[int] = []
+    monkeypatch.setattr("busmaster.app.cli.progress.Bar.advance", lambda _, count=1: counted.append(count))
     ran = busmaster(*save)
+    assert counted == [2, 1]  # the bar begins behind those that were read before
     assert ran.status == 0
     assert f"{path}.part: 2 of 3 were read before; continuing" in ran.err
     assert walk.requested == ["12"]
@@ -346,6 +370,28 @@ def test_what_a_limit_excludes_is_named_each_and_the_others_are_written(
     assert read_set(str(undo)).set.by == f"{getpass.getuser()}@{platform.node()}"
     dry = busmaster("params", "load", str(path), node, "--dry-run", "--undo", str(tmp_path / "other.toml"))
     assert dry.status == 1
+
+
+def test_a_load_reports_each_item_that_identifies_another_node(
+    busmaster: Command, controllers: TcpServer, tmp_path: Path
+) -> None:
+    path = written(tmp_path / "one.toml", '"10" = { value = 1 }', identity="{ firmware = 9, serial = 3 }")
+    ran = busmaster("params", "load", str(path), f"1@{controllers.path}", "--dry-run", *HCP2)
+    assert ran.status == 0, ran.err
+    reports = [line for line in ran.err.splitlines() if line.endswith("in the file")]
+    assert len(reports) == 1  # the node has no serial number to compare
+    assert re.fullmatch(r"busmaster: node 1: firmware is \d+, but 9 in the file", reports[0])
+
+
+def test_a_set_that_the_node_holds_is_loaded_without_a_question(
+    busmaster: Command, three_controllers: TcpServer, tmp_path: Path, requested: Callable[[bytes], None]
+) -> None:
+    preset(three_controllers, 5)
+    path = written(tmp_path / "one.toml", '"10" = { value = 5 }')
+    requested(b"n\n")
+    ran = busmaster("params", "load", str(path), f"1@{three_controllers.path}", "--enabled", *HCP2)
+    assert (ran.status, ran.out, ran.err) == (0, "", "busmaster: node 1: 0 to write, 1 equal, 0 excluded\n")
+    assert list(tmp_path.glob("*undo*")) == []
 
 
 def test_a_set_of_another_kind_of_node_is_not_loaded(

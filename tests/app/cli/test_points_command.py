@@ -104,6 +104,18 @@ def test_points_that_fit_into_the_terminal_are_a_table(busmaster: Command, path:
     ]
 
 
+@pytest.mark.usefixtures("narrow")
+def test_a_table_that_is_just_as_wide_as_the_terminal_is_shown_as_one(
+    busmaster: Command, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")
+    table = busmaster("points", str(path)).lines
+    width = max(map(len, table))
+    for columns, shown in ((width, True), (width - 1, False)):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert (busmaster("points", str(path)).lines == table) is shown
+
+
 def test_csv_on_a_terminal_is_printed_once_and_moves_no_cursor(
     busmaster: Command, path: Path, narrow: io.BytesIO
 ) -> None:

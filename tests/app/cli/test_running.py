@@ -83,6 +83,7 @@ def test_a_run_without_options_is_that_of_the_file(busmaster: Command, file: Pat
     assert sys.getswitchinterval() == usual
     assert handed.running._view == View()
     assert handed.running.watch.output is not None  # a full disk does not end it
+    assert handed.running.watch._of_file  # so advice about a late reply names the key of the file
 
 
 @pytest.mark.parametrize("command", ["run", "serve"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -136,3 +137,48 @@ def test_the_reply_window_of_the_option_is_that_of_each_node(
     monkeypatch.setattr(scan, "ask", ask)
     busmaster("scan", controllers.path, "--protocol", "hcp2", "--nodes", "7-8", "--timeout", "50")
     assert windows == [0.05, 0.05]
+
+
+def test_the_bar_counts_each_node_and_is_hidden_while_a_reply_is_printed(
+    busmaster: Command, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    happened: list[str | int] = []
+
+    @contextmanager
+    def hidden(_: object) -> Iterator[None]:
+        happened.append("hidden")
+        yield
+        happened.append("shown")
+
+    async def ask(node: Any) -> tuple[object, str] | None:
+        return None if node.address == 2 else (0, "it replies")
+
+    monkeypatch.setattr("busmaster.app.cli.progress.Bar.advance", lambda _, count=1: happened.append(count))
+    monkeypatch.setattr("busmaster.app.cli.progress.Bar.hidden", hidden)
+    monkeypatch.setattr(scan, "emit", happened.append)
+    monkeypatch.setattr(scan, "ask", ask)
+    busmaster("scan", controllers.path, "--protocol", "hcp2", "--nodes", "1-3", "--timeout", "50")
+    assert happened == ["hidden", "1 it replies", "shown", 1, 1, "hidden", "3 it replies", "shown", 1]
+
+
+@pytest.mark.parametrize("replying", [(1, 3), (1, 2, 3, 4)])
+def test_late_replies_are_waited_for_before_all_silent_nodes_are_tried_in_other_protocols(
+    busmaster: Command, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch, replying: tuple[int, ...]
+) -> None:
+    happened: list[Any] = []
+
+    async def ask(node: Any) -> tuple[object, str] | None:
+        return (0, "it replies") if node.address in replying else None
+
+    async def sleep(seconds: float) -> None:
+        happened.append(round(seconds, 3))
+
+    async def in_other_protocols(bus: Any, profile: Any, silent: list[int]) -> AsyncIterator[str]:
+        happened.append(silent)
+        yield "that is all"
+
+    monkeypatch.setattr(scan, "ask", ask)
+    monkeypatch.setattr(scan, "anyio", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(scan, "in_other_protocols", in_other_protocols)
+    busmaster("scan", controllers.path, "--protocol", "hcp2", "--nodes", "1-4", "--timeout", "200")
+    assert happened == ([[]] if len(replying) == 4 else [round(0.2 + scan.SILENCE, 3), [2, 4]])

@@ -18,9 +18,10 @@ import click
 import pytest
 
 from busmaster import Priority
-from busmaster.app.cli import output, poll, reaching, status, top, write
+from busmaster.app.cli import output, poll, reaching, safe, status, top, write
 from busmaster.app.cli.arguments import Connection
 from busmaster.app.cli.ending import SIGNALS
+from busmaster.app.cli.output import Level
 from busmaster.app.cli.parsing import Assignment
 from busmaster.app.service.folder import Owner
 from busmaster.app.service.remote import RemoteBus, connect
@@ -304,10 +305,21 @@ def test_a_poll_through_the_owner_prints_each_value_and_a_summary(
         assert all(0 <= cycle["due"] <= cycle["started"] + 0.001 < PATIENCE for cycle in cycles)
 
 
-def test_a_poll_through_the_owner_ends_by_itself_with_1_if_there_was_no_value(busmaster: Command, file: Path) -> None:
-    options = ("--nodes", "9", "--items", "1", "--period", "0.05", "--seconds", "0.2")
+def test_a_poll_through_the_owner_ends_by_itself_with_1_if_there_was_no_value(
+    busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ("--nodes", "9,12", "--items", "1,2", "--period", "0.05", "--seconds", "0.2")
+    requested: list[tuple[float, list[str]]] = []
+    usual = RemoteBus.poll_group
+
+    def poll_group(self: RemoteBus, name: str, *, period: float, points: Any, **more: Any) -> Any:
+        requested.append((period, [point.key for point in points]))
+        return usual(self, name, period=period, points=points, **more)
+
+    monkeypatch.setattr(RemoteBus, "poll_group", poll_group)
     with owner_here(file) as service:
         ran = busmaster("poll", service.address, *HCP2, *options)
+    assert requested == [(0.05, ["9/1", "9/2", "12/1", "12/2"])]
     assert ran.status == 1
     assert "no value was received" in ran.err
 
@@ -404,6 +416,59 @@ def test_a_process_that_does_not_reply_makes_the_status_1_and_another_line_is_li
     assert "none.sock" in ran.lines[1]
 
 
+class Asked:
+    """The owner of a line whose port is lost, or of an older version, which does not report all of its counts."""
+
+    def __init__(self, **different: Any) -> None:
+        nodes = [{"health": health} for health in ("up", "suspect", "up")]
+        self.about = {"nodes": nodes, "tcp": "tcp://127.0.0.1:7420", "clients": 3, "refused_requests": 2, **different}
+
+    async def __aenter__(self) -> Asked:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    async def statistics(self) -> Any:
+        return SimpleNamespace(utilisation=0.25)
+
+
+@pytest.mark.parametrize(
+    ("different", "state", "up", "row"),
+    [({}, "ready", 2, ["2", "25.0%", "2/3"]), ({"state": "offline"}, "offline", 0, ["2", "offline", "0/3"])],
+)
+def test_of_a_line_that_is_offline_no_node_is_up(
+    busmaster: Command,
+    owners: list[Owner],
+    monkeypatch: pytest.MonkeyPatch,
+    different: dict[str, Any],
+    state: str,
+    up: int,
+    row: list[str],
+) -> None:
+    owners.append(Owner("slitter", "/dev/ttyUSB0", "/run/slitter.sock", 7))
+    monkeypatch.setattr(status, "connect", lambda address: Asked(**different))
+    assert without_time(busmaster("status", "--json").out) == {
+        "name": "slitter",
+        "port": "/dev/ttyUSB0",
+        "address": "unix:/run/slitter.sock",
+        "process": 7,
+        "tcp": "tcp://127.0.0.1:7420",
+        "programs": 2,
+        "utilisation": 0.25,
+        "state": state,
+        "refused_connections": None,
+        "refused_requests": 2,
+        "failed_logins": None,
+        "up": up,
+        "nodes": 3,
+        "error": None,
+    }
+    ran = busmaster("status")
+    assert (ran.status, ran.err) == (0, "busmaster: slitter: 2 requests refused\n")
+    assert ran.lines[1].split() == ["slitter", "/dev/ttyUSB0", "7", *row]
+
+
 def test_what_each_line_has_refused_is_reported(
     busmaster: Command, owners: list[Owner], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -462,7 +527,7 @@ def test_top_names_the_lines_of_which_one_is_to_be_named(owners: list[Owner], mo
     with pytest.raises(LineDown, match="no running line of this user"):
         top.address_of(None)
     owners += [Owner(name, f"/dev/{name}", f"/run/{name}.sock", 1) for name in ("one", "two", "closed")]
-    monkeypatch.setattr(os, "access", lambda path, mode: "closed" not in str(path))
+    monkeypatch.setattr(os, "access", lambda path, mode: mode == os.F_OK or "closed" not in str(path))
     with pytest.raises(click.UsageError, match=r"several lines are running; name one of one, two$"):
         top.address_of(None)
     del owners[1]
@@ -614,6 +679,25 @@ def test_the_owner_sends_its_safe_state_and_is_not_recorded(
         ran = busmaster("safe", str(other))
         assert (ran.status, ran.out) == (2, "")
         assert held(three_controllers, 10) == [15]
+
+
+def test_a_safe_state_has_a_place_of_its_own_at_the_owner_and_a_missing_recording_is_a_warning(
+    busmaster: Command, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.write_text(file.read_text() + SAFE)
+    connected: list[dict[str, Any]] = []
+    noted: list[Level] = []
+
+    def counted(address: str, **options: Any) -> RemoteBus:
+        connected.append(options)
+        return connect(address, **options)
+
+    monkeypatch.setattr(safe, "connect", counted)
+    monkeypatch.setattr(safe, "note", lambda text, level: noted.append(level))
+    with owner_here(file):
+        assert busmaster("safe", str(file), "--capture", "x.pcapng").status == 0
+    assert connected == [{"safe_only": True}]  # though programs have taken all other places
+    assert noted == [Level.WARNING]
 
 
 def test_the_safe_state_goes_to_the_given_port_and_only_to_the_owner_of_that_port(
@@ -799,6 +883,27 @@ def test_the_options_of_a_read_reach_each_item(
     requested.clear()
     assert busmaster(*read).status == 0
     assert requested == [("1.17", {}), ("1.18", {})]
+
+
+@pytest.mark.parametrize("decimals", [0, 1])
+def test_a_number_of_decimals_is_that_of_each_item_of_a_write(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch, decimals: int
+) -> None:
+    options: list[dict[str, Any]] = []
+    usual = Connection.open_handle
+
+    def open_handle(self: Connection, bus: Any, address: int) -> Any:
+        options.append(dict(self.options))
+        return usual(self, bus, address)
+
+    monkeypatch.setattr(Connection, "open_handle", open_handle)
+    nobody, items = ("socket://127.0.0.1:1", "--node", "12"), ("1.17=1", "1.18:2=2,3", "1.21=4,5")
+    ran = busmaster("write", *nobody, "--protocol", "mentor", *items, "--decimals", str(decimals))
+    assert (ran.status, ran.out) == (1, "")
+    assert options[-1] == {"decimals": dict.fromkeys(("1.17", "1.18", "1.19", "1.21", "1.22"), decimals)}
+    ran = busmaster("write", *nobody, *HCP2, "1=2", "--decimals", str(decimals))
+    assert ran.status == 2
+    assert "hcp2 sends the decimal point itself; leave out --decimals" in ran.err
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from busmaster.app.cli import top
+from busmaster.app.interfaces.following import Following
 from busmaster.errors import LineDown
 from tests.app.cli.conftest import Command, owner_here
 from tests.patience import PATIENCE
@@ -121,6 +122,34 @@ def test_a_terminal_that_is_closed_ends_it(busmaster: Command, file: Path, termi
     with owner_here(file):
         ran = busmaster("top")
     assert (ran.status, ran.err) == (1, "")
+
+
+def test_an_internal_error_ends_the_screen_and_is_reported(
+    busmaster: Command, file: Path, terminal: dict[str, bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, broken, left = Following.follow, asyncio.Event(), list[bool]()
+
+    async def follow(self: Following, *, patient: bool = True) -> None:
+        following = asyncio.ensure_future(usual(self, patient=patient))
+        await broken.wait()
+        following.cancel()
+        raise ZeroDivisionError("a wrong picture")
+
+    async def story(screen: FakeScreen) -> None:
+        await screen.until(lambda: screen.taken > 1)
+        broken.set()
+        for _ in range(5):
+            await asyncio.sleep(0)
+        left.append(screen._left.is_set())
+        screen.exit(0)
+
+    monkeypatch.setattr(Following, "follow", follow)
+    plays(story)
+    with owner_here(file):
+        ran = busmaster("top")
+    assert left == [True]
+    assert ran.status == 1
+    assert "internal error: ZeroDivisionError: a wrong picture" in ran.err
 
 
 @pytest.mark.parametrize("stream", ["stdin", "stdout"])

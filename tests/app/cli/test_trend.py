@@ -217,6 +217,7 @@ def test_a_node_that_does_not_answer_is_no_value_and_status_1(busmaster: Command
     ran = busmaster("trend", three_controllers.path, "99/1", *options)
     assert ran.status == 1
     assert all(" 99/1 - " in line for line in ran.lines)
+    assert "attempt" not in ran.out  # as poll prints it: without node, command and attempts
     assert re.search(r"99/1: 0 samples, \d+ lost", ran.err)
     assert "no value was received" in ran.err
 
@@ -553,7 +554,8 @@ def test_the_plot_has_each_point_that_has_samples_in_its_span_with_a_marker_of_i
         for since in (1.0, 25.0, 30.0):
             trace.take(since, number + since)
     plot, plotter = plot_of(*traces, elapsed=30.0, span=10.0)
-    assert plot.lines()[0] == "the plot"
+    plot.lines()
+    assert plot.lines()[0] == "the plot"  # drawn anew, without what was drawn before
     assert plotter.limits == (20.0, 30.0)
     assert plotter.size == (90, 28)
     assert [(label, marker) for label, marker, _ in plotter.shown] == [
@@ -697,15 +699,16 @@ def test_the_last_samples_are_written_at_the_end(
 
 
 @in_virtual_time
-async def test_a_sample_is_read_in_the_background() -> None:
+async def test_a_sample_is_read_in_the_background_and_may_be_whole() -> None:
     asked: list[dict[str, Any]] = []
+    values = iter((5.5, 5))
 
     async def request(command: Any, **options: Any) -> float:
         asked.append(options)
-        return 5.0
+        return next(values)
 
     async with memory_bus() as bus:
         [trace] = traces_of(bus, "1/10")
         trace.node = SimpleNamespace(request=request)
-        assert await trace.read() == 5.0
-    assert asked == [{"priority": Priority.BACKGROUND}]
+        assert [await trace.read() for _ in range(2)] == [5.5, 5]
+    assert asked == [{"priority": Priority.BACKGROUND}] * 2

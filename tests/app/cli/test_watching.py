@@ -259,6 +259,11 @@ def test_the_summary_has_a_line_for_each_group_and_each_node(
     authorisation: Any = SimpleNamespace()
     watch = Watch(bus, "test", View(), authorisation=authorisation)
     watch.groups = [group("fast", 1, [0.02, 0.021]), group("slow", 0, [])]
+    levels: list[Level] = []
+    with monkeypatch.context() as patched:
+        patched.setattr(watching, "note", lambda text, level=Level.INFO: levels.append(level))
+        watch.summarise()
+    assert levels == [Level.WARNING, *[Level.INFO] * 6]  # a loss of the line is no matter of course
     watch.summarise()
     fast = "9 cycles, 2 missed, 1 of 10 values not read, period 20.50 ms mean, 21.00 ms p99, line 42.1% busy"
     assert capfd.readouterr().err.splitlines() == [

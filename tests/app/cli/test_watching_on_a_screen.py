@@ -20,6 +20,7 @@ from busmaster.app.cli.ending import SIGNALS
 from busmaster.app.cli.output import Level
 from busmaster.app.cli.poll import KEPT, Cycles
 from busmaster.app.cli.watching import Watch, p99_of
+from busmaster.app.service.authorisation import Authorisation
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import InvalidCommand
 from tests.app.cli.conftest import Command
@@ -148,8 +149,16 @@ def test_a_screen_that_cannot_be_served_is_replaced_by_lines(
         async def __aexit__(self, *_: object) -> None:
             pass
 
-    monkeypatch.setattr(watching, "served_here", lambda *_: Unserved())
+    titles: list[str] = []
+
+    def served_here(authorisation: Authorisation, title: str) -> Unserved:
+        assert isinstance(authorisation, Authorisation)
+        titles.append(title)
+        return Unserved()
+
+    monkeypatch.setattr(watching, "served_here", served_here)
     ran = busmaster("poll", controllers.path, *POLL)
+    assert titles == ["busmaster poll"]
     assert "no live view: no folder; showing plain lines" in ran.err
     assert (ran.status, terminal.drawn) == (130, [])
     assert ran.lines

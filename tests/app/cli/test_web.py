@@ -94,6 +94,7 @@ def served_with(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     async def serve(followed: Any, listen: Any, secrets: Any, hosts: Any, ready: Any, *rest: Any) -> None:
         found.update(read_only=followed.read_only, listen=listen, secrets=secrets, hosts=hosts, history=rest[1])
         ready("http://here")
+        rest[0]("connected to line")
 
     def following(line: str | None, *, read_only: bool) -> Any:
         found["line"] = line
@@ -108,7 +109,8 @@ def test_without_options_the_page_is_for_this_machine_and_may_write(
     busmaster: Command, served_with: dict[str, Any]
 ) -> None:
     ran = busmaster("web")
-    assert (ran.status, ran.err) == (0, "busmaster: the page is at http://here\n")
+    assert (ran.status, ran.out) == (0, "")
+    assert ran.err == "busmaster: the page is at http://here\nbusmaster: connected to line\n"
     assert served_with == {
         "line": None,
         "read_only": False,
