@@ -87,7 +87,7 @@ class Recorder:
         """The file has its closing statistics, but the next one could not be created yet."""
         self._reported = 0
         self._time_of_day = TimeOfDay(time.monotonic)
-        self._assembler = Assembler(self._write, protocol=protocol, echo=echo)
+        self._assembler = Assembler(self._write, protocol=protocol, echo=echo, offset=self._time_of_day.offset())
         self._thread = threading.Thread(target=self._run, name="busmaster capture", daemon=True)
         self._thread.start()
 
