@@ -829,15 +829,20 @@ class ModbusTcpServer:
     def _make_room(self, peer: str) -> bool:
         """Close a connection for one more of this peer. Returns False if none may be closed.
 
-        First choice is the one without a request for the longest time. If all have a request on the line, the address
-        with the most connections gives one up, so that a few addresses cannot keep out all others.
+        The address with the most connections gives one up, so that a few addresses cannot keep out all others. First
+        choice is the one without a request for the longest time. If all have a request on the line, it is the oldest.
         """
-        idle = next((one for one in self._open if one not in self._busy), None)
-        if idle is not None:
-            why = f"beyond {MOST_GATEWAY_CONNECTIONS}: the one idle for the longest time"
-            self._refuse(idle, self._open.pop(idle), why)
-            return True
         counts = Counter(self._open.values())
+        idle = [
+            one
+            for one, other in self._open.items()
+            if one not in self._busy and (other == peer or counts[other] > counts[peer])
+        ]
+        if idle:
+            chosen = max(idle, key=lambda one: counts[self._open[one]])  # of several, the first
+            why = f"beyond {MOST_GATEWAY_CONNECTIONS}: the one idle for the longest time"
+            self._refuse(chosen, self._open.pop(chosen), why)
+            return True
         [(most, count)] = counts.most_common(1)
         if count <= counts[peer] + 1:
             return False

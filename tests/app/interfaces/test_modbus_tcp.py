@@ -660,6 +660,27 @@ def test_connections_are_bounded_in_all_and_for_each_address(monkeypatch: pytest
     assert with_server(of_others) == [("connections", "127.0.0.2")]
 
 
+def test_an_address_with_many_connections_makes_room_and_one_with_few_keeps_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 3)
+
+    async def story(connect: Connect, _echo: Echo, _reports: list[str]) -> None:
+        few, writer = await connect("127.0.0.1")  # idle for the longest time
+        many = [(await connect("127.0.0.2"))[0] for _ in range(4)]
+        assert [await is_closed(reader) for reader in many[:2]] == [True, True]
+        third, _ = await connect("127.0.0.3")
+        assert await is_closed(many[2])
+        again, _ = await connect("127.0.0.2")  # now each address has one
+        assert await is_closed(many[3])
+        writer.write(frame(READ))
+        assert await few.readexactly(len(frame(READ))) == frame(READ)
+        assert not third.at_eof()
+        assert not again.at_eof()
+
+    assert with_server(story) == [("connections", "127.0.0.2")] * 4
+
+
 def test_a_connection_whose_request_is_on_its_way_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 2)
     go_on = asyncio.Event()
