@@ -14,7 +14,7 @@ from dataclasses import replace
 import pytest
 
 from busmaster.app.bounds import MOST_AT_ONCE
-from busmaster.app.service.authorisation import FRESH, Authorisation, WriteRequest, outcome_of
+from busmaster.app.service.authorisation import Authorisation, WriteRequest, outcome_of
 from busmaster.app.service.permission import Access
 from busmaster.app.service.record import LONGEST_SHOWN, Outcome, WriteRecord, cut, this_user
 from busmaster.app.service.values import write_fields
@@ -42,6 +42,8 @@ from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 
+FRESH = 1.0
+"""Seconds: a command that has waited for longer is not sent (docs/service.md)."""
 Story = Callable[[Authorisation, Hcp2Controller, list[WriteRecord]], Awaitable[None]]
 
 

@@ -156,8 +156,9 @@ def test_a_point_that_can_be_written_within_limits_is_a_number_too() -> None:
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
     point = replace(Hcp2Controller(bus, 5).point("10"), unit="N", meaning=Meaning(precision=1))
     assert [component for component, _ in made(point, 1.0, commands={"5/10": point})] == ["sensor"]
-    point.limit(minimum=-5, maximum=500)
     point.limit(maximum=400)
+    assert [component for component, _ in made(point, 1.0, commands={"5/10": point})] == ["sensor"], "without a minimum"
+    point.limit(minimum=-5, maximum=500)
     [(component, number), (other, sensor)] = made(point, 1.0, commands={"5/10": point})
     assert (component, other) == ("number", "sensor")
     assert (number["command_topic"], number["min"], number["max"], number["step"]) == ("line/set/5/10", -5, 400, 0.1)
