@@ -88,6 +88,17 @@ def test_chunks_split_a_reply_evenly() -> None:
     assert [data for _, data in arrivals(line, 1.0)] == ["02 30", "31 30", "03 32"]
 
 
+def test_a_reply_that_was_complete_before_the_host_sends_again_reaches_it_at_once() -> None:
+    line = line_of(mint())
+    line.prompt = False
+    line.send(READ_2, 0.0)
+    end = 14 * TAU + 0.002
+    line.send(READ_3, end + TAU)
+    assert line.next_event() == pytest.approx(end)
+    assert hexed(line.receive(end + TAU)) == REPLY
+    assert line.next_event() == pytest.approx(end + 9 * TAU)
+
+
 def test_latency_holds_back_what_the_wire_has_delivered() -> None:
     line = line_of(mint(), latency=0.016)
     line.prompt = False
@@ -172,6 +183,19 @@ def test_a_device_may_speak_unexpected_when_its_own_timer_runs_out() -> None:
     device.faults.dead = 1.0
     line.restart(device, 0.9)
     assert ask(line, "00", 0.95, 0.2) == ""
+
+
+def test_a_device_whose_timer_runs_out_during_a_reply_disturbs_it_from_then_on() -> None:
+    device, start = Insister(1), 8 * TAU + 0.002
+    device.wakeup = start + 2.5 * TAU
+    line = line_of(mint(), device)
+    line.prompt = False
+    line.send(READ_2, 0.0)
+    (when, data), *rest = arrivals(line, start + 10 * TAU)
+    assert data == "02 30"
+    assert when == pytest.approx(start + 2.5 * TAU)
+    assert " ".join(data for _, data in rest) != "31 30 03 32"
+    assert line.collisions == 1
 
 
 def test_each_device_has_a_timer_of_its_own() -> None:
@@ -310,6 +334,40 @@ def test_a_late_echo_still_comes_before_the_reply() -> None:
     [(when, data)] = arrivals(line, 1.0)
     assert when == pytest.approx(8 * TAU + 0.01)
     assert data == hexed(READ_2) + " " + REPLY
+
+
+@pytest.mark.parametrize("prompt", [False, True])
+@pytest.mark.parametrize("late", [2.5, 20])
+def test_a_late_echo_comes_at_its_time_although_the_host_sends_on(late: float, prompt: bool) -> None:
+    line = line_of(echo=Echo(late * TAU))
+    line.prompt = prompt
+    line.send(READ_2, 0.0)
+    line.send(READ_3, 0.0)
+    heard = arrivals(line, 1.0)
+    assert [data for _, data in heard] == [hexed(READ_2), hexed(READ_3)]
+    assert [when for when, _ in heard] == pytest.approx([(8 + late) * TAU, (16 + late) * TAU])
+
+
+@pytest.mark.parametrize("prompt", [False, True])
+def test_a_late_echo_comes_at_its_time_although_a_device_replies(prompt: bool) -> None:
+    line = line_of(mint(delay=0.0), echo=Echo(delay=2.5 * TAU))
+    line.prompt = prompt
+    line.send(READ_2, 0.0)
+    heard = arrivals(line, 1.0)
+    assert [data for _, data in heard] == [hexed(READ_2) + " 02 30", "31 30 03 32"]
+    assert [when for when, _ in heard] == pytest.approx([10.5 * TAU, 14 * TAU])
+
+
+def test_bytes_that_an_adapter_holds_back_come_at_their_time_although_the_host_sends_on() -> None:
+    line = line_of(mint(), latency=3 * TAU)
+    line.prompt = False
+    line.send(READ_2, 0.0)
+    end = 14 * TAU + 0.002
+    assert line.receive(end + TAU) == b""
+    line.send(READ_3, end + TAU)
+    [(when, data)] = arrivals(line, 1.0)
+    assert data == REPLY
+    assert when == pytest.approx(end + 3 * TAU)
 
 
 def test_a_corrupt_echo_differs_by_one_bit() -> None:

@@ -492,6 +492,13 @@ def test_the_kernel_names_the_process_and_the_user_of_a_unix_socket_only() -> No
         assert process_number(server) == 0
 
 
+def test_the_origin_of_a_program_on_this_machine_is_its_user_and_not_its_group() -> None:
+    """On many machines both have the same number, for example for root."""
+    credentials = struct.pack("3i", 4711, 1000, 50)
+    connected: Any = SimpleNamespace(family=socket.AF_UNIX, getsockopt=lambda *_: credentials)
+    assert (process_number(connected), origin_of(connected)) == (4711, 1000)
+
+
 def test_a_peer_of_ipv6_is_its_network() -> None:
     connected: Any = SimpleNamespace(family=socket.AF_INET6, getpeername=lambda: ("2001:db8::7", 1, 0, 0))
     assert origin_of(connected) == "2001:db8::/64"

@@ -6,6 +6,7 @@ import asyncio
 import os
 import pwd
 import socket
+import struct
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -117,3 +118,13 @@ def test_of_a_process_with_too_many_groups_the_first_counts() -> None:
 
     connected: Any = SimpleNamespace(getsockopt=refuse)
     assert peers._more_groups(connected) == ()
+
+
+def test_the_user_of_a_process_is_not_its_group() -> None:
+    """On many machines both have the same number, for example for root."""
+    peers._names[1000] = "plant"
+    options = {socket.SO_PEERCRED: struct.pack("3i", 2**22 + 1, 1000, 50), peers.PEER_GROUPS: struct.pack("2I", 60, 70)}
+    connected: Any = SimpleNamespace(getsockopt=lambda _, option, __: options[option])
+    process = process_of(connected)
+    assert (process.pid, process.uid, process.gids) == (2**22 + 1, 1000, (50, 60, 70))
+    assert str(process) == f"plant, a program (process {2**22 + 1})"
