@@ -244,6 +244,15 @@ def test_the_outcome_of_a_request_that_no_command_sends_is_that_of_its_last_shor
     assert str(one.now) == "read 01.17: no drive address: '1222'"
 
 
+def test_the_outcome_of_a_request_that_no_command_sends_is_not_lost_with_the_hosts_last_acknowledgement() -> None:
+    sent = exchange(msc.ReadFlag(255), 15, MSC)[0][0]
+    wrong = (sent, "02 0F 00 08 00 00 52 46 4C 41 47 2C 01 00 01 B0")  # flag 256
+    packets = overheard(wrong, (NODE, ACK), (NODE, "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 01 01 B0"), (HOST, ACK))
+    assert [packet.outcome for packet in packets] == [Outcome.NONE, Outcome.NONE, Outcome.OK, Outcome.NONE]
+    one = only(packets)
+    assert (one.now.outcome, one.recorded.outcome) == (Outcome.NONE, Outcome.OK)
+
+
 def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
     with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
         exchanges = list(replay_packets(read_packets(file)))

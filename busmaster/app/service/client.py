@@ -94,6 +94,8 @@ from busmaster.ext import (
 NodeKey = tuple[str, int]
 MOST_FAILED = 1_000_000
 """Failed logins of one peer in one message."""
+LONGEST_GROUP_NAME = 40
+"""Characters of a client's name for a poll group that the owner's name for it has."""
 FOR_SAFE_STATE = ("safe", "cancel")
 """Methods of a program that has a place for the safe state."""
 
@@ -609,8 +611,11 @@ class Client:
             raise InvalidCommand(f"one program has {self.rights.groups} poll groups at most")
         self._gather(params)
         read = self._gathered.pop(params.stream)
+        name, program = params.name, f"{self.peer.short}-{self._number}"
+        if len(name) > LONGEST_GROUP_NAME:  # with its stream: another name may have the same beginning
+            name, program = name[:LONGEST_GROUP_NAME], f"{program}.{params.stream}"
         group = self._line.bus.poll_group(
-            f"{params.name[:40]} ({self.peer.short}-{self._number})",
+            f"{name} ({program})",
             period=params.period,
             points=read,
             phase=params.phase,

@@ -1765,6 +1765,16 @@ def test_of_several_points_in_one_request_each_gets_its_own_registers_and_an_err
     assert answer("06 0000 0007") == bytes.fromhex("86 0b")
 
 
+def test_a_write_while_the_owner_of_the_line_is_away_is_no_reply_and_is_not_tried() -> None:
+    given, answer, reports, refused = answering(allow=("a/x",))
+    given.is_connected = False
+    assert answer("06 0000 0007") == bytes.fromhex("86 0b")
+    assert (given.writes, reports, refused) == ([], [], [])
+    given.is_connected = True
+    assert answer("06 0000 0007") == bytes.fromhex("06 0000 0007")
+    assert given.writes == [("axes", "a/x", 7)]
+
+
 def test_a_number_that_cannot_be_written_keeps_the_points_before_it_from_being_written() -> None:
     given, answer, _, refused = answering(allow=("a/*",))
     given.map = RegisterMap.of([Entry("a/x", 0, type="int16"), Entry("a/y", 1, type="float32")], False)

@@ -227,6 +227,23 @@ def test_what_only_the_owner_can_reject_is_raised_where_the_group_is_iterated(tm
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.parametrize("length", [1, 38, 39, 40, 41, 99])
+def test_names_of_groups_that_differ_only_at_their_end_are_different_names(tmp_path: Path, length: int) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        points = [Hcp2Controller(remote, 5).point("1")]
+        groups = [remote.poll_group("n" * length + end, period=60, points=points) for end in "ab"]
+        for group in groups:
+            await group.ready()
+        assert [own.name for own in line.bus.groups] == [group.owners_name for group in groups]
+        assert remote.groups == tuple(groups)
+        for group in groups:
+            assert remote.group(group.name) is group
+            with pytest.raises(InvalidCommand, match=f"a poll group {group.name!r} already exists"):
+                remote.poll_group(group.name, period=60, points=points)
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_a_group_that_the_owner_never_accepted_raises_that_the_line_is_down(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         group = remote.poll_group("mine", period=60, points=[Hcp2Controller(remote, 5).point("1")])

@@ -626,7 +626,16 @@ def test_a_poll_group_has_the_phase_of_its_program_and_the_beginning_of_its_name
         async with raw(line) as client:
             assert "result" in await asked(client, 1, "poll", **polled(7, name="n" * 99, phase=12.5, priority=3))
             [group] = line.bus.groups
-            assert group.name.startswith(f"{'n' * 40} (")
+            for stream, length in ((8, 41), (9, 40)):
+                assert "result" in await asked(client, 1, "poll", **polled(stream, name="n" * length))
+            [program] = line.service.clients
+            number = f"{program.peer.short}-{program._number}"
+            beginning = "n" * 40
+            assert [own.name for own in line.bus.groups] == [
+                f"{beginning} ({number}.7)",
+                f"{beginning} ({number}.8)",
+                f"{beginning} ({number})",
+            ]
             assert (group.planned().phase, group.planned().priority) == (12.5, Priority.BACKGROUND)
 
     on_a_line(tmp_path, story)
