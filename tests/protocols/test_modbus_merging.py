@@ -191,6 +191,35 @@ def test_one_missing_register_is_found_by_halves_and_remembered() -> None:
     on_a_line(story, a_unit())
 
 
+class Holed(EmulatedModbus):
+    """It lacks the registers 5 and 11, and refuses each read that contains one with exception 3."""
+
+    def _read(self, function: int, first: int, count: int, now: float) -> bytes:
+        lacking = {5, 11} & set(range(first, first + count))
+        return super()._read(function, first, 0 if lacking else count, now)
+
+
+def test_two_missing_registers_of_a_run_are_refused_alone_and_the_others_are_read_in_each_cycle() -> None:
+    async def story(bus: Bus) -> None:
+        unit = ModbusUnit(bus, UNIT)
+        points = [unit.point(f"holding:{n}") for n in range(16)]
+        group = bus.poll_group("g", period=10.0, points=points)
+        async with asyncio.timeout(100.0):
+            for snapshot in await cycles(group, 3):
+                errors = [type(snapshot[point].error) for point in points]
+                assert [n for n, error in enumerate(errors) if error is Refused] == [5, 11]
+                assert errors.count(type(None)) == 14
+        # of a run, all refused parts are halved at once: 1, 2, 4, 6 and 8 reads, and 8 in each further cycle
+        assert sent(unit) <= 1 + 2 + 4 + 6 + 3 * 8
+        # read in each cycle: 0-3, 4, 5, 6-7, 8-9, 10, 11 and 12-15
+        assert (await bus.plan()).groups[0].exchanges == 8
+        before = sent(unit)
+        await cycles(group, 1)
+        assert sent(unit) - before <= 8, "the refused runs are not sent again"
+
+    on_a_line(story, Holed(UNIT))
+
+
 class Short(EmulatedModbus):
     """It returns 40 registers at most, and refuses more with exception 3."""
 

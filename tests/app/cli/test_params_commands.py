@@ -144,6 +144,12 @@ def test_two_nodes_of_a_line_and_two_files_are_compared(
     assert [json.loads(line) for line in only.lines] == [
         {"item": "11", "name": None, "unit": "", "one": 5, "other": None}
     ]
+    zero = written(tmp_path / "zero.toml", '"10" = { value = 0 }\n"11" = { value = 5 }')
+    for sides, values in (((zero, one), (0, 1)), ((one, zero), (1, 0))):
+        ran = busmaster("params", "diff", *map(str, sides), "--json")
+        assert [json.loads(line) for line in ran.lines] == [
+            {"item": "10", "name": None, "unit": "", "one": values[0], "other": values[1]}
+        ]
     at = written(tmp_path / "b@ck.toml", '"10" = { value = 1 }\n"11" = { value = 5 }')
     assert busmaster("params", "diff", str(one), str(at)).status == 0
 

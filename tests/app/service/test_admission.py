@@ -96,6 +96,17 @@ def test_writers_do_not_lock_out_admins_and_places_that_nobody_reserved_are_ever
     among(tmp_path, story)
 
 
+def test_reserved_places_that_a_role_does_not_use_are_for_no_other_role(tmp_path: Path) -> None:
+    async def story(crowd: Crowd) -> None:
+        await crowd.come(Role.ADMIN)
+        for _ in range(bounds.RESERVED_FOR_WRITERS + 3):
+            await crowd.come(Role.WRITE)
+        assert await crowd.fill(Role.READ) == bounds.MOST_CLIENTS - 3
+        assert await crowd.fill(Role.ADMIN) == bounds.RESERVED_FOR_ADMINS - 1
+
+    among(tmp_path, story)
+
+
 def test_a_place_is_free_again_when_its_program_has_gone(tmp_path: Path) -> None:
     async def story(crowd: Crowd) -> None:
         async with AsyncExitStack() as stack:
@@ -396,5 +407,45 @@ def test_programs_that_are_sending_the_safe_state_keep_their_places_and_idle_one
             f"all {places} places for role admin are taken; {bounds.RESERVED_FOR_WRITERS} more are for role write"
         )
         assert refusals.connections == {"safe": 1, "admin": 2, "read": 1}
+
+    run_in_virtual_time(run())
+
+
+ALL, WRITERS, ADMINS = bounds.MOST_CLIENTS, bounds.RESERVED_FOR_WRITERS, bounds.RESERVED_FOR_ADMINS
+
+
+@pytest.mark.parametrize(
+    ("read", "write", "admin", "admitted"),
+    [
+        # how many programs of each role are there, and which roles one more program may have
+        (0, 0, 0, "read write admin"),
+        (ALL - 1, 0, 0, "read write admin"),
+        (ALL - 1, WRITERS, ADMINS, "read write admin"),
+        (ALL, 0, 0, "write admin"),
+        (ALL, 1, 0, "write admin"),
+        (ALL, 0, 1, "write admin"),
+        (ALL, WRITERS - 1, ADMINS - 1, "write admin"),
+        (ALL, WRITERS, ADMINS - 1, "admin"),
+        (ALL, WRITERS - 1, ADMINS, "write"),
+        (ALL, WRITERS, ADMINS, ""),
+        (ALL - 3, WRITERS + 2, 1, "read write admin"),
+        (ALL - 3, WRITERS + 3, 1, "admin"),
+        (ALL - 3, 1, ADMINS + 3, "write"),
+        (ALL - 3, WRITERS + 1, ADMINS + 2, ""),
+        (0, WRITERS + ALL, 0, "admin"),
+        (0, 0, ADMINS + ALL, "write"),
+    ],
+)
+def test_a_program_gets_a_reserved_place_of_its_role_or_one_of_those_for_all_roles(
+    read: int, write: int, admin: int, admitted: str
+) -> None:
+    async def run() -> None:
+        admission = Admission(Refusals())
+        counts = {Role.READ: read, Role.WRITE: write, Role.ADMIN: admin}
+        seats: Any = [Seat(role) for role, count in counts.items() for _ in range(count)]
+        # these have places of their own
+        seats += [Seat(Role.ADMIN, in_safe_place=True) for _ in range(bounds.RESERVED_FOR_SAFE)]
+        found = [role.value for role in counts if not admission.refusal(Permission("user me", role), seats)]
+        assert found == admitted.split()
 
     run_in_virtual_time(run())
