@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import anyio
@@ -50,7 +50,7 @@ def test_the_safe_state_is_sent_while_a_file_that_is_read_again_still_waits_for_
     path = tmp_path / "line.toml"
     hangups, replacing, replaced = Hangups(), anyio.Event(), anyio.Event()
 
-    async def take(_: LineFile) -> None:
+    async def take(_: LineFile, _secrets: Mapping[str, bytes]) -> None:
         """As with an output that hangs: nothing ends it, a cancel neither."""
         replacing.set()
         with anyio.CancelScope(shield=True):
