@@ -24,7 +24,7 @@ from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, make_device
 from tests.app.cli.conftest import Command
 
-WINDOW = ("--timeout", "300")
+WINDOW = ("--timeout", "1000")
 """For a busy machine: the emulated drives answer from a thread of the test's own process."""
 
 
