@@ -38,6 +38,8 @@ T = TypeVar("T")
 
 def checked_priority(value: Priority | int) -> Priority:
     """Return a priority from a Priority or its number. Raises InvalidCommand for any other value."""
+    if isinstance(value, Priority):
+        return value
     return Priority(whole_number(value, min(Priority), max(Priority), "a priority"))
 
 
