@@ -152,7 +152,7 @@ class PollGroup(Cycles):
                 raise InvalidCommand(
                     f"poll group {self.name!r}: no node replies to a read of {point.key}, a broadcast address"
                 )
-            # A new group has none: a point is hashed once instead of twice, which takes a third of all this.
+            # A new group has no points. Without a look for them each point is hashed once and not twice, which is slow.
             if not self._points or point not in self._points:
                 fresh[point] = node
         # Only after all checks: an error in the middle of the list must leave the group unchanged.

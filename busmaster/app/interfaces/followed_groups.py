@@ -45,6 +45,7 @@ class FollowedGroups:
         for name in self._tasks.keys() - wanted:
             task = self._tasks.pop(name)
             self._last_cycles.pop(name, None)
+            self.dropped.pop(name, None)
             task.cancel()
             await asyncio.wait([task])
 

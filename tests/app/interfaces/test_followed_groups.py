@@ -141,3 +141,14 @@ async def test_only_the_wanted_groups_are_followed_and_the_others_are_sent_no_mo
         own.close()
         assert interface.cycles.counts == {}
         assert interface.groups.old(now + 10.0) == set()
+
+
+@pytest.mark.asyncio
+async def test_a_group_without_any_cycle_gets_old_too(tmp_path: Path) -> None:
+    async with interface_to_a_line(tmp_path) as interface:
+        await interface.follow("no such group")
+        now = interface.remote.now()
+        assert interface.groups.old(now) == set()
+        assert interface.groups.old(now + 1000.0) == {"no such group"}
+        await interface.groups.leave()
+        assert interface.groups.old(now + 1000.0) == set()

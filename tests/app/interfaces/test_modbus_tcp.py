@@ -397,21 +397,31 @@ def test_a_client_that_floods_is_served_in_turn_with_the_others() -> None:
     with_server(story)
 
 
-def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
-    """From Python 3.12 on, a server that waits for its clients would not end before they do."""
+async def serving_no_line(
+    report: Callable[[str], None] = lambda _: None, **options: float
+) -> tuple[asyncio.Task[None], str, int]:
+    """Start the server over a line that never answers, and return it with its host and port."""
 
     async def forever() -> None:
         await asyncio.get_running_loop().create_future()
 
+    opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    line: Any = SimpleNamespace(follow=forever, on_state=lambda _: None, read_only=False)
+    values: Any = SimpleNamespace(run=forever, line=line)
+    serving = asyncio.ensure_future(
+        modbus_tcp.serve(values, Rules(), ("127.0.0.1", 0), opened.set_result, report, **options)
+    )
+    host, _, port = (await asyncio.wait_for(opened, PATIENCE)).rpartition(":")
+    return serving, host, int(port)
+
+
+def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
+    """From Python 3.12 on, a server that waits for its clients would not end before they do."""
+
     async def run() -> None:
-        opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        line: Any = SimpleNamespace(follow=forever, on_state=lambda _: None)
-        values: Any = SimpleNamespace(run=forever, line=line)
-        listen = ("127.0.0.1", 0)
-        serving = asyncio.ensure_future(modbus_tcp.serve(values, Rules(), listen, opened.set_result, print))
+        serving, host, port = await serving_no_line()
         async with asyncio.timeout(PATIENCE):
-            host, _, port = (await opened).rpartition(":")
-            ends = [await asyncio.open_connection(host, int(port)) for _ in range(2)]
+            ends = [await asyncio.open_connection(host, port) for _ in range(2)]
             for reader, writer in ends:
                 writer.write(frame(b"\x63"))  # there is no such function
                 assert (await reader.readexactly(9))[7:] == b"\xe3\x01"
@@ -422,26 +432,16 @@ def test_the_end_of_the_server_is_the_end_of_its_connections() -> None:
                 assert await is_closed(reader)
                 writer.transport.abort()
             with pytest.raises(ConnectionRefusedError):
-                await asyncio.open_connection(host, int(port))
+                await asyncio.open_connection(host, port)
 
     asyncio.run(run())
 
 
 def test_the_time_without_a_request_is_the_one_that_the_server_is_given() -> None:
-    async def forever() -> None:
-        await asyncio.get_running_loop().create_future()
-
     async def run() -> None:
-        opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        line: Any = SimpleNamespace(follow=forever, on_state=lambda _: None)
-        values: Any = SimpleNamespace(run=forever, line=line)
-        listen = ("127.0.0.1", 0)
-        serving = asyncio.ensure_future(
-            modbus_tcp.serve(values, Rules(), listen, opened.set_result, reports.append, 0.05)
-        )
+        serving, host, port = await serving_no_line(reports.append, idle=0.05)
         async with asyncio.timeout(PATIENCE):
-            host, _, port = (await opened).rpartition(":")
-            reader, writer = await asyncio.open_connection(host, int(port))
+            reader, writer = await asyncio.open_connection(host, port)
             assert await is_closed(reader)
         writer.transport.abort()
         serving.cancel()
@@ -462,18 +462,10 @@ def test_what_a_server_refuses_is_reported_here_and_to_the_owner(monkeypatch: py
         def note(self, kind: str, peer: str) -> None:
             refused.append((kind, peer))
 
-    async def forever() -> None:
-        await asyncio.get_running_loop().create_future()
-
     async def run() -> None:
-        opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        values: Any = SimpleNamespace(run=forever, line=SimpleNamespace(follow=forever, read_only=False))
-        serving = asyncio.ensure_future(
-            modbus_tcp.serve(values, Rules(), ("127.0.0.1", 0), opened.set_result, reports.append)
-        )
+        serving, host, port = await serving_no_line(reports.append)
         async with asyncio.timeout(PATIENCE):
-            host, _, port = (await opened).rpartition(":")
-            reader, writer = await asyncio.open_connection(host, int(port))
+            reader, writer = await asyncio.open_connection(host, port)
             writer.write(frame(bytes.fromhex("06 0000 0007")))
             assert (await reader.readexactly(9))[7:] == b"\x86\x01"
             writer.write(frame(READ, protocol=1))
