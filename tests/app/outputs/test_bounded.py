@@ -165,6 +165,8 @@ def test_one_that_hangs_is_not_waited_for() -> None:
     assert output._thread.is_alive()
     assert output.dropped == 2
     assert said == ["shelf did not end within 0.01 s: 2 values count as dropped, and may still be written"]
+    output.close(0.01)
+    assert len(said) == 1, "there are no further values"
     output.let.set()
     assert output._thread.daemon, "or it would keep the process from ending"
 

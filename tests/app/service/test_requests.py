@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import json
 import os
 import time
@@ -15,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, NoReply, Point, Priority, RemoteBus, ext
+from busmaster import Hcp2Controller, NoReply, Point, Priority, RemoteBus, connect, ext
 from busmaster.app import bounds
 from busmaster.app.bounds import FARTHEST_REQUESTED
 from busmaster.app.service.authorisation import FRESH
@@ -1039,5 +1040,26 @@ def test_a_write_whose_audit_entry_is_not_on_the_disk_is_unconfirmed(tmp_path: P
             )
             assert data["hint"] == "check why that output failed; the value need not be written again"
         assert await Hcp2Controller(line.bus, 5).read(1) == 2.5
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_groups_of_programs_are_forgotten_when_they_have_ended(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        of_programs = line.service.line.of_programs
+        async with connect(line.address) as remote:
+            group = remote.poll_group("axes", period=0.02, points=[Hcp2Controller(remote, 5).point("1")])
+            await group.ready()
+            assert len(of_programs) == 1
+            group.close()
+            other = remote.poll_group("others", period=0.02, points=[Hcp2Controller(remote, 5).point("1")])
+            await other.ready()
+        await line.alone()
+
+        def are_forgotten() -> bool:
+            gc.collect()
+            return not of_programs
+
+        await until(are_forgotten)
 
     on_a_line(tmp_path, story)
