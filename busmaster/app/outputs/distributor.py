@@ -291,14 +291,14 @@ class Distributor:
         async for snapshot in cycles:
             selected = news.of(snapshot)
             for output in self._outputs:
-                if isinstance(snapshot, Outdated) and output.finds_outdated:
+                if output.groups and group.name not in output.groups:
                     continue
-                if not output.groups or group.name in output.groups:
+                # cycles for which the loop was too busy count as well
+                output.miss((cycles.dropped - lost) * len(group.points))
+                if not (isinstance(snapshot, Outdated) and output.finds_outdated):
                     output.suppress(len(snapshot) - len(selected))
                     if selected:
                         output.offer(selected)
-                    # cycles for which the loop was too busy count as well
-                    output.miss((cycles.dropped - lost) * len(group.points))
             lost = cycles.dropped
 
     async def _watch(self) -> None:

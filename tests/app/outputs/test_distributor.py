@@ -408,6 +408,20 @@ async def test_what_a_write_made_stale_comes_to_outputs_behind_one_that_finds_it
 
 @pytest.mark.usefixtures("_listed")
 @pytest.mark.asyncio
+async def test_cycles_missed_before_a_stale_value_count_at_an_output_that_finds_it_by_itself() -> None:
+    outputs = Distributor(BUS)
+    for kind in ("first", "second"):
+        outputs.add(kind, Settings())
+    stale = Outdated(**{field.name: getattr(cycle(5, 1.0), field.name) for field in fields(Snapshot)})
+    outputs.start([Fed("axes", (cycle(1, 1.0), 0), (stale, 3), (cycle(6, 1.0), 3))])
+    await asyncio.gather(*outputs._feeding.values())
+    counts = [output.dropped for output in outputs._outputs]
+    await outputs.close()
+    assert counts == [3, 3]
+
+
+@pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
 async def test_a_cycle_without_a_value_to_report_is_not_offered() -> None:
     outputs = Distributor(BUS)
     outputs.add("all", Settings())
