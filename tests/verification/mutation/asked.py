@@ -18,7 +18,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     "codecs": ("tests/contract", "tests/protocols", "tests/handles", "tests/test_mistyped_arguments.py"),
     "pump": ("tests/transport", "tests/bus"),
     "service": ("tests/app/service", "tests/app/authorisation", "tests/docs/test_reference.py"),
-    "outputs": ("tests/app/outputs",),
+    "outputs": ("tests/app/outputs", "tests/app/config"),
     "config": ("tests/app/config", "tests/app/line", "tests/docs/test_reference.py"),
     "line": ("tests/app/line", "tests/app/config"),
     "interfaces": ("tests/app/interfaces",),
