@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 
 import pytest
 
@@ -36,6 +36,7 @@ points.speed = { item = "10" }
 points.force = { item = "11" }
 """
 WITHIN = 5.0
+NO_OTHERS: Mapping[str, float] = {}
 Story = Callable[[ConfiguredLine, list[WriteRecord]], Awaitable[None]]
 
 
@@ -51,8 +52,10 @@ class Forgetful(EmulatedMint):
         return super().write_element(element, value, now)
 
 
-def on_a_line(story: Story, *safe: str, gone: bool = False, forgetful: int = 0) -> None:
-    """Run it on a line whose safe state leaves these points at 0.
+def on_a_line(
+    story: Story, *safe: str, others: Mapping[str, float] = NO_OTHERS, gone: bool = False, forgetful: int = 0
+) -> None:
+    """Run it on a line whose safe state leaves these points at 0, and `others` at their values.
 
     Node 1 may be gone, and node 2 `forgetful` of so many writes.
     """
@@ -62,8 +65,9 @@ def on_a_line(story: Story, *safe: str, gone: bool = False, forgetful: int = 0) 
         winder.left = forgetful
         devices: list[Device] = [EmulatedMint(1), winder]
         devices[0].faults.dead = float(gone)
-        points = [f'"{name}"' for name in safe]
-        writes = ", ".join(f"{point} = 0" for point in points)
+        values = {**dict.fromkeys(safe, 0.0), **others}
+        points = [f'"{name}"' for name in values]
+        writes = ", ".join(f'"{name}" = {value}' for name, value in values.items())
         text = f"{TEXT}[safe]\nwithin = {WITHIN}\nrepeatable = [{', '.join(points)}]\nwrites = {{ {writes} }}\n"
         port = MemoryPort(Line(Hcp2Controller.profile.line, devices, chance=random.Random(1)))
         line = ConfiguredLine(read(Source("line.toml", text)), port=port, outputs=False)
@@ -127,17 +131,34 @@ def test_each_write_is_read_back_and_sent_again_until_it_reads_as_it_was_written
     on_a_line(story, "winder/speed", forgetful=3)
 
 
-def test_writes_to_any_of_its_nodes_that_were_decided_before_are_not_sent() -> None:
+@pytest.mark.parametrize("values", [(0, 0), (0, 20), (20, 0), (20, 30)])
+def test_writes_to_any_of_its_nodes_that_were_decided_or_queued_before_are_not_sent(
+    values: tuple[float, float],
+) -> None:
+    """Also to a node that is not left at 0."""
+    left = dict(zip(("gone", "winder"), values, strict=True))
+
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
-        nodes = [Node.of(line.nodes[name]) for name in ("gone", "winder")]
-        before = [node.stops for node in nodes]
+        nodes = {name: Node.of(line.nodes[name]) for name in left}
+        before = {name: node.stops for name, node in nodes.items()}
+        reading = asyncio.ensure_future(line.nodes["gone"].read(20))
+        await asyncio.sleep(0)  # the writes wait until it has its reply
+        queued = [asyncio.ensure_future(line.nodes[name].write(10, 5)) for name in left]
+        await asyncio.sleep(0)
         await line.safe_state.enter(line.authorisation, "a test", leaving=False)
-        for node, stops in zip(nodes, before, strict=True):
+        for writing in queued:
             with pytest.raises(Superseded):
-                await node.request(hcp2.Write(10, (5.0,)), stops_seen=stops)
+                await writing
+        assert await reading == 0
+        for name, node in nodes.items():
+            with pytest.raises(Superseded):
+                await node.request(hcp2.Write(10, (5.0,)), stops_seen=before[name])
+            assert await line.nodes[name].read(10) == left[name]
+            await node.request(hcp2.Write(10, (5.0,)), stops_seen=node.stops)
+            assert await line.nodes[name].read(10) == 5
         assert [(record.interface, record.by) for record in records] == 2 * [("safe", "a test")]
 
-    on_a_line(story, "gone/speed", "winder/speed")
+    on_a_line(story, others={f"{name}/speed": value for name, value in left.items()})
 
 
 def test_a_line_without_a_safe_state_takes_writes_as_before() -> None:
