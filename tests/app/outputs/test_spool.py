@@ -83,18 +83,28 @@ def test_a_file_that_is_no_spool_is_kept_aside(tmp_path: Path) -> None:
     assert "begun anew" in said[0]
 
 
+@pytest.mark.parametrize("damaged", [False, True])
 @pytest.mark.parametrize(("strict", "level"), [(False, 1), (True, 2)])
 def test_a_spool_has_its_mode_and_survives_a_loss_of_power_at_once_if_it_is_strict(
-    tmp_path: Path, strict: bool, level: int
+    tmp_path: Path, strict: bool, level: int, damaged: bool
 ) -> None:
+    """Also one that is begun anew in place of a damaged file, which keeps the mode that it had."""
+    if damaged:
+        (tmp_path / "spool").write_text("not a database at all " * 100)
+        (tmp_path / "spool").chmod(0o640)
     before = os.umask(0)
     try:
         spool = Spool(str(tmp_path / "spool"), 100, "mqtt", mode=0o604, strict=strict)
     finally:
         os.umask(before)
     assert spool._database.execute("pragma synchronous").fetchone() == (level,)
+    spool.put([record(1)])
+    modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
     spool.close()
-    assert (tmp_path / "spool").stat().st_mode & 0o777 == 0o604
+    of_the_damaged = {"spool.damaged": 0o640} if damaged else {}
+    assert modes == {"spool": 0o604, "spool-wal": 0o604, **of_the_damaged}
+    with pytest.raises(InvalidCommand, match="contains the stored values of mqtt; use another file for csv"):
+        spool_at(tmp_path, 100, "csv")
 
 
 @pytest.mark.slow
