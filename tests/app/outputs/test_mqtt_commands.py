@@ -31,8 +31,10 @@ from busmaster.errors import BusError
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from tests.app.outputs.brokers import Broker, needs_mosquitto
+from tests.app.outputs.cycles import BUS, NODE
 from tests.app.outputs.cycles import until as outside_until
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message
@@ -466,6 +468,44 @@ async def test_commands_that_are_not_permitted_are_answered_before_the_interface
         answers = await there.answers(10)
     assert sorted(answer["id"] for _, answer in answers) == [str(number) for number in range(10)]
     assert sorted(record.value for record in there.records) == list(range(10))
+
+
+async def close_interface(output: MqttOutput) -> None:
+    """Close it. Fails if that waits as for an interface that does not end."""
+    began = time.monotonic()
+    await asyncio.to_thread(output.close_interface)
+    assert time.monotonic() - began < mqtt.LAST_ANSWERS
+
+
+@pytest.mark.asyncio
+async def test_an_interface_that_never_began_is_closed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an output that was not started, that finds no broker, and that gets no reply from what is there."""
+    monkeypatch.setattr(mqtt, "TIMEOUT", 0.1)
+    commands = {"5/1": NODE.point("1")}
+    await close_interface(MqttOutput("mqtt", MqttSettings(port=free_port()), BUS, commands=commands))
+    away = MqttOutput("mqtt", MqttSettings(port=free_port()), BUS, commands=commands)
+    away.start()
+    await until(lambda: away.error)
+    await close_interface(away)
+    await asyncio.to_thread(away.close, PATIENCE)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        silent = MqttOutput("mqtt", MqttSettings(port=server.getsockname()[1]), BUS, commands=commands)
+        silent.start()
+        connection = (await asyncio.to_thread(server.accept))[0]
+        await close_interface(silent)
+    connection.close()
+    await asyncio.to_thread(silent.close, PATIENCE)
+
+
+@pytest.mark.asyncio
+async def test_an_interface_whose_broker_is_lost_is_closed_at_once(broker: Broker) -> None:
+    output = MqttOutput("mqtt", MqttSettings(port=broker.port), BUS, commands={"5/1": NODE.point("1")})
+    output.start()
+    await until(lambda: not output._interface_is_closed.is_set())
+    await asyncio.to_thread(broker.stop)
+    await until(lambda: output.error)
+    await close_interface(output)
+    await asyncio.to_thread(output.close, PATIENCE)
 
 
 @pytest.mark.asyncio
