@@ -25,6 +25,7 @@ PATIENCE = 5.0
 """Seconds for a whole request, and for a whole answer to be taken."""
 BACKLOG = 128
 TICK = 0.05
+END_OF_HEAD = b"\r\n\r\n"
 BUSY = "503 Service Unavailable"
 
 Page = tuple[str, bytes]
@@ -73,12 +74,13 @@ class _Server:
             self._drop(next(iter(self._silent)))
         try:
             async with asyncio.timeout(PATIENCE):
-                head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+                head = (await reader.readuntil(END_OF_HEAD)).decode("latin-1")
             self._silent.pop(writer, None)
             self._asking.add(writer)
             busy = len(self._asking) > MOST_ASKING
             writer.transport.set_write_buffer_limits(0)  # drain() waits until the system has taken everything
-            writer.write(response(BUSY, "text/plain", b"too many ask at once\n") if busy else await self._reply(head))
+            reply = response(BUSY, "text/plain", b"too many ask at once\n") if busy else await self._reply(head)
+            writer.write(reply[: reply.index(END_OF_HEAD) + len(END_OF_HEAD)] if head.startswith("HEAD ") else reply)
             async with asyncio.timeout(PATIENCE):
                 await writer.drain()
         except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError):
@@ -115,8 +117,7 @@ class _Server:
         encoding: dict[str, str] = {}
         if "gzip" in fields.get("accept-encoding", ""):
             text, encoding = gzip.compress(text, 1), {"Content-Encoding": "gzip"}
-        answer = response("200 OK", content_type, text, **encoding)
-        return answer if words[0] == "GET" else answer[: answer.index(b"\r\n\r\n") + 4]
+        return response("200 OK", content_type, text, **encoding)
 
     async def _page(self, accept: str) -> Page:
         """Return the metrics; all requests while a page is being made wait for the same one."""

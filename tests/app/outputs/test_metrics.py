@@ -11,6 +11,7 @@ import re
 import socket
 import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -754,6 +755,68 @@ async def test_connections_are_closed_at_the_end(monkeypatch: pytest.MonkeyPatch
         server.go_on.set()
         assert await silent.read() == b""
         await asking.read()
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("error", "status", "reason"),
+    [
+        (KeyError("axes"), b"500 Internal Server Error", b"KeyError('axes')"),
+        (RuntimeError("a bug"), b"500 Internal Server Error", b"RuntimeError('a bug')"),
+        (OSError("a bug"), b"500 Internal Server Error", b"OSError('a bug')"),
+        (TimeoutError(), b"503 Service Unavailable", b"the line's loop is busy"),
+    ],
+    ids=["key", "runtime", "system", "time"],
+)
+async def test_whatever_fails_while_a_page_is_made_is_reported_to_all_that_wait_and_the_next_one_gets_its_page(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, status: bytes, reason: bytes
+) -> None:
+    async with scrape_server(monkeypatch) as server:
+        server.error = error
+        waiting = [await server.ask() for _ in range(2)]
+        await server.until_asking(2)
+        server.go_on.set()
+        for reader in waiting:
+            head, _, body = (await reader.read()).partition(b"\r\n\r\n")
+            assert head.startswith(b"HTTP/1.1 " + status)
+            assert f"Content-Length: {len(body)}".encode() in head
+            assert body == reason + b"\n"
+        assert len(server.made) == 1
+        server.error = None
+        assert (await (await server.ask()).read()).startswith(b"HTTP/1.1 200 OK")
+
+
+@pytest.mark.asyncio
+async def test_a_reply_to_head_has_no_body_also_if_it_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def reply_to(asked: bytes) -> tuple[bytes, bytes, bytes]:
+        reader, writer = await server.connect()
+        writer.write(asked)
+        return (await reader.read()).partition(b"\r\n\r\n")
+
+    async with scrape_server(monkeypatch) as server:
+        server.go_on.set()
+        server.error = KeyError("axes")
+        head, end, body = await reply_to(b"HEAD /metrics HTTP/1.1\r\n\r\n")
+        assert (head.partition(b"\r\n")[0], end, body) == (b"HTTP/1.1 500 Internal Server Error", b"\r\n\r\n", b"")
+        monkeypatch.setattr(scrapes, "MOST_ASKING", 0)
+        head, end, body = await reply_to(b"HEAD /metrics HTTP/1.1\r\n\r\n")
+        assert (head.partition(b"\r\n")[0], end, body) == (b"HTTP/1.1 503 Service Unavailable", b"\r\n\r\n", b"")
+        assert (await reply_to(b"GET /metrics HTTP/1.1\r\n\r\n"))[2] == b"too many ask at once\n"
+
+
+@pytest.mark.asyncio
+async def test_a_metric_that_cannot_be_collected_is_reported_to_the_scraper() -> None:
+    def fail() -> tuple[OutputStatistics, ...]:
+        raise KeyError("sqlite")
+
+    output = MetricsOutput("metrics", MetricsSettings(port=0), BUS, outputs=fail)
+    output.start()
+    await asyncio.to_thread(until, lambda: output.port != 0)
+    with pytest.raises(urllib.error.HTTPError) as failed:
+        await asyncio.to_thread(scraped, output.port)
+    with failed.value as reply:
+        assert (reply.code, reply.read()) == (500, b"KeyError('sqlite')\n")
+    await asyncio.to_thread(output.close, PATIENCE)
 
 
 @pytest.mark.asyncio
