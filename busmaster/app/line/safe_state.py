@@ -108,8 +108,8 @@ class SafeState:
             return {}
         take_writes_again = ext.take_only_safe_writes(authorisation.bus)
         try:
-            for write in self.writes:
-                write.node.note_stop()
+            for node in authorisation.bus.nodes:
+                node.note_stop()  # also nodes that keep their values: a write decided for them is old too
             return await self._send(authorisation, by)
         finally:
             if not leaving:

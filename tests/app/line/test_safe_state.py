@@ -161,6 +161,20 @@ def test_writes_to_any_of_its_nodes_that_were_decided_or_queued_before_are_not_s
     on_a_line(story, others={f"{name}/speed": value for name, value in left.items()})
 
 
+def test_a_write_that_was_decided_before_is_not_sent_to_a_node_that_keeps_its_values_either() -> None:
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        node = Node.of(line.nodes["winder"])
+        before = node.stops
+        await line.safe_state.enter(line.authorisation, "a test", leaving=False)
+        with pytest.raises(Superseded):
+            await node.request(hcp2.Write(10, (5.0,)), stops_seen=before)
+        assert await line.nodes["winder"].read(10) == 7
+        await node.request(hcp2.Write(10, (5.0,)), stops_seen=node.stops)
+        assert await line.nodes["winder"].read(10) == 5
+
+    on_a_line(story, "gone/speed")
+
+
 def test_a_line_without_a_safe_state_takes_writes_as_before() -> None:
     async def run() -> None:
         file = read(Source("line.toml", TEXT))
