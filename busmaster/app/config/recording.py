@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TypeAlias
 
@@ -27,7 +28,10 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
     for kind, settings in outputs.items():
         for key in ("path", "spill"):
             path = getattr(settings, key, None)
-            if path is not None and taken.setdefault(path, f"{kind}.{key}") != f"{kind}.{key}":
+            if not isinstance(path, str):
+                continue
+            path = os.path.abspath(path)  # it can be written in several ways
+            if taken.setdefault(path, f"{kind}.{key}") != f"{kind}.{key}":
                 with table.part():
                     raise table.table(kind).error(f"is already the file of {taken[path]}; use another path", key)
     return outputs

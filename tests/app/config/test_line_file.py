@@ -332,6 +332,8 @@ def test_only_outputs_that_are_enabled_are_there_and_all_are_checked() -> None:
     with pytest.raises(FileError, match=r"line\.toml:3: outputs\.sqlite\.pth: no such key; did you mean"):
         parse(f'{HEAD}[outputs.sqlite]\npth = "x.db"\npath = "x.db"\nenabled = false\n')
     assert SqliteSettings(path="x.db").keep_days is None
+    shared = '[outputs.csv]\npath = "x"\n[outputs.jsonl]\npath = "x"\nenabled = false\n'
+    assert set(parse(HEAD + shared + NODE).outputs) == {"csv"}, "one that is not enabled has no file"
 
 
 def test_the_emulator_has_delays_and_faults_for_all_nodes_and_for_single_ones() -> None:
@@ -518,6 +520,18 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             "line.toml:10: outputs.csv.groups[2]: no such group 'h'",
         ),
         (
+            f"{HEAD}[outputs.csv]\npath = 'x'\nspill = 'x'",
+            "line.toml:4: outputs.csv.spill: is already the file of csv.path; use another path",
+        ),
+        (
+            f"{HEAD}[outputs.csv]\npath = 'x'\n[outputs.jsonl]\nspill = 'y'\npath = 'x'",
+            "line.toml:6: outputs.jsonl.path: is already the file of csv.path; use another path",
+        ),
+        (
+            f"{HEAD}[outputs.csv]\npath = 'x'\nspill = 'z'\n[outputs.mqtt]\nspill = 'z'",
+            "line.toml:6: outputs.mqtt.spill: is already the file of csv.spill; use another path",
+        ),
+        (
             f"{HEAD}[outputs.csv]\npath = 'x'\n[outputs.sqlite]\npath = 'y'\nspill = 'x'",
             "line.toml:6: outputs.sqlite.spill: is already the file of csv.path; use another path",
         ),
@@ -550,6 +564,18 @@ def test_an_error_names_file_line_and_key_and_what_would_do(text: str, complaint
         line(text)
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("other", ["./x", "a/../x", ".//x", "HERE/x"])
+def test_the_file_of_an_output_is_the_same_however_its_path_is_written(
+    other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    other = other.replace("HERE", str(tmp_path))
+    outputs = f'[outputs.csv]\npath = "x"\n[outputs.jsonl]\npath = "y"\nspill = "{other}"\n'
+    with pytest.raises(FileError, match=r"line\.toml:9: outputs\.jsonl\.spill: is already the file of csv\.path"):
+        parse(HEAD + NODE + outputs)
+    assert set(parse(HEAD + NODE + outputs.replace(other, f"{other}.spill")).outputs) == {"csv", "jsonl"}
 
 
 def test_what_an_output_cannot_do_is_said_where_the_file_asks_for_it(tmp_path: Path) -> None:
