@@ -268,6 +268,38 @@ def test_what_is_no_number_is_known_before_it_is_read(decode: Callable[[Any], An
     assert sort_of(point, find("hcp2")) == sort
 
 
+@pytest.mark.parametrize("number", ["int32", "uint32", "int64", "uint64", "float32", "float64"])
+def test_a_number_of_any_width_is_a_quantity(number: str) -> None:
+    limits = "minimum = -5, maximum = 5, max_step = 2, low = -3, high = 3, hysteresis = 1"
+    point = f'a = {{ item = "holding:40:{number}", {limits}, precision = 1, deadband = 0.5 }}'
+    metrics = f'{GROUP}[outputs.metrics]\ngroups = "axes"\n'  # a gauge cannot show a set of flags
+    meaning = ConfiguredLine(file("modbus", point + metrics)).point("w/a").meaning
+    assert (meaning.precision, meaning.low, meaning.high, meaning.deadband) == (1, -3, 3, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("number", "key", "complaint"),
+    [
+        ("int64", "labels = { -9223372036854775808 = 'least', 9223372036854775807 = 'most' }", None),
+        ("uint64", "labels = { 18446744073709551615 = 'most' }", None),
+        ("uint64", "bits = { LOWEST = 0, HIGHEST = 63 }", None),
+        ("int64", "labels = { -9223372036854775809 = 'x' }", "labels: holding:40:int64 cannot be -9223372036854775809"),
+        ("uint64", "labels = { 18446744073709551616 = 'x' }", "labels: holding:40:uint64 cannot be 184467440737095516"),
+        ("uint64", "bits = { A = 64 }", "bits: A is bit 64, but the highest bit of holding:40:uint64 is 63"),
+        ("float64", "labels = { 0 = 'x' }", "labels: need whole numbers, but holding:40:float64 has decimals"),
+        ("float64", "bits = { A = 0 }", "bits: need whole numbers, but holding:40:float64 has decimals"),
+    ],
+)
+def test_a_number_of_64_bits_has_labels_or_bits_if_it_is_whole(number: str, key: str, complaint: str | None) -> None:
+    point = f'a = {{ item = "holding:40:{number}", {key} }}'
+    if complaint is None:
+        assert parse("modbus", point).point("w/a").meaning != Meaning()
+        return
+    with pytest.raises(FileError) as refused:
+        parse("modbus", point)
+    assert str(refused.value).startswith(f"line.toml:6: nodes.w.points.a.{complaint}")
+
+
 def test_a_text_may_be_told_by_exception() -> None:
     section = file("hcp2", 'a = { item = "10", deadband = 0, heartbeat = 60 }').nodes["w"].points["a"]
     text: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=str)
