@@ -31,6 +31,7 @@ from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.errors import LineDown
 from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.registry import find, make_device
 from tests.app.cli.conftest import SLITTER, Command, owner_here, serve, without_time
 from tests.patience import PATIENCE
@@ -904,6 +905,61 @@ def test_a_number_of_decimals_is_that_of_each_item_of_a_write(
     ran = busmaster("write", *nobody, *HCP2, "1=2", "--decimals", str(decimals))
     assert ran.status == 2
     assert "hcp2 sends the decimal point itself; leave out --decimals" in ran.err
+
+
+@pytest.mark.parametrize(
+    ("owned", "options"),
+    [
+        (True, ""),
+        pytest.param(True, "chained = true\n", marks=pytest.mark.slow),
+        pytest.param(False, "", marks=pytest.mark.slow),
+    ],
+)
+def test_the_decimals_of_a_file_apply_with_and_without_an_owner(
+    busmaster: Command, mentor: TcpServer, tmp_path: Path, owned: bool, options: str
+) -> None:
+    def sent(parameter: int) -> int:
+        def value(line: Line, now: float) -> int:
+            drive = line.device(12)
+            assert isinstance(drive, EmulatedMentor)
+            return drive.value(parameter, now)
+
+        return mentor.call(value)
+
+    file, kept = tmp_path / "screw.toml", tmp_path / "kept.toml"
+    file.write_text(
+        f'port = "{mentor.path}?baudrate=19200"\n[nodes.screw]\nprotocol = "mentor"\naddress = 12\n{options}'
+        '[nodes.screw.points]\nspeed = { item = "1.17", decimals = 1 }\njog = { item = "1.18" }\n'
+    )
+    with owner_here(file) if owned else nullcontext():
+        ran = busmaster("write", str(file), "screw/speed=-47.6", "screw/jog=3", "--verify")
+        assert (ran.status, sent(117), sent(118)) == (0, -476, 3), ran.err
+        assert busmaster("read", str(file), "screw/speed", "screw/jog").lines == ["screw/speed -47.6", "screw/jog 3"]
+        assert busmaster("params", "save", str(file), "screw", "--items", "1.17,1.18", "-o", str(kept)).status == 0
+        assert busmaster("write", str(file), "screw/1.17=20.5").status == 0
+        assert sent(117) == 205
+        _, differs = busmaster("params", "diff", str(kept), f"screw@{file}").lines
+        assert differs.split()[-2:] == ["-47.6", "20.5"]
+        ran = busmaster("params", "load", str(kept), f"screw@{file}", "--yes", "--enabled")
+        assert (ran.status, sent(117), sent(118)) == (0, -476, 3), ran.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("owned", [False, True])
+def test_the_symbols_of_a_file_are_known_with_and_without_an_owner(
+    busmaster: Command, tmp_path: Path, owned: bool
+) -> None:
+    file = tmp_path / "press.toml"
+    with serve("msc", 3) as server:
+        file.write_text(
+            f'port = "{server.path}?baudrate=9600"\n[nodes.press]\nprotocol = "msc"\naddress = 3\n'
+            "symbols = { count = 2008 }\n[nodes.press.points]\nbatch = { item = 'count', maximum = 50 }\n"
+        )
+        with owner_here(file) if owned else nullcontext():
+            ran = busmaster("write", str(file), "press/batch=7", "--verify")
+            assert (ran.status, ran.lines) == (0, ["press/batch ok"]), ran.err
+            assert busmaster("read", str(file), "press/count", "press/2008").lines == ["press/count 7", "press/2008 7"]
+            assert busmaster("write", str(file), "press/count=51").status == 2
 
 
 @pytest.mark.slow
