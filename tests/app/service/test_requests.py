@@ -475,6 +475,53 @@ def test_the_number_of_a_request_in_progress_is_not_used_for_another_of_any_kind
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.parametrize(
+    ("method", "turns", "end"),
+    [
+        ("request", 0, "cancel"),
+        ("write", 0, "cancel cancel"),
+        ("request", 0, "connection"),
+        ("write", 0, "service"),
+        ("request", 1, "cancel"),
+        ("write", 1, "service"),
+    ],
+)
+def test_a_write_that_ends_before_it_is_sent_has_one_audit_entry(
+    tmp_path: Path, method: str, turns: int, end: str
+) -> None:
+    async def story(line: Served) -> None:
+        line.bus.poll_group("axes", period=100.0, points=[Hcp2Controller(line.bus, 5).point("1")])
+        remote = connect(line.address)
+        await remote.__aenter__()
+        await until(lambda: line.service.clients)
+        [program] = line.service.clients
+
+        def say(method: str, params: dict[str, Any], **more: int) -> None:
+            message = {"jsonrpc": "2.0", "method": method, "params": params, **more}
+            program.take(decode_client_message(json.dumps(message)))
+
+        async with busy(line) if turns else contextlib.nullcontext():
+            say(method, write(7.0) if method == "request" else {"group": "axes", "key": "5/1", "value": 7.0}, id=70)
+            for _ in range(turns):  # with none, its task has not begun
+                await asyncio.sleep(0)
+            if end == "service":
+                program.requests.end()
+            elif end == "connection":
+                await program.requests.give_up()
+            else:
+                for _ in end.split():
+                    say("cancel", {"id": 70})
+            await remote.__aexit__(None, None, None)
+            await line.alone()
+        [record] = line.records
+        assert (record.point, record.value, record.outcome) == ("5/1", 7, Outcome.NOT_STARTED)
+        cause = "the program that owns the line ended" if end == "service" else "its program cancelled it"
+        assert record.error == f"{cause} before it was sent"
+        assert await Hcp2Controller(line.bus, 5).read(1) == 0
+
+    on_a_line(tmp_path, story)
+
+
 # checks and reports
 
 
