@@ -579,6 +579,34 @@ async def test_a_screen_that_joins_while_others_look_has_the_counts_in_its_first
 
 
 @in_virtual_time
+async def test_a_screen_that_joins_between_two_counts_gets_the_counts_that_the_others_have() -> None:
+    def counts(screen: Screen) -> dict[tuple[str, int], Any]:
+        return {key: body for key, body in screen.latest.items() if key[0] in ("groups", "nodes")}
+
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        for number in range(COUNTED_AT_ONCE + 1):
+            polled(bus, f"group {number}", "1", address=1, period=0.1)
+        pictures, first, others = overview_of(bus), Screen(), [Screen(), Screen(), Screen()]
+        pictures.join(first, 1)
+        await asyncio.sleep(1.0)
+        for other in others:
+            before = counts(first)
+            while counts(first) == before:  # noqa: ASYNC110  time is virtual
+                await asyncio.sleep(0.01)
+            bus.node(hcp2.PROFILE, 2 + others.index(other))  # it is in the next counts
+            sent = counts(first)
+            pictures.join(other, 1)
+            await asyncio.sleep(1.5 * INTERVAL)
+            assert counts(other) == counts(first) == sent
+            assert sorted(sent) == [("groups", 0), ("groups", COUNTED_AT_ONCE), ("nodes", 0)]
+        await asyncio.sleep(1.0)
+        assert [len(screen.latest["nodes", 0]["nodes"]) for screen in (first, *others)] == [4] * 4
+        for screen in (first, *others):
+            pictures.leave(screen, 1)
+        await pictures._journal.close()
+
+
+@in_virtual_time
 async def test_the_counts_of_a_group_and_a_node_are_those_of_their_statistics() -> None:
     devices = [make_device("hcp2", 1), make_device("microflex", 3)]
     async with Bus(MemoryPort(Line(hcp2.PROFILE.line, devices))) as bus:
