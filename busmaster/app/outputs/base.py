@@ -154,7 +154,7 @@ class Output(ABC):
             try:
                 oldest = self._waiting.popleft()
             except IndexError:
-                break  # the rest is in the thread's hands
+                break  # the rest is in the thread's hands until its try ends
             self.dropped += size_of(oldest)
             if isinstance(oldest, WriteRecord):
                 self.settle_entry(oldest, f"{self.kind} dropped it, because its queue was full")
@@ -241,6 +241,13 @@ class Output(ABC):
         except IndexError:
             return None
 
+    def wait_again(self, items: Sequence[Item]) -> None:
+        """Put items back in front of the queue, in their order: if it fills up, they are dropped first."""
+        self._waiting.extendleft(reversed(items))
+
+    def put_back(self) -> None:  # noqa: B027  nothing to do where no item is in hand between two tries
+        """Have items that could not be delivered wait again. It is called after each failed try."""
+
     def drain(self, send: Callable[[Item], None]) -> None:
         """Send items one by one until the output is stopped and none waits.
 
@@ -261,7 +268,7 @@ class Output(ABC):
                 self._drop(item, str(error))
                 continue
             except BaseException:
-                self._waiting.appendleft(item)
+                self.wait_again([item])
                 raise
             self.written += size_of(item)
             self.up()
@@ -302,6 +309,7 @@ class Output(ABC):
                 self.work()
                 return
             except Exception as error:
+                self.put_back()
                 self.down(error)
             if last:
                 return

@@ -34,10 +34,8 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
     ) -> None:
         super().__init__(kind, settings, report)
         self._batch: list[Formatted] = []
-        self._sizes: list[int] = []
-        """How many values each of the batch holds."""
-        self._entries: list[WriteRecord] = []
-        """The audit entries in the batch."""
+        self._items: list[Item] = []
+        """What the batch was formatted from."""
         self._hurries_at = inf
         """When it writes nothing more, because it is to end and the rest can go to disk."""
 
@@ -101,16 +99,14 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
 
     def hold(self, most: int) -> bool:
         """Format what waits, up to a batch, and return whether there is one."""
-        size = sum(self._sizes)
+        size = self._size()
         while size < most and (item := self.take()) is not None:
             formatted = self.format(item)
             if formatted is None:
                 self.written += size_of(item)  # items that are not written here, such as events in CSV, are not lost
             else:
                 self._batch.append(formatted)
-                self._sizes.append(size_of(item))
-                if isinstance(item, WriteRecord):
-                    self._entries.append(item)
+                self._items.append(item)
                 size += size_of(item)
             if not self._stop.is_set():
                 time.sleep(PAUSE)
@@ -118,24 +114,37 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
 
     def records(self) -> Iterator[Record]:
         """Yield the batch as it is kept on disk."""
-        for formatted, values in zip(self._batch, self._sizes, strict=True):
-            yield Record(self.pack(formatted), values)
+        for formatted, item in zip(self._batch, self._items, strict=True):
+            yield Record(self.pack(formatted), size_of(item))
             if not self._stop.is_set():
                 time.sleep(PAUSE)
 
     def let_go(self) -> int:
         """Forget the batch, which is written or spilled, and return how many values were in it."""
-        size = sum(self._sizes)
-        entries, self._entries = self._entries, []
-        self._batch, self._sizes = [], []
+        size, entries = self._size(), self._entries()
+        self._batch, self._items = [], []
         for entry in entries:
             self.settle_entry(entry)
         return size
 
+    def put_back(self) -> None:
+        """Have the batch wait again."""
+        items = self._items
+        self._batch, self._items = [], []
+        self.wait_again(items)
+
     @property
     def must_sync(self) -> bool:
         """Return whether the batch must survive a loss of power once it is written."""
-        return self.is_strict and bool(self._entries)
+        return self.is_strict and bool(self._entries())
+
+    def _size(self) -> int:
+        """Return how many values the batch holds."""
+        return sum(map(size_of, self._items))
+
+    def _entries(self) -> list[WriteRecord]:
+        """Return the audit entries in the batch."""
+        return [item for item in self._items if isinstance(item, WriteRecord)]
 
     def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample[Any]]]:
         """Yield the points and samples of a cycle.

@@ -183,6 +183,11 @@ class MqttOutput(SpillingOutput):
         self._held.clear()
         return size
 
+    def put_back(self) -> None:
+        """Have the held items wait again."""
+        held, self._held = self._held, []
+        self.wait_again(held)
+
     async def _send_spilled(self, client: Client) -> None:
         """Send all that is on disk. When all is to end the rest stays there."""
         while self._spool is not None and self.spilled and not self._stop.is_set():

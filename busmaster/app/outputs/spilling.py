@@ -94,6 +94,7 @@ class SpillingOutput(Output):
             try:
                 lost = self._spool.put(self.records())
             except sqlite3.Error as error:
+                self.put_back()
                 self._report_once(f"{self._spill}: {error}")
                 return
             self.lost += lost  # first, for the same reason

@@ -130,6 +130,42 @@ def test_what_failed_is_written_when_it_works_again_and_both_are_told() -> None:
     assert output.statistics().error == ""
 
 
+def test_one_that_is_down_keeps_the_newest_and_drops_also_what_it_has_tried_to_write() -> None:
+    said: list[str] = []
+    output = Shelf(buffer=10, report=said.append)
+    output._retry = PATIENCE  # the next try is that of the end
+    output.broken = OSError(28, "No space left on device", "/disk/x")
+    offer(output, 1, 5)
+    output.offer(Happening(0.0, "winder", "winder is down"))
+    output.start()
+    until(lambda: bool(said))
+    offer(output, 6, 7)
+    assert output.statistics().dropped == 4
+    assert [item.cycle for item in output._waiting if isinstance(item, Snapshot)] == [3, 4, 5, 6, 7]
+    output.broken = None
+    output.close(PATIENCE)
+    assert output.cycles == [3, 4, 5, 6, 7]
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.waiting) == (11, 4, 0), "the event, which it does not write, once"
+
+
+def test_an_audit_entry_that_is_dropped_after_a_failed_try_is_reported_to_who_waits_for_it() -> None:
+    said: list[str] = []
+    kept: list[str] = []
+    output = Shelf(buffer=2, report=said.append)
+    output._retry = PATIENCE
+    output.broken = OSError("broken")
+    output.offer_entry(WRITE, kept.append)
+    output.start()
+    until(lambda: bool(said))
+    assert not kept
+    offer(output, 1, 1)
+    assert kept == ["shelf dropped it, because its queue was full"]
+    output.broken = None
+    output.close(PATIENCE)
+    assert (output.shelf, output.cycles, len(kept)) == (output.shelf[-1:], [1], 1)
+
+
 def test_a_bug_in_an_output_does_not_end_it() -> None:
     output = Shelf()
     output._retry = 0.01

@@ -28,6 +28,7 @@ from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.payload import NoCommand, Payload, read_payload
 from busmaster.bus.bus import Bus
 from busmaster.bus.meaning import Meaning
+from busmaster.bus.polling import Snapshot
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
@@ -342,6 +343,16 @@ async def test_without_a_broker_the_oldest_are_dropped_and_counted() -> None:
     assert "refused" in counts.error
     await asyncio.to_thread(output.close, PATIENCE)
     assert output.dropped == 200
+
+
+def test_what_the_broker_has_not_acknowledged_waits_again_in_its_order() -> None:
+    output = MqttOutput("mqtt", MqttSettings(), BUS)
+    for number in range(1, 4):
+        output.offer(cycle(number, 1.0))
+    assert output.hold(2)
+    output.put_back()
+    assert [item.cycle for item in output._waiting if isinstance(item, Snapshot)] == [1, 2, 3]
+    assert output.let_go() == 0
 
 
 @contextmanager

@@ -463,6 +463,7 @@ def test_the_reasons_why_the_disk_takes_nothing_are_reported_each_once(tmp_path:
     output.offer(cycle(1, 1))
     output.start()
     until(lambda: len(said) == 2)
+    until(lambda: len(output._waiting) == 1)  # it waits in memory, where the oldest are dropped
     errors.append(sqlite3.OperationalError("disk I/O error"))
     until(lambda: len(said) == 3)
     output.close(PATIENCE)
