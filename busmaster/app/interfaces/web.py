@@ -264,7 +264,8 @@ class Api:
             "value",
         )
         data = {name: getattr(row, name) for name in (*named, "quality", "error", "alarm")}
-        return _as_in_the_file(data) | {"time": None if row.asked is None else self._wall(row.asked)}
+        time = None if row.asked is None else self._wall(row.asked)
+        return _as_in_the_file(data) | {"current": self._line.is_current(row), "time": time}
 
 
 def _as_in_the_file(data: dict[str, Any]) -> dict[str, Any]:

@@ -764,6 +764,23 @@ async def test_times_of_the_line_are_times_of_day_and_none_while_they_are_unknow
     assert (said["connected"], said["since"], said["why"]) == (False, 900.0, "gone")
 
 
+@pytest.mark.asyncio
+async def test_a_point_is_current_while_its_quality_is_and_its_group_has_cycles() -> None:
+    rows = {
+        "good": row(asked=99.5),
+        "late": row(asked=99.5, quality="late"),
+        "of a paused group": row(asked=98.9),
+        "stale": row(asked=99.5, quality="stale"),
+        "bad": row(asked=99.5, quality="bad", error="no reply"),
+        "not read yet": row(asked=None, quality=""),
+    }
+    of = Local(*rows.values())
+    told = [one["current"] for one in await of.get("points")]
+    assert {name for name, current in zip(rows, told, strict=True) if current} == {"good", "late"}
+    of.line._remote = None  # the owner is away
+    assert not any(one["current"] for one in await of.get("points"))
+
+
 @pytest.mark.parametrize(
     ("method", "path", "allowed"),
     [
