@@ -43,10 +43,9 @@ from busmaster.app.service.encoding import (
     listed_groups,
     point_of,
     profile_of,
-    protocol_of,
 )
 from busmaster.app.service.failures import REFUSED, START_OWNER, encode_error, refusal_of
-from busmaster.app.service.fields import ReplyTimesForm
+from busmaster.app.service.fields import ReplyTimesForm, protocol_of
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import (
     NO_METHOD,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from functools import cached_property
+from typing import Annotated, Any, Literal
 
 from busmaster import Priority
 from busmaster.app.bounds import (
@@ -26,9 +27,10 @@ from busmaster.app.service.fields import (
     Sequence,
     StreamNumber,
     Value,
+    protocol_of,
 )
 from busmaster.app.service.typed import Meta, Raw, Struct, field
-from busmaster.ext import LONGEST_HOLD, LONGEST_PERIOD, LONGEST_SUSPENSION, MOST_RETRIES, SHORTEST_PERIOD
+from busmaster.ext import LONGEST_HOLD, LONGEST_PERIOD, LONGEST_SUSPENSION, MOST_RETRIES, SHORTEST_PERIOD, Command
 
 
 class ClientMessage(Struct, frozen=True):
@@ -59,7 +61,7 @@ class NodeParams(Struct, frozen=True, omit_defaults=True):
     sync_reads: Annotated[list[CommandForm], Meta(min_length=1, max_length=MOST_SYNC_READS)] | None = None
 
 
-class RequestParams(Struct, frozen=True, omit_defaults=True):
+class RequestParams(Struct, frozen=True, omit_defaults=True, dict=True):
     protocol: ProtocolName
     address: Address
     command: CommandForm
@@ -69,6 +71,11 @@ class RequestParams(Struct, frozen=True, omit_defaults=True):
     stop: bool = False
     requested: Moment | None = None
     sequence: Sequence | None = None
+
+    @cached_property
+    def checked_command(self) -> Command[Any]:
+        """The command itself, which checks its arguments. Raises InvalidCommand."""
+        return protocol_of(self.protocol).read_back(self.command)
 
 
 class CheckParams(Struct, frozen=True, omit_defaults=True):

@@ -11,8 +11,7 @@ from busmaster import InvalidCommand, Node, NotStarted, Point, WriteUnconfirmed,
 from busmaster.app.bounds import FARTHEST_REQUESTED, LONGEST_WAIT
 from busmaster.app.service.authorisation import FRESH, NEVER_SENT, WriteRequest, outcome_of
 from busmaster.app.service.client_messages import RequestParams, WriteParams
-from busmaster.app.service.encoding import protocol_of
-from busmaster.app.service.fields import OptionsForm, shortened
+from busmaster.app.service.fields import OptionsForm, protocol_of, shortened
 from busmaster.app.service.line import ServedLine
 from busmaster.app.service.messages import value_of
 from busmaster.app.service.peers import Peer
@@ -96,10 +95,10 @@ class RequestedCommand(NamedTuple):
     @classmethod
     def of_node(cls, params: RequestParams, sender: RequestSender) -> RequestedCommand:
         """Return the command that a client sends. Raises InvalidCommand for one that the protocol does not have."""
-        node, protocol = sender.node(params.protocol, params.address), protocol_of(params.protocol)
-        command, touches = protocol.read_back(params.command), params.touches
+        node, command, touches = sender.node(params.protocol, params.address), params.checked_command, params.touches
         value = str(command) if command.writes else None
-        return cls(node, command, None if touches is None else protocol.read_back(touches), value)
+        read = None if touches is None else protocol_of(params.protocol).read_back(touches)
+        return cls(node, command, read, value)
 
     @classmethod
     def of_point(cls, params: WriteParams, sender: RequestSender, line: ServedLine) -> RequestedCommand:

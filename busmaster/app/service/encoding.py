@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any, NamedTuple, Protocol, cast
 
 from busmaster import Bus, GarbledReply, InvalidCommand, Point, Quality, Sample, Snapshot
 from busmaster.app.service.failures import bus_error_of, error_data
-from busmaster.app.service.fields import GroupForm, PointForm
+from busmaster.app.service.fields import GroupForm, PointForm, protocol_of
 from busmaster.app.service.messages import encode_number, encode_value, value_of
 from busmaster.app.service.owner_messages import (
     AlarmChangedForm,
@@ -36,7 +35,7 @@ from busmaster.events import (
     PortFailed,
     RepliesLate,
 )
-from busmaster.ext import DriverErrors, LineStatistics, NodeRecord, Profile, Quantiles, Requester, protocols
+from busmaster.ext import DriverErrors, LineStatistics, NodeRecord, Profile, Quantiles, Requester
 from busmaster.ext import Protocol as BusProtocol
 
 
@@ -44,15 +43,6 @@ class FindNode(Protocol):
     """Returns the node that a protocol's name and an address stand for."""
 
     def __call__(self, protocol: str, address: int, /) -> Requester: ...
-
-
-@cache  # it is called for each request of a client
-def protocol_of(name: str) -> BusProtocol:
-    """Return the protocol of a name. Raises InvalidCommand if there is none."""
-    for protocol in protocols():
-        if protocol.name == name:
-            return protocol
-    raise InvalidCommand(f"no such protocol {name!r}; there are {', '.join(one.name for one in protocols())}")
 
 
 class SyncReads(NamedTuple):

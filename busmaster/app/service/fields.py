@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Any, TypeAlias
 
-from busmaster import Health, Priority, Quality
+from busmaster import Health, InvalidCommand, Priority, Quality
 from busmaster.app.bounds import LONGEST_REPLY, LONGEST_WAIT
 from busmaster.app.service.typed import UNSET, Meta, Raw, Struct, UnsetType
-from busmaster.ext import MOST_RETRIES, CommandOptions
+from busmaster.ext import MOST_RETRIES, CommandOptions, Protocol, protocols
 
 LARGEST_STREAM = 2**53
 """The largest whole number that every client has, JavaScript included."""
@@ -22,6 +23,15 @@ def one_of(*texts: str) -> Meta:
 def defined_as(name: str) -> Meta:
     """Return the reference to a definition of the schema, for a field that is decoded in a second step."""
     return Meta(extra_json_schema={"$ref": f"#/$defs/{name}"})
+
+
+@cache  # it is called for each request of a client
+def protocol_of(name: str) -> Protocol:
+    """Return the protocol of a name. Raises InvalidCommand if there is none."""
+    for protocol in protocols():
+        if protocol.name == name:
+            return protocol
+    raise InvalidCommand(f"no such protocol {name!r}; there are {', '.join(one.name for one in protocols())}")
 
 
 Count = Annotated[int, Meta(ge=0)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
+from functools import lru_cache
 from math import isfinite
 from typing import Any, NamedTuple, get_args
 
@@ -96,6 +97,10 @@ _OWNER_MESSAGE = Decoder(owner.OwnerMessage)
 _EVENT_NAME = Decoder(owner.StreamMessage[owner.EventName])
 _EVENTS = {kind.__name__.removesuffix("Form") for kind in get_args(owner.EventForm)}
 _ENCODER = Encoder()
+SHORT = 256
+"""Bytes of the parameters of a request that are kept after they were decoded: no read has more."""
+KEPT = 1024
+"""Requests that are kept: those that were used last, of all clients."""
 
 INVALID = (DecodeError, RecursionError)
 """Exceptions of a decoder. msgspec has no limit for nested values of its own, so the interpreter's ends them."""
@@ -186,6 +191,9 @@ def encode_value(value: Any) -> Any:
 
     Raises TypeError for a value that JSON does not support.
     """
+    kind = type(value)
+    if kind is int or kind is bool or kind is str:  # most values, and faster than the patterns
+        return value
     match value:
         case None | bool() | str():
             return value if value is None or isinstance(value, bool) else str(value)
@@ -264,10 +272,19 @@ def decode_owner_message(text: str | bytes) -> owner.OwnerMessage:
 
 def decode_request_params(method: str, params: Raw) -> Any:
     """Return the parameters of a request. Raises Malformed for an unknown method, and InvalidParams."""
+    if method == "request" and len(params) <= SHORT:
+        return _short_request(bytes(params))
     decoder = _REQUEST_PARAMS.get(method)
     if decoder is None:
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
     return _decode(decoder, method, params)
+
+
+@lru_cache(KEPT)
+def _short_request(params: bytes) -> client.RequestParams:
+    """Return the parameters of a request. Most requests are reads, with the same parameters again and again."""
+    decoded: client.RequestParams = _decode(_REQUEST_PARAMS["request"], "request", params)
+    return decoded
 
 
 def decode_client_notification(method: str, params: Raw) -> Any:
@@ -302,7 +319,7 @@ def decode_result(method: str, result: Raw) -> Any:
     return _decode(_RESULTS[method], method, result)
 
 
-def _decode(decoder: Decoder[Any], method: str, part: Raw) -> Any:
+def _decode(decoder: Decoder[Any], method: str, part: Raw | bytes) -> Any:
     try:
         return decoder.decode(part)
     except INVALID as error:

@@ -10,7 +10,7 @@ from typing import Any
 from busmaster import Bus, InvalidCommand, LineSettings, Priority, ext
 from busmaster.app.bounds import MOST_PLANNED_GROUPS, MOST_PLANNED_READS
 from busmaster.app.service.client_messages import PlannedGroupForm, PlannedRead
-from busmaster.app.service.encoding import protocol_of
+from busmaster.app.service.fields import protocol_of
 from busmaster.app.service.messages import encode_value, value_of
 from busmaster.app.service.owner_messages import PlanResult
 from busmaster.app.service.reply_times import encode_timings, timings_of

@@ -33,10 +33,9 @@ from busmaster.app.service.encoding import (
     encode_points,
     encode_sync_reads,
     event_of,
-    protocol_of,
     statistics_of,
 )
-from busmaster.app.service.fields import OptionsForm, shortened
+from busmaster.app.service.fields import OptionsForm, protocol_of, shortened
 from busmaster.app.service.link import TCP, Link
 from busmaster.app.service.messages import encode, value_of
 from busmaster.app.service.owner_messages import (

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, NoReply, Quality, Sample, Snapshot, ext
-from busmaster.app.service import encoding
+from busmaster.app.service import encoding, fields
 from busmaster.app.service.messages import decode_owner_notification, decode_result, encode
 from busmaster.arbiter.health import Health
 from busmaster.bus.node import Node
@@ -155,10 +155,10 @@ def test_a_probe_or_a_sync_read_alone_that_differs_is_sent_with_both() -> None:
         replace(usual, probe=microflex.PROFILE.probe),
         replace(usual, sync_reads=microflex.PROFILE.sync_reads),
     ):
-        again = encoding.profile_of(encoding.protocol_of("hcp2"), encoding.encode_sync_reads(other))
+        again = encoding.profile_of(fields.protocol_of("hcp2"), encoding.encode_sync_reads(other))
         assert (again.probe, again.sync_reads) == (other.probe, other.sync_reads)
 
 
 def test_an_unknown_protocol_is_refused_with_the_names_of_the_known_ones() -> None:
     with pytest.raises(InvalidCommand, match=r"no such protocol 'hcp3'; there are .*hcp2.*modbus"):
-        encoding.protocol_of("hcp3")
+        fields.protocol_of("hcp3")

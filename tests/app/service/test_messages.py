@@ -524,6 +524,34 @@ def test_a_request_is_refused_if_its_node_was_named_wrongly(tmp_path: Path) -> N
     on_a_line(tmp_path, story)
 
 
+def test_requests_with_the_same_text_are_each_carried_out_and_a_wrong_one_is_refused_each_time(tmp_path: Path) -> None:
+    def write(value: float) -> dict[str, Any]:
+        return {**READ, "command": {"command": "write", "element": 1, "values": [value]}}
+
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            for value in (5, 6, 5, -0.0, 0.0):
+                assert (await client.ask("request", **write(value)))["result"] is None
+                assert (await client.ask("request", **READ))["result"] == value
+            for wrong in (True, 1.5, 1000):
+                for _ in range(2):
+                    refused = await client.ask("request", **READ | {"command": {"command": "read", "element": wrong}})
+                    assert refused["error"]["code"] == -32602
+            assert (await client.ask("request", **READ))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_long_request_is_not_kept() -> None:
+    def decoded(values: int) -> Any:
+        params = {"protocol": "hcp2", "address": 5, "command": {"command": "write", "values": [1] * values}}
+        return decode_request_params("request", msgspec.Raw(json.dumps(params).encode()))
+
+    assert decoded(1) is decoded(1)
+    assert decoded(100) is not decoded(100)
+    assert decoded(100).command["values"] == 100 * [1]
+
+
 def test_a_program_has_a_limited_number_of_requests_and_each_has_its_own_id(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line) as client:

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from busmaster.app.service.encoding import SyncReads, encode_sync_reads, profile_of, protocol_of
+from busmaster.app.service.encoding import SyncReads, encode_sync_reads, profile_of
+from busmaster.app.service.fields import protocol_of
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import microflex

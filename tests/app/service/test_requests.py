@@ -23,8 +23,7 @@ from busmaster.app.service.authorisation import FRESH
 from busmaster.app.service.client import MOST_FAILED, Requests
 from busmaster.app.service.client_messages import RequestParams, WriteParams
 from busmaster.app.service.client_requests import Reading, Writing, client_request_of
-from busmaster.app.service.encoding import protocol_of
-from busmaster.app.service.fields import OptionsForm, shortened
+from busmaster.app.service.fields import OptionsForm, protocol_of, shortened
 from busmaster.app.service.messages import BUS_ERROR, INVALID_PARAMS, Malformed, decode_client_message, encode_value
 from busmaster.app.service.permission import Access, Permission
 from busmaster.app.service.record import Outcome
