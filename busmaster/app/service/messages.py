@@ -98,7 +98,7 @@ _EVENT_NAME = Decoder(owner.StreamMessage[owner.EventName])
 _EVENTS = {kind.__name__.removesuffix("Form") for kind in get_args(owner.EventForm)}
 _ENCODER = Encoder()
 SHORT = 256
-"""Bytes of the parameters of a request that are kept after they were decoded: no read has more."""
+"""Bytes of the parameters of a request, at most, that are kept after they were decoded. Most reads have fewer."""
 KEPT = 1024
 """Requests that are kept: those that were used last, of all clients."""
 
