@@ -241,6 +241,8 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("hcp2", 'item = "10", heartbeat = 0', "heartbeat: is more than 0 seconds, not 0; leave it out for none"),
         ("hcp2", 'item = "10", low = 2, high = 1', "low: 2 must be below high, which is 1"),
         ("hcp2", 'item = "10", low = nan', "low: must be finite, not nan"),
+        ("hcp2", 'item = "10", low = -inf', "low: must be finite, not -inf"),
+        ("hcp2", 'item = "10", high = inf', "high: must be finite, not inf"),
         ("hcp2", 'item = "10", hysteresis = 1', "hysteresis: is of low and high: write one of them, or leave it out"),
         ("hcp2", 'item = "10", high = 1, hysteresis = -1', "hysteresis: is 0 or more, not -1"),
         ("hcp2", 'item = "10", low = 0, high = 1, hysteresis = 2', "hysteresis: must be less than the 1 between low"),

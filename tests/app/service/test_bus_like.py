@@ -79,6 +79,8 @@ async def program(bus: BusLike) -> list[object]:
     outcome.append(plan.groups[-1].name)
     async with drive.exclusive(max_hold=1.0) as held:
         outcome.append(await held.status())
+    async with drive.exclusive() as held:
+        outcome.append(await held.status())
     consumer = group.subscribe(buffer=4)
     group.close()
     group.close()

@@ -9,19 +9,23 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from busmaster import Hcp2Controller, RemoteBus
+from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus
 from busmaster.app.service.exchanges import (
     LONGEST_RESULT,
     MOST_BYTES,
     MOST_KEPT,
     RECEIVED_AT_ONCE,
+    ExchangesBroadcast,
     Listener,
     encode_exchange,
 )
 from busmaster.app.service.messages import encode
 from busmaster.contract.tap import Attempt, Verdict
+from busmaster.emulator.line import Line
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
+from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.app.service.lines import ABSENT, PATIENT, Served, on_a_served_line, until
 from tests.app.service.schema import check
 from tests.stories import in_use
@@ -132,6 +136,19 @@ def test_a_line_is_tapped_only_while_somebody_looks(tmp_path: Path) -> None:
             await until(lambda: not tapped(line))
 
     on_a_served_line(tmp_path, story)
+
+
+def test_exchanges_are_sent_five_times_a_second() -> None:
+    async def run() -> None:
+        async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)]))) as bus:
+            bodies = ExchangesBroadcast(bus, lambda: None)._bodies()
+            begun = bus.now()
+            for _ in range(6):
+                await anext(bodies)
+            assert bus.now() - begun == pytest.approx(1.0, abs=0.01)
+            await bodies.aclose()
+
+    run_in_virtual_time(run())
 
 
 def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:

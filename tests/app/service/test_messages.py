@@ -293,6 +293,12 @@ def test_an_invalid_envelope_is_malformed(text: str | bytes, reason: str) -> Non
     assert encode_error(refusal.value).code == (-32700 if reason == "not valid JSON" else -32600)
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"jsonrpc":"2.0","id":"1","result":1}', 50_000 * "[", b"{}"])
+def test_an_invalid_message_of_the_owner_is_malformed(text: str | bytes) -> None:
+    with pytest.raises(Malformed):
+        decode_owner_message(text)
+
+
 def test_an_envelope_may_have_a_large_number_and_further_fields() -> None:
     message = decode_client_message(f'{{"jsonrpc":"2.0","id":{10**30},"method":"now","trace":{{"a":[1]}}}}')
     assert (message.id, message.method, bytes(message.params)) == (10**30, "now", b"{}")

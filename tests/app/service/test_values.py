@@ -240,8 +240,8 @@ ALARM = AlarmChanged(Point(NODE, "pull", Read(1)), "high", 5.0, 6.0, active=True
         (NodeChanged(NODE, Health.UNKNOWN, Health.DOWN, returning=False), "node 5 is down, was unknown"),
         (NodeChanged(NODE, Health.UNKNOWN, Health.UP, returning=False), ""),
         (
-            MaxReplyDelayRaised(NODE, 0.1404, 0.2236),
-            "node 5 replied after 140 ms; maximum reply delay raised to 224 ms",
+            MaxReplyDelayRaised(NODE, 1.1404, 1.2236),
+            "node 5 replied after 1140 ms; maximum reply delay raised to 1224 ms",
         ),
         (
             RepliesLate(NODE, 0.1404, 0.0125),
