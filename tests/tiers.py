@@ -14,6 +14,12 @@ def one_by_default(values: Iterable[Any], others: pytest.MarkDecorator = pytest.
     return [first, *(pytest.param(value, marks=others) for value in rest)]
 
 
+def one_slow(values: Iterable[Any], others: pytest.MarkDecorator) -> list[Any]:
+    """Return parameters of which the first is slow and the others have this mark."""
+    first, *rest = values
+    return [pytest.param(first, marks=pytest.mark.slow), *(pytest.param(value, marks=others) for value in rest)]
+
+
 def in_turn_by_default(firsts: Iterable[Any], seconds: Iterable[Any]) -> list[Any]:
     """Return all pairs as parameters. By default each of the seconds runs once, with the next of the firsts in turn;
     the other pairs are slow."""

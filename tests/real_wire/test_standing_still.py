@@ -6,7 +6,6 @@ import pytest
 
 from tests.real_wire.kinds import KINDS
 from tests.real_wire.trial import PORTS, Verdict, trial
-from tests.tiers import one_by_default
 
 STANDSTILLS = 3
 LONGEST = 0.8
@@ -31,6 +30,7 @@ def test_no_value_is_wrong_and_no_write_falsely_confirmed_whatever_stands_still(
     check("hcp2", trial("hcp2", port, what, STANDSTILLS, LONGEST))
 
 
-@pytest.mark.parametrize("protocol", one_by_default(name for name in KINDS if name != "hcp2"))
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", [name for name in KINDS if name != "hcp2"])
 def test_nor_with_any_other_protocol_behind_a_network_that_stands_still(protocol: str) -> None:
     check(protocol, trial(protocol, "tcp", "both", STANDSTILLS, LONGEST))

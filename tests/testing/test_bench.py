@@ -47,7 +47,6 @@ from busmaster.testing.fixtures import latency_bench
 from busmaster.testing.latency_plot import _course, _title
 from busmaster.testing.latency_report import histogram
 from busmaster.testing.virtual_time import run_in_virtual_time
-from tests.tiers import one_by_default
 
 __all__ = ["latency_bench"]
 
@@ -406,6 +405,7 @@ def test_every_field_of_a_report_is_in_its_json() -> None:
     assert json.loads(report.to_json())["rate"] == report.rate == 3.5
 
 
+@pytest.mark.slow
 def test_a_report_from_json_is_plotted_with_the_counts_of_its_histogram(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -578,7 +578,8 @@ def test_the_workload_of_a_report_is_what_was_wanted() -> None:
 # the plot
 
 
-@pytest.mark.parametrize("suffix", one_by_default(["svg", "png"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["svg", "png"])
 def test_the_plot_is_drawn(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     report = bench("hcp2", [1, 2], virtual=True, seconds=1, priorities="command=3,urgent=1")
@@ -587,6 +588,7 @@ def test_the_plot_is_drawn(suffix: str, tmp_path: Path) -> None:
     assert path.read_bytes().startswith({"png": b"\x89PNG", "svg": b"<?xml"}[suffix])
 
 
+@pytest.mark.slow
 def test_a_plot_of_nothing_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     plot(bench("hcp2", [1], virtual=True, seconds=1, faults=["dead=1"]), str(tmp_path / "latency.png"))

@@ -578,6 +578,7 @@ def test_a_plot_is_drawn_whatever_the_form_of_the_report(
     assert path == "latency.png"
 
 
+@pytest.mark.slow
 def test_a_plot_is_drawn_after_what_is_printed(busmaster: Command, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "latency.png"

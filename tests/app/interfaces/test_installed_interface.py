@@ -137,6 +137,7 @@ def test_a_value_of_a_line_whose_owner_is_gone_is_not_sent(file: Path) -> None:
             pass
 
 
+@pytest.mark.slow
 def test_a_value_of_a_stopped_owner_or_of_a_paused_group_is_not_sent(file: Path) -> None:
     with owner("serve", str(file)) as (process, address), interface(str(file)) as port:
         eventually(port, "winder/force", "0.0")

@@ -13,7 +13,7 @@ import pytest
 from busmaster.arbiter import learned as learning
 from busmaster.arbiter.in_sync import InSync
 from busmaster.emulator.line import Talk
-from tests.tiers import in_turn_by_default, one_by_default
+from tests.tiers import in_turn_by_default, one_by_default, one_slow
 from tests.verification.campaigns.__main__ import main
 from tests.verification.campaigns.hunt import Hunt
 from tests.verification.campaigns.judge import BrokenRuleError, Totals
@@ -26,7 +26,7 @@ EACH = 700
 LONG = 150
 """Likewise, of one with standstills of seconds."""
 EVERY_PROTOCOL = pytest.mark.parametrize("protocol", one_by_default(KINDS))
-OF_THE_HUNT = pytest.mark.parametrize("protocol", one_by_default(KINDS, pytest.mark.exhaustive))
+OF_THE_HUNT = pytest.mark.parametrize("protocol", one_slow(KINDS, pytest.mark.exhaustive))
 """For tests of the hunt itself, which one protocol shows as well as all."""
 
 

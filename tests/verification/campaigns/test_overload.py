@@ -227,7 +227,8 @@ def test_r9_urgent_starts_within_its_bound_beside_a_dead_node() -> None:
     assert max(waits) <= (1 + MOST_BEFORE) * line.bounds().wait(Priority.URGENT)  # of a write; these are reads (R15)
 
 
-@pytest.mark.parametrize("pace", one_by_default([0.0199, 0.001, 0.010, 0.050]))
+@pytest.mark.slow
+@pytest.mark.parametrize("pace", [0.0199, 0.001, 0.010, 0.050])
 def test_r9_urgent_starts_within_its_bound_beside_a_node_whose_bytes_trickle_in(pace: float) -> None:
     trickler = Trickler(1)
     trickler.pace = pace

@@ -22,7 +22,7 @@ from tests.planted import (
     without_the_adapter_in_the_silence,
     without_the_byte_time,
 )
-from tests.tiers import one_by_default
+from tests.tiers import one_slow
 from tests.verification.campaigns.hunt import Hunt
 from tests.verification.campaigns.judge import Judge, Totals
 from tests.verification.campaigns.kinds import KINDS
@@ -30,7 +30,7 @@ from tests.verification.campaigns.kinds import KINDS
 SEEDS = range(1, 21)
 EACH = 2000
 """Transactions of a hunt. Most are broken off long before."""
-EVERY_PROTOCOL = pytest.mark.parametrize("protocol", one_by_default(KINDS, pytest.mark.exhaustive))
+EVERY_PROTOCOL = pytest.mark.parametrize("protocol", one_slow(KINDS, pytest.mark.exhaustive))
 BUT_MODBUS = [protocol for protocol in KINDS if protocol != "modbus"]
 BUT_MSC = ["hcp", "hcp2", "mentor", "dc104"]
 
@@ -71,7 +71,7 @@ def test_a_max_reply_delay_of_zero_is_caught(protocol: str, monkeypatch: pytest.
     assert "WRONG" in caught(protocol, "late").problems[0]
 
 
-@pytest.mark.parametrize("protocol", one_by_default(BUT_MSC, pytest.mark.exhaustive))
+@pytest.mark.parametrize("protocol", one_slow(BUT_MSC, pytest.mark.exhaustive))
 def test_a_wrong_echo_that_does_not_resynchronise_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(readers, "find_field", excusing(readers.find_field))
     monkeypatch.setattr(dc104.Reading, "feed", excusing(dc104.Reading.feed))
@@ -85,7 +85,7 @@ def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkey
 
 
 # `excusing` does not reach the reader of Modbus, whose replies name no register
-@pytest.mark.parametrize("protocol", one_by_default(BUT_MODBUS, pytest.mark.exhaustive))
+@pytest.mark.parametrize("protocol", one_slow(BUT_MODBUS, pytest.mark.exhaustive))
 def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The element check removed; for an MSC, that of unit and name."""
     right, read = readers.find_field, dc104.Reading.feed
@@ -104,7 +104,7 @@ def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pyt
 
 
 # Modbus keeps a silence between frames that is longer than a byte: there this bug does no harm
-@pytest.mark.parametrize("protocol", one_by_default(BUT_MODBUS, pytest.mark.exhaustive))
+@pytest.mark.parametrize("protocol", one_slow(BUT_MODBUS, pytest.mark.exhaustive))
 def test_a_byte_time_left_out_of_the_max_reply_delay_brings_a_wrong_value(
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,7 +115,7 @@ def test_a_byte_time_left_out_of_the_max_reply_delay_brings_a_wrong_value(
     assert "WRONG" in caught(protocol, "edges, equal").problems[0]
 
 
-@pytest.mark.parametrize("protocol", one_by_default(BUT_MSC, pytest.mark.exhaustive))
+@pytest.mark.parametrize("protocol", one_slow(BUT_MSC, pytest.mark.exhaustive))
 def test_without_r3_a_request_that_leaves_too_early_is_caught_before_it_does_harm(
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,7 +139,7 @@ def broken(protocol: str, mix: str) -> str:
     pytest.fail(f"{len(SEEDS)} hunts found nothing wrong")
 
 
-NOT_MSC = pytest.mark.parametrize("protocol", one_by_default(BUT_MSC, pytest.mark.exhaustive))
+NOT_MSC = pytest.mark.parametrize("protocol", one_slow(BUT_MSC, pytest.mark.exhaustive))
 
 
 @NOT_MSC

@@ -64,6 +64,7 @@ def test_the_sweep_sees_what_a_master_without_r15_makes_of_a_standstill(monkeypa
     assert any("WRONG: " in line for line in shown)
 
 
+@pytest.mark.slow
 def test_the_command_counts_and_replays(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     """Here of a master without R15."""
     without_r15(monkeypatch)

@@ -43,6 +43,7 @@ def test_texts_constants_decorators_and_definitions_are_left_alone(source: str) 
     assert edits(source) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", ["config", "transport"])
 def test_every_slip_of_a_room_is_another_program(room: str) -> None:
     count = 0
