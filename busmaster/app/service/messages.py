@@ -97,8 +97,9 @@ _OWNER_MESSAGE = Decoder(owner.OwnerMessage)
 _EVENT_NAME = Decoder(owner.StreamMessage[owner.EventName])
 _EVENTS = {kind.__name__.removesuffix("Form") for kind in get_args(owner.EventForm)}
 _ENCODER = Encoder()
-SHORT = 256
-"""Bytes of the parameters of a request, at most, that are kept after they were decoded. Most reads have fewer."""
+SHORT = 128
+"""Bytes of the parameters of a request, at most, that are kept after they were decoded. Most reads have fewer, and
+writes more: a time is in each, so their text is never that of an earlier one."""
 KEPT = 1024
 """Requests that are kept: those that were used last, of all clients."""
 
