@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import inf, nextafter
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line, Talk
@@ -50,6 +50,36 @@ class Frame(NamedTuple):
 
 
 NOTHING = Frame(-inf, -inf, -inf)
+
+
+class Damage(NamedTuple):
+    """What passed then does not hold what was said."""
+
+    start: float
+    end: float
+
+
+Passed = TypeVar("Passed", Frame, Damage)
+
+
+class Latest(Generic[Passed]):
+    """What passed last on a line. A search begins with the newest and seldom reaches the rest."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[float, Passed]] = deque(maxlen=REMEMBERED)
+        """Each with the latest end of all up to it."""
+
+    def add(self, passed: Passed) -> None:
+        """They come about in the order of their ends."""
+        before = self._kept[-1][0] if self._kept else -inf
+        self._kept.append((max(before, passed.end), passed))
+
+    def ending_after(self, time: float) -> Iterator[Passed]:
+        """All that end after `time`, and perhaps others, the newest first."""
+        for latest_end, passed in reversed(self._kept):
+            if latest_end <= time:
+                return
+            yield passed
 
 
 @dataclass(slots=True)
@@ -103,8 +133,8 @@ class Ledger:
     _written: dict[int, Written] = field(default_factory=dict)
     _old: deque[int] = field(default_factory=deque)
     _old_writes: deque[tuple[int, Written]] = field(default_factory=deque)
-    _frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    _damage: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _frames: Latest[Frame] = field(default_factory=Latest)
+    _damage: Latest[Damage] = field(default_factory=Latest)
     _unexpected_at: float = -inf
     _orders: dict[tuple[int, object], int] = field(default_factory=dict)
 
@@ -179,7 +209,7 @@ class Ledger:
         """A device is going to say something; `asked`: the last request was for it."""
         now = self.now()
         frame = Frame(now, start, end, data)
-        self._frames.append(frame)
+        self._frames.add(frame)
         if asked:
             self._asked.append((talker, frame))
             self.last = max(self.last, frame, key=lambda one: one.end)
@@ -197,11 +227,11 @@ class Ledger:
 
     def spoiled(self, start: float, end: float) -> None:
         """What passed then does not hold what was said."""
-        self._damage.append((start, end))
+        self._damage.add(Damage(start, end))
 
     def damaged(self, begin: float, end: float) -> bool:
         """Something that passed in that time was not what was said."""
-        return any(start <= end and begin < stop for start, stop in self._damage)
+        return any(start <= end and begin < stop for start, stop in self._damage.ending_after(begin))
 
     def disguised(self, asked: float, now: float) -> bool:
         """Since the request at `asked`, an overdue reply has ended that noise had changed. Nothing can tell it from the
@@ -211,9 +241,9 @@ class Ledger:
             and (
                 (frame.end <= now and self.damaged(frame.start, frame.end))
                 # Noise may have removed its last byte. On a line without pacing, a reply takes no time.
-                or any(start == frame.start and asked < end <= now for start, end in self._damage)
+                or any(start == frame.start and asked < end <= now for start, end in self._damage.ending_after(asked))
             )
-            for frame in self._frames
+            for frame in self._frames.ending_after(asked)
         )
 
     def broken(self) -> bool:
@@ -225,7 +255,7 @@ class Ledger:
 
         Nothing can tell one that noise has changed from the reply to the present request, if it looks like that one.
         """
-        for frame in self._frames:
+        for frame in self._frames.ending_after(begin):
             late = frame.cause < begin < frame.end - ROUNDING and frame.start < end
             if late and not self.damaged(frame.start, frame.end):
                 yield frame

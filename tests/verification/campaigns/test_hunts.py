@@ -209,7 +209,7 @@ def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_faul
     """Seed 60200 of EI-Bisynch: it ended the exchange at the moment the device's own reply began."""
     ledger = Ledger(97, 5)
     late = Frame(8.0, 9.0, 11.0)
-    ledger._frames.append(late)
+    ledger._frames.add(late)
     assert not ledger.disguised(10.0, 11.0)
     ledger.spoiled(late.start, late.end)
     assert ledger.disguised(10.0, 11.0)
@@ -220,7 +220,7 @@ def test_an_overdue_reply_that_noise_made_look_like_the_one_asked_for_is_no_faul
 def test_noise_may_have_taken_the_last_byte_of_such_a_reply() -> None:
     """Seed 271165 of EI-Bisynch with learned windows: it ended a byte earlier than what the device said."""
     ledger = Ledger(97, 5)
-    ledger._frames.append(Frame(8.0, 9.0, 12.0))
+    ledger._frames.add(Frame(8.0, 9.0, 12.0))
     ledger.spoiled(9.0, 11.0)
     assert ledger.disguised(10.0, 11.0)
     assert not ledger.disguised(10.0, 10.9), "it still lasts"
@@ -229,7 +229,7 @@ def test_noise_may_have_taken_the_last_byte_of_such_a_reply() -> None:
 def test_on_a_line_without_pacing_such_a_reply_takes_no_time() -> None:
     """Seed 271162 of EI-Bisynch with learned windows."""
     ledger = Ledger(97, 5)
-    ledger._frames.append(Frame(8.0, 11.0, 11.0))
+    ledger._frames.add(Frame(8.0, 11.0, 11.0))
     assert not ledger.disguised(10.0, 11.0)
     ledger.spoiled(11.0, 11.0)
     assert ledger.disguised(10.0, 11.0)
@@ -250,8 +250,9 @@ def test_an_overdue_reply_that_noise_changed_blames_nobody() -> None:
     """Seed 92000 of DC104: noise turned the reply to parameter 2 into one of parameter 3, which was requested then."""
     ledger = Ledger(97, 5)
     changed, whole = Frame(8.0, 9.0, 11.0, b"\x02\x02"), Frame(8.5, 11.0, 12.0, b"\x02\x15")
-    ledger._frames.extend((changed, whole))
-    assert list(ledger.overdue_replies(10.0, 12.0)) == [changed, whole]
+    ledger._frames.add(changed)
+    ledger._frames.add(whole)
+    assert list(ledger.overdue_replies(10.0, 12.0)) == [whole, changed]
     ledger.spoiled(changed.start, changed.end)
     assert list(ledger.overdue_replies(10.0, 12.0)) == [whole]
     assert list(ledger.overdue_replies(10.0, 11.0)) == [], "it begins later"
