@@ -94,7 +94,8 @@ class Histogram:
         for edge, count in self.buckets():
             seen += count
             if seen >= wanted:
-                return min(edge, self._highest)
+                # The first bucket holds times of 0. Its edge, 1e-309, would be read as an error.
+                return 0.0 if edge == _upper_edge(0) else min(edge, self._highest)
         return self._highest
 
     def buckets(self) -> list[tuple[float, int]]:

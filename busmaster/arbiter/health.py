@@ -126,7 +126,7 @@ class NodeRecord:
         self.suspended_until = -inf
         self.has_hook = False
         self.removed = False
-        """It was removed from the line, which sends it nothing of its own accord."""
+        """It was removed from the line."""
         self.holds = 0
         """Number of returns whose on_return hook is still running. Its polls wait."""
         self.stops = 0
@@ -167,6 +167,10 @@ class NodeRecord:
     def silent(self) -> bool:
         """True if the node is not known to answer."""
         return self.unheard >= SILENT
+
+    def is_left_alone(self, now: float) -> bool:
+        """Return True if the line sends it nothing of its own accord: it was removed from the line, or is suspended."""
+        return self.removed or now < self.suspended_until
 
     def latest(self, unknown: float) -> float:
         """Return the longest usual time, in seconds, to the first byte of a reply; `unknown` if none was timed."""

@@ -208,8 +208,7 @@ class InSync:
         for overdue in self.overdue_replies:
             if (
                 overdue.node is None
-                or overdue.node.removed
-                or now < overdue.node.suspended_until
+                or overdue.node.is_left_alone(now)
                 or now >= overdue.until
                 or not (answers is None or _could_be(overdue, answers))
             ):
@@ -443,7 +442,7 @@ def _is_silent(overdue: OverdueReply, now: float) -> bool:
     """Return True if the node of the overdue reply is not known to answer, or no request may be sent to it, so that
     another node's reply must clear it."""
     node = overdue.node
-    return node is None or node.removed or now < node.suspended_until or node.silent or node.last_reply == -inf
+    return node is None or node.is_left_alone(now) or node.silent or node.last_reply == -inf
 
 
 def _is(run: bytes, key: bytes) -> bool:

@@ -154,6 +154,14 @@ def test_quantiles_are_of_what_the_histogram_holds() -> None:
     assert [quantiles.p50, quantiles.p99] == pytest.approx([0.050, 0.099], rel=0.1)
 
 
+def test_the_median_of_waits_most_of_which_took_no_time_is_0() -> None:
+    histogram = Histogram()
+    for seconds in (0.0, -1e-9, 0.0, 0.025):
+        histogram.record(seconds)
+    quantiles = Quantiles.of(histogram)
+    assert (quantiles.p50, quantiles.highest) == (0.0, 0.025)
+
+
 def test_the_utilisation_of_a_line_is_the_share_of_the_time_in_which_it_was_in_use() -> None:
     for busy, quiet_time, elapsed, share in ((0.25, 0.5, 1.5, 0.5), (0.0, 0.0, 0.0, 0.0), (0.6, 0.5, 1.0, 1.0)):
         assert replace(line_statistics(), busy=busy, quiet_time=quiet_time, elapsed=elapsed).utilisation == share
