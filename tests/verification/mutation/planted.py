@@ -47,6 +47,8 @@ class Bug:
     tests: Sequence[str]
     chosen: str
     first: str
+    groups: Sequence[str] = ()
+    """The long checks that notice it too, as `groups.py` found."""
 
 
 def main() -> None:
@@ -89,10 +91,12 @@ def section(file: Path) -> str:
         those = [bug for bug in bugs if bug.chosen == chosen]
         missed = sum(bug.first == "missed" for bug in those)
         lines.append(f"Chosen {chosen}: {len(those)}, {missed} of them missed at first.\n")
-        lines.append("| bug | file | at first | noticed by |\n|---|---|---|---|")
+        also = any(bug.groups for bug in those)
+        lines.append(f"| bug | file | at first | noticed by |{' also by |' * also}\n|---|---|---|---|{'---|' * also}")
         for bug in those:
+            groups = f" {', '.join(bug.groups) or 'none'} |" * also
             tests = "<br>".join(f"`{test}`" for test in bug.tests)
-            lines.append(f"| {bug.bug} | `{bug.file.removeprefix('busmaster/')}` | {bug.first} | {tests} |")
+            lines.append(f"| {bug.bug} | `{bug.file.removeprefix('busmaster/')}` | {bug.first} | {tests} |{groups}")
         lines.append("")
     return "\n".join(lines)
 
