@@ -9,7 +9,7 @@ from decimal import Decimal
 from rich.text import Text
 
 from busmaster.app.cli.output import value_text
-from busmaster.app.service.picture import OLD_AFTER, Frame, Group, Node, Row
+from busmaster.app.service.picture import Frame, Group, Node, Row
 
 BARS = "▁▂▃▄▅▆▇█"
 RIPPLE = 0.1
@@ -213,7 +213,7 @@ def row_line(
     mark, style = MARKS.get(fault, ("", ""))
     age = None if row.asked is None else max(0.0, frame.now - row.asked)
     paused = group is not None and group.paused
-    old = age is not None and group is not None and not paused and age > OLD_AFTER * group.period
+    old = age is not None and group is not None and not paused and age > group.old_after
     health = "offline" if frame.state == "offline" else node.health if node else ""
     cells = {
         "NODE": left(node.label if node else row.node, widths["NODE"]),

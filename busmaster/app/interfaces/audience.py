@@ -9,6 +9,7 @@ from typing import Any
 from busmaster import BusError
 from busmaster.app.interfaces.following import Following, Lost
 from busmaster.app.service.messages import encode_json
+from busmaster.app.service.picture import old_after
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 
 MOST_EXCHANGES = 50
@@ -102,6 +103,9 @@ class Audience:
         if params.get("set", 0) > self._set:
             self._set = params["set"]
             self._sent = {key: text for key, text in self._sent.items() if key[0] not in ("rows", "values")}
+        if method == "groups":
+            aged = [group | {"old_after": old_after(group["period"], group["achieved"])} for group in params["groups"]]
+            params = {**params, "groups": aged}
         key = method, params.get("first", 0)
         self._sent[key] = text = encode_json({"method": method, "body": params})
         for seat in self._seats:

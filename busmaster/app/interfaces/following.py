@@ -14,16 +14,13 @@ from typing import Any
 
 from busmaster import BusError, InvalidCommand, LineDown, NotStarted
 from busmaster.app.service.messages import value_of
-from busmaster.app.service.picture import CURRENT, OLD_AFTER, Picture, Row
+from busmaster.app.service.picture import CURRENT, Picture, Row, old_after
 from busmaster.app.service.remote import RemoteBus, connect
 from busmaster.app.service.remote_overview import RemoteOverview
 
 FIRST_PAUSE = 0.25
 """Seconds before it is tried again to connect; each time twice as long, up to `LONGEST_PAUSE`."""
 LONGEST_PAUSE = 2.0
-LEAST_AGE = 1.0
-"""Seconds without a cycle of its group, at least, after which a value is not current any more. The group may be slower:
-then it is OLD_AFTER of its periods."""
 
 Receive = Callable[[str, Mapping[str, Any]], None]
 
@@ -121,12 +118,9 @@ class Following:
 
         `last_cycles` has the time of the last cycle of each group. All times are on the clock of the line, in seconds.
         """
-        periods = {group.name: max(group.period, group.achieved) for group in self.picture.groups}
-        return {
-            name
-            for name, last in last_cycles.items()
-            if now - last > max(LEAST_AGE, OLD_AFTER * periods.get(name, 0.0))
-        }
+        ages = {group.name: group.old_after for group in self.picture.groups}
+        unknown = old_after(0.0, 0.0)
+        return {name for name, last in last_cycles.items() if now - last > ages.get(name, unknown)}
 
     @property
     def read_only(self) -> bool:

@@ -14,7 +14,9 @@ from busmaster.app.service.touches import Touches
 KEPT_VALUES = 120
 """Of each point, for its trend."""
 OLD_AFTER = 3
-"""Periods of its group after which a value is old."""
+"""Periods of its group without a cycle after which a value is old."""
+LEAST_AGE = 1.0
+"""Seconds after which a value is old at the earliest, however fast its group is."""
 Identity: TypeAlias = tuple[str, str, int]
 """Group and key of a point, and how many like it the group has before it."""
 CURRENT = frozenset(quality.value for quality in Quality if quality.is_current)
@@ -113,6 +115,11 @@ class Group:
     achieved: float = 0.0
     jitter: float = 0.0
     paused: bool = False
+
+    @property
+    def old_after(self) -> float:
+        """Age of its values from which they are old."""
+        return old_after(self.period, self.achieved)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +243,11 @@ class Picture:
         """The nodes, by protocol and address, in the order of the bus."""
         nodes = [node for first in sorted(self._nodes) for node in self._nodes[first]]
         return {(node.protocol, node.address): node for node in nodes[: self.frame.nodes if self.frame else 0]}
+
+
+def old_after(period: float, achieved: float) -> float:
+    """Return the age, in seconds, from which values of a group are old: it had no cycle for so long."""
+    return max(LEAST_AGE, OLD_AFTER * max(period, achieved))
 
 
 def _made(kind: Any, decoded: Mapping[str, Any]) -> Any:

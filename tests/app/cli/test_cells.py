@@ -241,9 +241,9 @@ def test_of_an_error_an_alarm_and_a_quality_the_first_has_the_mark(known: dict[s
     assert cells(point(**known))[""] == mark
 
 
-@pytest.mark.parametrize(("age", "style"), [(0.74, None), (0.76, "bold magenta")])
+@pytest.mark.parametrize(("age", "style"), [(1.44, None), (1.56, "bold magenta")])
 def test_a_value_older_than_three_periods_of_its_group_stands_out(age: float, style: str | None) -> None:
-    line = row_line(point(asked=200.0 - age), NODE, GROUP, FRAME, column_widths(120))
+    line = row_line(point(asked=200.0 - age), NODE, replace(GROUP, period=0.5), FRAME, column_widths(120))
     assert styles(line).get(f"{age:.1f}s") == style
 
 

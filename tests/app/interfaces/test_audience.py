@@ -109,6 +109,15 @@ async def test_a_page_that_joins_gets_the_state_and_the_last_of_each_message() -
 
 
 @pytest.mark.asyncio
+async def test_a_page_is_told_from_which_age_the_values_of_a_group_are_old() -> None:
+    line = Line()
+    seat = pages_of(line).join()
+    line.receive("groups", {"first": 0, "groups": [{"name": "axes", "period": 0.5, "achieved": 0.6}]})
+    [body] = [body for method, body in await taken(seat) if method == "groups"]
+    assert body["groups"] == [{"name": "axes", "period": 0.5, "achieved": 0.6, "old_after": pytest.approx(1.8)}]
+
+
+@pytest.mark.asyncio
 async def test_a_page_is_told_why_the_owner_is_away_and_what_may_not_be_written() -> None:
     line = Line()
     pages = pages_of(line)

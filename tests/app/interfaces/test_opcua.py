@@ -22,7 +22,7 @@ from busmaster.app.interfaces.following import Following
 from busmaster.app.interfaces.opcua import serving
 from busmaster.app.interfaces.opcua_access import Rules
 from busmaster.app.interfaces.opcua_connections import Acceptor, OpcuaServer
-from busmaster.app.service import overview
+from busmaster.app.service import overview, picture
 from busmaster.app.service.authorisation import Authorisation
 from busmaster.app.service.owner_messages import StreamMessage
 from busmaster.app.service.record import WriteRecord
@@ -110,7 +110,7 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(following, "FIRST_PAUSE", 0.001)
         patch.setattr(following, "LONGEST_PAUSE", 0.001)
-        patch.setattr(following, "LEAST_AGE", PATIENCE)  # a machine that stands still makes no value old
+        patch.setattr(picture, "LEAST_AGE", PATIENCE)  # a machine that stands still makes no value old
         servers: list[OpcuaServer] = []
 
         def made() -> OpcuaServer:
@@ -407,10 +407,10 @@ async def test_what_is_not_read_any_more_is_of_some_time_ago(opened: Opened, mon
         group = line.poll("10")
         good = await opened.is_("5/10", "Good")
         group.pause()
-        monkeypatch.setattr(following, "LEAST_AGE", 0.1)
+        monkeypatch.setattr(picture, "LEAST_AGE", 0.1)
         old = await opened.is_("5/10", "UncertainLastUsableValue")
         assert (old.value, old.when >= good.when) == (good.value, True)
-        monkeypatch.setattr(following, "LEAST_AGE", PATIENCE)
+        monkeypatch.setattr(picture, "LEAST_AGE", PATIENCE)
         group.resume()
         assert (await opened.is_("5/10", "Good")).when > old.when
 

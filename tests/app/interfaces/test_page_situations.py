@@ -77,3 +77,22 @@ async def test_a_person_reads_of_a_dead_drive_a_lost_line_and_an_owner_that_is_a
                 await reads(browser, UP, NONE_DOWN, without=OFFLINE)
         await reads(browser, "the values are old", "2 nodes offline", "owner away", OFFLINE, without=UP)
         assert browser.complaints() == []
+
+
+@pytest.mark.slow
+@pytest.mark.asyncio
+async def test_the_row_of_a_paused_group_is_drawn_as_old_until_the_group_goes_on(
+    browser: Browser, tmp_path: Path
+) -> None:
+    is_old = "given[0] === document.querySelector('#point-rows .point')?.classList.contains('old')"
+    port = MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False))
+    async with asyncio.timeout(PATIENCE), page(tmp_path) as of, Bus(port) as bus:
+        group = bus.poll_group("axes", period=0.05, points=[Hcp2Controller(bus, 5).point("10")])
+        async with Service(bus, authorisation=Authorisation(bus), path=tmp_path / "line.sock"):
+            await asyncio.to_thread(browser.open, of.url)
+            await reads(browser, "node 5", UP)
+            await asyncio.to_thread(browser.until, is_old, False)
+            group.pause()
+            await asyncio.to_thread(browser.until, is_old, True)
+            group.resume()
+            await asyncio.to_thread(browser.until, is_old, False)

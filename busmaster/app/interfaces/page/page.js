@@ -7,7 +7,6 @@ import { Wire } from "./wire.js";
 import { draw_trend } from "./trend.js";
 
 const MOST_SHOWN = 1000;
-const OLD_AFTER = 3; // periods after which a value's age is worth a look
 const AGAIN = 1000; // milliseconds before it is tried again to connect
 const FIRST_WAIT = 2000; // milliseconds in which the first picture of the line may be incomplete
 const WIRE_EVERY = 50, VALUES_EVERY = 150; // milliseconds from one drawing to the next
@@ -192,7 +191,7 @@ function draw_points() {
     for (const { row } of before.values()) in_sight.unobserve(row);
     by("point-rows").replaceChildren(...made);
   }
-  const ink = colours(), periods = new Map(line.all_groups.map((group) => [group.name, group.period]));
+  const ink = colours(), ages = new Map(line.all_groups.map((group) => [group.name, group.old_after]));
   const lost = is_lost(), may_write = !allowed().read_only, now = performance.now();
   const all_due = now - all_drawn > OUT_OF_SIGHT_EVERY;
   if (all_due) all_drawn = now;
@@ -200,7 +199,7 @@ function draw_points() {
   for (const row of rows) {
     const cells = shown_rows.get(row.place + row.name);
     if (!cells.in_sight && cells.fact && !all_due) continue;
-    fill_row(cells, row, periods, lost, may_write);
+    fill_row(cells, row, ages, lost, may_write);
     if (cells.in_sight) to_draw.push(cells);
   }
   show_reasons(rows, lost);
@@ -283,10 +282,10 @@ function quality_text(row, lost) {
   return ALARMS[row.alarm] ?? (row.quality || "not read yet");
 }
 
-function fill_row(cells, row, periods, lost, may_write) {
+function fill_row(cells, row, ages, lost, may_write) {
   cells.fact = row;
   const age = row.asked === null ? null : Math.max(0, line.now - row.asked);
-  const old = age !== null && age > OLD_AFTER * (periods.get(row.group) ?? 1) + 0.5;
+  const old = age !== null && age > (ages.get(row.group) ?? Infinity);
   const text = shown(row.value, row.precision), long = typeof row.value === "string" && text.length > LONG_TEXT;
   const kind = lost || row.error ? "bad" : row.alarm ? "alarm" : old || row.quality === "stale" ? "old" : "";
   set(cells.row, "className", `point ${kind}${long ? " long" : ""}${cells.reason_text ? " failed" : ""}`);
