@@ -132,6 +132,7 @@ def test_a_line_has_twenty_thousand_points_at_most(monkeypatch: pytest.MonkeyPat
             ConfiguredLine(parsed(more), outputs=False)
     with pytest.raises(FileError, match=r"groups\.g\.points\[1\]: 'd1-9/1,2,3' expands to more than 20 points"):
         ConfiguredLine(parsed(TEXT.replace("d1-9/1", "d1-9/1,2,3")), outputs=False)
+    assert len(ConfiguredLine(parsed(TEXT.replace("d1-9/1", "d1-2/1-10")), outputs=False).members("g")) == 20
 
 
 def test_only_regular_files_of_bounded_size_are_read(tmp_path: Path) -> None:

@@ -318,6 +318,19 @@ def test_a_name_that_looks_like_a_range_is_the_point_or_the_symbol_with_this_nam
     ]
     with pytest.raises(InvalidCommand, match="no such item 'zone1'"):
         list(configured.points_named("press/zone1-2"))
+    configured = line(f'{SLOW}{PRESS}symbols = {{ cam = 3000 }}\npoints = {{ "cam:1-2" = {{ item = "2008" }} }}\n')
+    assert [point.source.item for point in configured.points_named("press/cam:1-2,cam:3-4")] == [
+        *("2008", "cam:3", "cam:4")
+    ]
+
+
+def test_names_of_nodes_and_points_may_be_listed_with_spaces_and_none_may_be_missing() -> None:
+    drives = f'{HEAD}[nodes.drive1-2]\nprotocol = "hcp2"\naddress = "1-2"\n{NODE}'
+    found = [point.key for point in line(drives).points_named("winder , drive1-2/1 , 2")]
+    assert found == ["winder/1", "winder/2", "drive1/1", "drive1/2", "drive2/1", "drive2/2"]
+    for text, list_ in (("winder,,drive1/1", "winder,,drive1"), ("winder,/1", "winder,"), ("winder/1,,2", "1,,2")):
+        with pytest.raises(InvalidCommand, match=f"a name is missing in '{list_}'; remove a comma, or add the name"):
+            list(line(drives).points_named(text))
 
 
 # outputs and the emulator

@@ -93,6 +93,13 @@ def test_one_bit_may_be_polled_without_its_word() -> None:
     assert [point.key for point in line.members("axes")] == ["w/a.A1-3"]
 
 
+def test_a_bit_of_a_point_whose_name_has_a_dot_is_found() -> None:
+    word = '"drive.status" = { item = "10", bits = { READY = 0 } }' + GROUP.replace("w/a", "w/drive.status")
+    line = parse("hcp2", word)
+    assert [point.key for point in line.members("axes")] == ["w/drive.status", "w/drive.status.READY"]
+    assert line.point("w/drive.status.READY").bits == ()
+
+
 def test_bits_are_told_to_outputs_as_their_word_is() -> None:
     line = parse("hcp2", 'a = { item = "10", bits = { READY = 0 }, deadband = 0, heartbeat = 60 }')
     assert line.point("w/a.READY").meaning == Meaning(deadband=0, heartbeat=60)
