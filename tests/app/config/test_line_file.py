@@ -218,6 +218,20 @@ def test_symbols_stand_for_addresses_of_thirty_two_bits() -> None:
     assert nodes["press"].options["symbols"] == {"first": 0, "last": 0xFFFF_FFFF}
 
 
+def test_a_file_of_symbols_may_have_any_bytes_in_its_texts_and_is_named_where_it_is_wrong(tmp_path: Path) -> None:
+    listing, path = tmp_path / "press.lst", tmp_path / "line.toml"
+    path.write_text(f'{SLOW}{PRESS}symbols = "press.lst"\n')
+    listing.write_bytes(b" GRAD \xb0C.MAC\n DATA TABLE\n count 2008\n")
+    assert load(path).nodes["press"].options["symbols"] == {"count": 2008}
+    listing.write_text("DATA TABLE\ncount 2008\nb\n")
+    with pytest.raises(FileError, match=rf"line.toml:5: nodes.press.symbols: {tmp_path}/press.lst: 1 line of its data"):
+        load(path)
+    listing.unlink()
+    listing.mkdir()
+    with pytest.raises(FileError, match=r"line.toml:5: nodes.press.symbols: .* cannot be read: Is a directory"):
+        load(path)
+
+
 def test_a_time_is_at_most_the_longest_that_the_reference_names() -> None:
     timing = "timing = {{ window = 0.1, max_reply_delay = {} }}"
     assert parse(HEAD + NODE + timing.format(10)).nodes["winder"].timings is not None

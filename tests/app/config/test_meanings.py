@@ -254,6 +254,7 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("hcp2", 'item = "10", high = 1, hysteresis = -1', "hysteresis: is 0 or more, not -1"),
         ("hcp2", 'item = "10", low = 0, high = 1, hysteresis = 2', "hysteresis: must be less than the 1 between low"),
         ("dc104", 'item = "12", decimals = 2', "decimals: dc104 has no implied decimals; use factor = 0.01"),
+        ("dc104", 'item = "12", decimals = 9', "decimals: dc104 has no implied decimals; use factor = 0.000000001 to"),
         ("ct-ansi", 'item = "1.21", decimals = 10', "decimals: must be 0 to 9, not 10"),
     ],
 )

@@ -34,6 +34,14 @@ def test_a_value_is_written_in_its_unit_and_read_as_the_lines_number(tmp_path: P
         write_set(path, whole, KIND)
 
 
+def test_a_value_with_more_decimals_than_its_parameter_is_rounded_as_the_line_carries_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    write_set(str(path), replace(EMPTY, entries={"1.17": Entry(WANTED[0], -476)}), KIND)
+    for written, number in (("-47.64", -476), ("-47.65", -477), ("-47", -470)):
+        path.write_text(path.read_text().replace(path.read_text().partition("value = ")[2].split(",")[0], written))
+        assert repr(read_set(str(path)).set.entries["1.17"].value) == str(number)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
@@ -319,6 +327,14 @@ def test_parameters_of_a_line_are_those_of_the_document_with_what_the_file_adds(
     other = found["2.05"]
     assert (other.name, other.factor, other.offset) == (document["2.05"].name, 3, 1)
     assert other.kept == "LINE.toml has writable = false"
+
+
+def test_a_run_of_the_file_keeps_no_point_behind_it_out_of_the_set() -> None:
+    run, rest = 'points.run = { item = "1.17:2" }\n', TEXT.partition("points.run")[0]
+    line = ConfiguredLine(read(Source("line.toml", rest.replace("points.ramp", f"{run}points.ramp"))), outputs=False)
+    found = {one.item: one for one in line_parameters(line, "screw", line.nodes["screw"])}
+    assert "1.17:2" not in found
+    assert (found["2.04"].name, found["2.04"].minimum) == ("ramp", 0.5)
 
 
 def test_items_of_a_parameter_set_can_be_named_as_the_points_of_the_file() -> None:
