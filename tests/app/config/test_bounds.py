@@ -65,6 +65,11 @@ def test_what_is_too_deep_or_too_long_is_refused_with_its_line(text: str, compla
     assert str(caught.value).startswith(complaint)
 
 
+def test_the_line_of_what_is_too_long_counts_those_of_texts_before_it() -> None:
+    with pytest.raises(FileError, match=r"^line\.toml:5: a number or a key must have at most"):
+        Source("line.toml", f'a = """\n\n"""\n\n{(bounds.LONGEST_WORD + 1) * "x"} = 1\n')
+
+
 def test_what_is_just_within_the_bounds_is_read_even_from_a_deep_stack() -> None:
     deep, names = "[" * bounds.MOST_NESTED + "]" * bounds.MOST_NESTED, ".".join("a" * bounds.MOST_NESTED)
     text = f'a = {deep}\nb.{names[2:]} = 1\nc = "{"x" * (bounds.LONGEST_TEXT - 2)}"\nd = 1{"0" * 199}\n# {"[" * 999}\n'

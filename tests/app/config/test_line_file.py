@@ -410,6 +410,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (f"{HEAD}{NODE}points.a = {{ factor = inf }}", "nodes.winder.points.a.factor: must be finite, not inf"),
         ('port = "rfc2217://h:1"', "line.toml:1: port: rfc2217://h:1: no baud rate given"),
         ('[port]\nhost = "h"\nport = 1\nparity = "E"', "line.toml:4: port.parity: no such key"),
+        ('[port]\nhost = "h"\nport = 1\nrfc2217 = true', "line.toml:1: port: 'baudrate' is missing, and the nodes' p"),
         ('[port]\nhost = "h"\nport = 1\nrfc2217 = 1', "line.toml:4: port.rfc2217: must be true or false, not 1"),
         ('[port]\npath = "/dev/ttyS0"\nbaud = 9600', "line.toml:3: port.baud: no such key; did you mean 'baudrate'?"),
         (f'[port]\npath = "/dev/ttyS0"\nparity = "Q"\n{NODE}', "line.toml:1: port: no such framing: 8Q1"),
@@ -421,6 +422,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         ),
         (f"{HEAD}{NODE}adress = 1", "line.toml:5: nodes.winder.adress: no such key; did you mean 'address'?"),
         (f'{HEAD}[nodes.a]\nprotocol = "hcp"\naddress = 16', "line.toml:4: nodes.a.address: hcp: address 16 does not"),
+        (f'{HEAD}[nodes.a1-2]\nprotocol = "hcp"\naddress = "15-16"', "nodes.a1-2.address: hcp: address 16 does not"),
         (f'{HEAD}[nodes.a]\nprotocol = "hcp"\naddress = "x"', "line.toml:4: nodes.a.address: an address is a number"),
         (
             f'{HEAD}[nodes.a]\nprotocol = "mentor"\naddress = 0',

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import busmaster
-from busmaster import Bus, BusClosed, InvalidCommand, MemoryPort, NoReply, WriteUnconfirmed
+from busmaster import Bus, BusClosed, InvalidCommand, MemoryPort, NoReply, NotStarted, WriteUnconfirmed
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import FileError, Source
@@ -178,6 +178,36 @@ profile = { item = "cam:40", unit = "mm", factor = 0.001 }
             assert found == tuple(125 * i for i in range(40))
 
     run_in_virtual_time(main())
+
+
+CAM = """
+port = "/dev/ttyUSB0"
+[nodes.press]
+protocol = "msc"
+address = 1
+address_step = 4
+points.profile = { item = "3000:40" }
+points.length = { item = "2008" }
+"""
+
+
+@pytest.mark.parametrize(("name", "value"), [("profile", 40 * [1]), ("length", 1)])
+def test_a_write_to_a_point_has_the_options_that_it_is_given(name: str, value: object) -> None:
+    async def main() -> None:
+        async with opened(CAM) as line:
+            reading = asyncio.ensure_future(line.point("press/2012").read())
+            await asyncio.sleep(0)  # the write waits until it has its reply
+            with pytest.raises(NotStarted):
+                await line.point(f"press/{name}").write(value, start_within=1e-6)
+            assert await reading == 0
+
+    run_in_virtual_time(main())
+
+
+@pytest.mark.parametrize("name", ["length", "2008"])
+def test_a_value_with_decimals_for_a_whole_number_without_a_scale_is_refused_and_not_rounded(name: str) -> None:
+    with pytest.raises(InvalidCommand, match=r"a value must be a whole number, not 4\.7"):
+        opened(CAM).prepare_write(f"press/{name}", [4.7])
 
 
 def test_a_node_answers_by_its_name_in_errors() -> None:
