@@ -302,6 +302,16 @@ def test_several_points_are_added_to_inline_points_behind_the_last() -> None:
     assert 'points = { c = { item = "12" }, d = { item = "13" } }\n' in empty.text
 
 
+def test_new_points_of_several_nodes_are_added_to_each_of_them() -> None:
+    held = read(Source("line.toml", f'{HEAD}[nodes.x]\nprotocol = "hcp2"\naddress = 6\n'))
+    back = take(held, "node,point,item", "x,b,11", "w,a,10", "x,c,12")
+    nodes = tomllib.loads(back.text)["nodes"]
+    assert (nodes["w"]["points"], nodes["x"]["points"]) == (
+        {"a": {"item": "10"}},
+        {"b": {"item": "11"}, "c": {"item": "12"}},
+    )
+
+
 def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
     (tmp_path / "ours.toml").write_text(
         'protocol = "hcp2"\n[points]\na = { item = "10", maximum = 5 }\nz = { item = "12" }\n'
