@@ -672,6 +672,7 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
     done = busmaster("doctor", controllers.path, *HCP2, "--nodes", "8,77", "--capture", str(file))
     assert done.status == 1
     assert "the adapter checks do not apply to a TCP port" in done.out
+    assert "-> check the server's own: line settings, and bytes passed on at once" in done.out
     assert "FAIL  node 77     does not reply\n" in done.out
     assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to fix\n"
     with file.open("rb") as capture:
