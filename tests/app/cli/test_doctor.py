@@ -181,6 +181,8 @@ def test_settings_that_are_not_usual_are_noted_where_the_port_is_opened() -> Non
     line = Line(LineSettings(19200), [hcp2(1)], chance=random.Random(1))
     finding = examined(line, (1,)).on("open")
     assert finding == Finding("open", True, "it opens at 19200 8N1", "Host Comms Protocol 2 usually has 57600 8N1")
+    line = Line(LineSettings(57600, 8, "E"), [hcp2(1)], chance=random.Random(1))
+    assert examined(line, (1,)).on("open").advice == "Host Comms Protocol 2 usually has 57600 8N1"
     assert examined(line_of("hcp2", [hcp2(1)]), (1,)).on("open").advice == ""
 
 

@@ -194,12 +194,15 @@ def test_a_set_of_another_kind_of_node_or_with_an_item_that_it_does_not_have_is_
         read_set(str(path)).check(handle)
 
 
-def test_a_set_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_set_that_cannot_be_written_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
     def full(_: object) -> None:
-        raise OSError(28, "No space left on device")
+        raise error
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(type(error)):
         write_set(str(tmp_path / "a.toml"), EMPTY, KIND)
     assert not list(tmp_path.iterdir())
 
@@ -278,6 +281,15 @@ def test_a_save_that_was_interrupted_before_its_first_parameter_starts_again(tmp
             fresh.add(Found(one, 5))
     assert list(fresh.finish().entries) == [one.item for one in WANTED]  # in the order of the list
     assert list(read_set(str(path)).set.entries) == [one.item for one in WANTED]
+
+
+def test_a_save_that_started_again_goes_on_when_it_is_interrupted_again(tmp_path: Path) -> None:
+    path = str(tmp_path / "a.toml")
+    (tmp_path / "a.toml.part").write_text("# of the list\n")
+    with PartFile(path, EMPTY, WANTED, KIND) as part:
+        part.add(Found(WANTED[0], 5))
+    with PartFile(path, EMPTY, WANTED, KIND) as part:
+        assert part.missing == (*WANTED[1:],)
 
 
 def test_a_continued_save_keeps_its_start_and_why_parameters_have_no_value(tmp_path: Path) -> None:
