@@ -106,6 +106,8 @@ def _texts(source: Source, way: Key) -> Iterator[str]:
     yield str(way[-1])
     value: object = source.data
     for step in way:
+        if isinstance(value, str):
+            break  # one text in place of a list of texts
         if not isinstance(value, dict | list):
             return
         try:

@@ -181,6 +181,8 @@ def test_settings_that_are_not_usual_are_noted_where_the_port_is_opened() -> Non
     line = Line(LineSettings(19200), [hcp2(1)], chance=random.Random(1))
     finding = examined(line, (1,)).on("open")
     assert finding == Finding("open", True, "it opens at 19200 8N1", "Host Comms Protocol 2 usually has 57600 8N1")
+    line = Line(LineSettings(57600, 8, "E"), [hcp2(1)], chance=random.Random(1))
+    assert examined(line, (1,)).on("open").advice == "Host Comms Protocol 2 usually has 57600 8N1"
     assert examined(line_of("hcp2", [hcp2(1)]), (1,)).on("open").advice == ""
 
 
@@ -672,6 +674,7 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
     done = busmaster("doctor", controllers.path, *HCP2, "--nodes", "8,77", "--capture", str(file))
     assert done.status == 1
     assert "the adapter checks do not apply to a TCP port" in done.out
+    assert "-> check the server's own: line settings, and bytes passed on at once" in done.out
     assert "FAIL  node 77     does not reply\n" in done.out
     assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to fix\n"
     with file.open("rb") as capture:

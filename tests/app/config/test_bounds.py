@@ -65,6 +65,11 @@ def test_what_is_too_deep_or_too_long_is_refused_with_its_line(text: str, compla
     assert str(caught.value).startswith(complaint)
 
 
+def test_the_line_of_what_is_too_long_counts_those_of_texts_before_it() -> None:
+    with pytest.raises(FileError, match=r"^line\.toml:5: a number or a key must have at most"):
+        Source("line.toml", f'a = """\n\n"""\n\n{(bounds.LONGEST_WORD + 1) * "x"} = 1\n')
+
+
 def test_what_is_just_within_the_bounds_is_read_even_from_a_deep_stack() -> None:
     deep, names = "[" * bounds.MOST_NESTED + "]" * bounds.MOST_NESTED, ".".join("a" * bounds.MOST_NESTED)
     text = f'a = {deep}\nb.{names[2:]} = 1\nc = "{"x" * (bounds.LONGEST_TEXT - 2)}"\nd = 1{"0" * 199}\n# {"[" * 999}\n'
@@ -132,6 +137,7 @@ def test_a_line_has_twenty_thousand_points_at_most(monkeypatch: pytest.MonkeyPat
             ConfiguredLine(parsed(more), outputs=False)
     with pytest.raises(FileError, match=r"groups\.g\.points\[1\]: 'd1-9/1,2,3' expands to more than 20 points"):
         ConfiguredLine(parsed(TEXT.replace("d1-9/1", "d1-9/1,2,3")), outputs=False)
+    assert len(ConfiguredLine(parsed(TEXT.replace("d1-9/1", "d1-2/1-10")), outputs=False).members("g")) == 20
 
 
 def test_only_regular_files_of_bounded_size_are_read(tmp_path: Path) -> None:

@@ -363,6 +363,20 @@ def test_what_an_emulated_device_cannot_be_is_said_with_its_place_and_nearest_na
     assert str(caught.value).count("line.toml") == 1
 
 
+def test_a_name_that_the_file_has_is_not_guessed_where_its_value_is_refused() -> None:
+    text = node("hcp2", 1, "points.speed = { item = '1' }", "values = { speed = 1e300 }")
+    with pytest.raises(FileError, match=r"values\.speed: element 1 holds .*, not 1e\+300$"):
+        emulated_line(read(Source("line.toml", text)))
+
+
+def test_a_range_of_emulated_nodes_that_is_none_is_an_error_at_its_table() -> None:
+    text = f"{node('hcp2', 1)}\n[emulator.nodes.n3-2]\nlively = true\n"
+    with pytest.raises(
+        FileError, match=r"line\.toml:\d+: emulator\.nodes\.n3-2: the range 3-2 is descending; write 2-3"
+    ):
+        read(Source("line.toml", text))
+
+
 @pytest.mark.parametrize("ripple", [0, 1])
 def test_a_number_can_be_each_end_of_its_range(ripple: float) -> None:
     assert device_of(node("mentor", 14, emulated=f"ripple = {ripple}")).ripple == ripple

@@ -218,6 +218,20 @@ def test_symbols_stand_for_addresses_of_thirty_two_bits() -> None:
     assert nodes["press"].options["symbols"] == {"first": 0, "last": 0xFFFF_FFFF}
 
 
+def test_a_file_of_symbols_may_have_any_bytes_in_its_texts_and_is_named_where_it_is_wrong(tmp_path: Path) -> None:
+    listing, path = tmp_path / "press.lst", tmp_path / "line.toml"
+    path.write_text(f'{SLOW}{PRESS}symbols = "press.lst"\n')
+    listing.write_bytes(b" GRAD \xb0C.MAC\n DATA TABLE\n count 2008\n")
+    assert load(path).nodes["press"].options["symbols"] == {"count": 2008}
+    listing.write_text("DATA TABLE\ncount 2008\nb\n")
+    with pytest.raises(FileError, match=rf"line.toml:5: nodes.press.symbols: {tmp_path}/press.lst: 1 line of its data"):
+        load(path)
+    listing.unlink()
+    listing.mkdir()
+    with pytest.raises(FileError, match=r"line.toml:5: nodes.press.symbols: .* cannot be read: Is a directory"):
+        load(path)
+
+
 def test_a_time_is_at_most_the_longest_that_the_reference_names() -> None:
     timing = "timing = {{ window = 0.1, max_reply_delay = {} }}"
     assert parse(HEAD + NODE + timing.format(10)).nodes["winder"].timings is not None
@@ -318,6 +332,19 @@ def test_a_name_that_looks_like_a_range_is_the_point_or_the_symbol_with_this_nam
     ]
     with pytest.raises(InvalidCommand, match="no such item 'zone1'"):
         list(configured.points_named("press/zone1-2"))
+    configured = line(f'{SLOW}{PRESS}symbols = {{ cam = 3000 }}\npoints = {{ "cam:1-2" = {{ item = "2008" }} }}\n')
+    assert [point.source.item for point in configured.points_named("press/cam:1-2,cam:3-4")] == [
+        *("2008", "cam:3", "cam:4")
+    ]
+
+
+def test_names_of_nodes_and_points_may_be_listed_with_spaces_and_none_may_be_missing() -> None:
+    drives = f'{HEAD}[nodes.drive1-2]\nprotocol = "hcp2"\naddress = "1-2"\n{NODE}'
+    found = [point.key for point in line(drives).points_named("winder , drive1-2/1 , 2")]
+    assert found == ["winder/1", "winder/2", "drive1/1", "drive1/2", "drive2/1", "drive2/2"]
+    for text, list_ in (("winder,,drive1/1", "winder,,drive1"), ("winder,/1", "winder,"), ("winder/1,,2", "1,,2")):
+        with pytest.raises(InvalidCommand, match=f"a name is missing in '{list_}'; remove a comma, or add the name"):
+            list(line(drives).points_named(text))
 
 
 # outputs and the emulator
@@ -383,6 +410,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (f"{HEAD}{NODE}points.a = {{ factor = inf }}", "nodes.winder.points.a.factor: must be finite, not inf"),
         ('port = "rfc2217://h:1"', "line.toml:1: port: rfc2217://h:1: no baud rate given"),
         ('[port]\nhost = "h"\nport = 1\nparity = "E"', "line.toml:4: port.parity: no such key"),
+        ('[port]\nhost = "h"\nport = 1\nrfc2217 = true', "line.toml:1: port: 'baudrate' is missing, and the nodes' p"),
         ('[port]\nhost = "h"\nport = 1\nrfc2217 = 1', "line.toml:4: port.rfc2217: must be true or false, not 1"),
         ('[port]\npath = "/dev/ttyS0"\nbaud = 9600', "line.toml:3: port.baud: no such key; did you mean 'baudrate'?"),
         (f'[port]\npath = "/dev/ttyS0"\nparity = "Q"\n{NODE}', "line.toml:1: port: no such framing: 8Q1"),
@@ -394,6 +422,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         ),
         (f"{HEAD}{NODE}adress = 1", "line.toml:5: nodes.winder.adress: no such key; did you mean 'address'?"),
         (f'{HEAD}[nodes.a]\nprotocol = "hcp"\naddress = 16', "line.toml:4: nodes.a.address: hcp: address 16 does not"),
+        (f'{HEAD}[nodes.a1-2]\nprotocol = "hcp"\naddress = "15-16"', "nodes.a1-2.address: hcp: address 16 does not"),
         (f'{HEAD}[nodes.a]\nprotocol = "hcp"\naddress = "x"', "line.toml:4: nodes.a.address: an address is a number"),
         (
             f'{HEAD}[nodes.a]\nprotocol = "mentor"\naddress = 0',

@@ -93,6 +93,13 @@ def test_one_bit_may_be_polled_without_its_word() -> None:
     assert [point.key for point in line.members("axes")] == ["w/a.A1-3"]
 
 
+def test_a_bit_of_a_point_whose_name_has_a_dot_is_found() -> None:
+    word = '"drive.status" = { item = "10", bits = { READY = 0 } }' + GROUP.replace("w/a", "w/drive.status")
+    line = parse("hcp2", word)
+    assert [point.key for point in line.members("axes")] == ["w/drive.status", "w/drive.status.READY"]
+    assert line.point("w/drive.status.READY").bits == ()
+
+
 def test_bits_are_told_to_outputs_as_their_word_is() -> None:
     line = parse("hcp2", 'a = { item = "10", bits = { READY = 0 }, deadband = 0, heartbeat = 60 }')
     assert line.point("w/a.READY").meaning == Meaning(deadband=0, heartbeat=60)
@@ -247,6 +254,7 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("hcp2", 'item = "10", high = 1, hysteresis = -1', "hysteresis: is 0 or more, not -1"),
         ("hcp2", 'item = "10", low = 0, high = 1, hysteresis = 2', "hysteresis: must be less than the 1 between low"),
         ("dc104", 'item = "12", decimals = 2', "decimals: dc104 has no implied decimals; use factor = 0.01"),
+        ("dc104", 'item = "12", decimals = 9', "decimals: dc104 has no implied decimals; use factor = 0.000000001 to"),
         ("ct-ansi", 'item = "1.21", decimals = 10', "decimals: must be 0 to 9, not 10"),
     ],
 )

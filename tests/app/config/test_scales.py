@@ -112,7 +112,13 @@ def test_a_name_that_is_known_as_it_stands_is_no_range() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "complaint"), [("3-1", "the range 3-1 is descending; write 1-3"), ("0-5000", "has more than 1000 names")]
+    ("name", "complaint"),
+    [
+        ("3-1", "the range 3-1 is descending; write 1-3"),
+        ("0-5000", "has more than 1000 names"),
+        ("0-1000", "the range 0-1000 has more than 1000 names; use a shorter one"),
+        (f"{60 * 'x'}1-99y1-99", f"^'{40 * 'x'}' expands to more than 1000 names; use shorter ranges"),
+    ],
 )
 def test_a_range_that_cannot_be_is_refused(name: str, complaint: str) -> None:
     with pytest.raises(InvalidCommand, match=complaint):

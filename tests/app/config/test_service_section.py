@@ -18,7 +18,7 @@ from busmaster.app.config import FileError, LineFile
 from busmaster.app.config.sections import read
 from busmaster.app.config.service import read_tokens
 from busmaster.app.config.source import Source
-from busmaster.app.line import ConfiguredLine
+from busmaster.app.line import ConfiguredLine, configured_line
 from busmaster.app.service.permission import Access, Permission, digest_of
 from busmaster.app.service.rights import Role
 from busmaster.contract.bounds import LONGEST_FILE
@@ -120,6 +120,16 @@ def test_what_is_no_point_that_could_be_written_is_refused_with_its_place(said: 
     with pytest.raises(FileError, match=complaint.replace("reel*", r"reel\*")) as refused:
         role(said)
     assert str(refused.value).startswith("line.toml:")
+
+
+def test_what_cannot_be_permitted_alone_is_refused_with_the_node_that_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Nothing:
+        """No command is placed."""
+
+    monkeypatch.setattr(configured_line, "Placed", Nothing)
+    with pytest.raises(FileError, match=r"drive1/speed cannot be permitted alone; permit drive1/\*$"):
+        role('allow_writes = "drive*/speed"')
+    assert only("drive1/*") == {("hcp2", 11): None}
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,16 @@ def test_a_wrong_item_of_a_protocol_is_an_error_at_the_node_that_does_not_have_i
 
 
 @pytest.mark.parametrize(
-    "key", ['probe = "holding:1"', 'sync_reads = ["holding:1", "holding:2"]', "reply_time = 0.01", "retries = 1"]
+    "key",
+    [
+        'probe = "holding:1"',
+        'sync_reads = ["holding:1", "holding:2"]',
+        "reply_time = 0.01",
+        "retries = 1",
+        "timing = { window = 0.25 }",
+        'timing = "learned"',
+        "registers_per_read = 10",
+    ],
 )
 def test_another_setting_of_a_node_needs_a_restart(key: str) -> None:
     with pytest.raises(InvalidCommand, match="changes of node 'press' need a restart"):

@@ -142,6 +142,12 @@ def test_a_template_that_there_is_not_is_an_error_with_the_nearest(template: str
         line(tmp_path, f'template = "{template}"\n')
 
 
+def test_a_template_of_several_protocols_names_all_of_them_to_a_node_of_another(tmp_path: Path) -> None:
+    (tmp_path / "ours.toml").write_text(OURS)
+    with pytest.raises(FileError, match=r"ours.toml is for nodes of hcp and hcp2, not of mentor; use another"):
+        line(tmp_path, 'template = "ours.toml"\n', kind="mentor")
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [

@@ -133,15 +133,16 @@ def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("/dev/pts/99999")
     (tmp_path / "null").symlink_to("/dev/null")
-    for name, says in (
-        ("file", "is not a device"),
-        ("link", "which is gone"),
-        ("none", "does not exist"),
-        ("null", "is not a serial port"),
+    for name, says, advice in (
+        ("file", "is not a device", "give the path of a serial port"),
+        ("link", "points to /dev/pts/99999, which is gone", "plug it in again"),
+        ("none", "does not exist", "see `python -m serial.tools.list_ports`"),
+        ("null", "is not a serial port", "see `python -m serial.tools.list_ports`"),
     ):
         (finding,) = inspect(str(tmp_path / name))
         assert not finding.ok
         assert says in finding.what
+        assert finding.advice == advice
 
 
 def test_a_port_that_may_not_be_opened_names_its_group(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:

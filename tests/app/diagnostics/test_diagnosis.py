@@ -50,6 +50,13 @@ def test_bytes_before_any_request_are_those_of_a_master_or_noise() -> None:
         assert noise.advice.startswith("look for a second master, a babbling node, missing biasing")
 
 
+def test_a_request_of_a_master_that_came_damaged_is_noise() -> None:
+    request = bytes.fromhex("01 03 00 00 00 01 84 0a")
+    assert diagnosis.unexpected(request, "modbus").what.startswith("another master is active, so nothing was sent: ")
+    for damaged, protocol in ((request[:-1] + b"\x0b", "modbus"), (bytes.fromhex("07 30 35 02 30 31 05 04"), "hcp2")):
+        assert diagnosis.unexpected(damaged, protocol).what.startswith("8 unexpected bytes were received: ")
+
+
 @pytest.mark.parametrize(
     ("heard", "declared", "ok", "what", "advice"),
     [

@@ -23,12 +23,13 @@ class Attempts(Tap):
 
     def __init__(self) -> None:
         self.ended: list[Attempt] = []
+        self.of_bytes: list[Attempt | None] = []
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        pass
+        self.of_bytes.append(attempt)
 
     def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
-        pass
+        self.of_bytes.append(attempt)
 
     def attempted(self, attempt: Attempt, /) -> None:
         self.ended.append(attempt)
@@ -52,6 +53,29 @@ def test_an_echo_that_differs_is_recorded_as_a_spoilt_exchange(
 
     assert run_in_virtual_time(ask()) is outcome
     assert [attempt.verdict for attempt in tap.ended] == [verdict]
+
+
+def test_each_byte_of_a_probe_is_recorded_with_its_attempt_and_each_attempt_has_its_number() -> None:
+    profile, tap = find("hcp2").profile, Attempts()
+    line = Line(SETTINGS, [make_device("hcp2", 3)], chance=random.Random(1))
+
+    async def ask() -> None:
+        async with opened(MemoryPort(line), tap) as wire:
+            prober = Prober(wire, profile, profile.timings, SETTINGS.byte_time, echo=False)
+            for node in (3, 4):
+                await prober.ask(node)
+            assert wire.attempt is None
+
+    run_in_virtual_time(ask())
+    assert [(attempt.transaction, attempt.address, attempt.verdict) for attempt in tap.ended] == [
+        (1, 3, Verdict.OK),
+        (2, 4, Verdict.NO_REPLY),
+    ]
+    assert {attempt.purpose for attempt in tap.ended} == {"probe"}
+    replied, silent = tap.ended
+    assert [attempt is replied for attempt in tap.of_bytes] == [True] * (len(tap.of_bytes) - 1) + [False]
+    assert len(tap.of_bytes) > 2, "the request of each, and a reply"
+    assert tap.of_bytes[-1] is silent
 
 
 @pytest.mark.parametrize(("delay", "outcome"), [(0.149, Outcome.ANSWERED), (0.17, Outcome.SILENT)])

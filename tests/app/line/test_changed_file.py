@@ -135,6 +135,14 @@ def test_another_port_or_other_settings_of_a_node_need_a_restart(old: str, new: 
         check_same_line(before, after)
 
 
+@in_virtual_time
+async def test_a_changed_file_may_name_a_template_for_a_node_that_had_none() -> None:
+    drive = '[nodes.drive]\nprotocol = "microflex"\naddress = 6\n'
+    async with ConfiguredLine(file(drive), port=MemoryPort(emulated_line(file(drive))), outputs=False) as line:
+        await line.take(file(f'{drive}template = "microflex"\n'))
+        assert line.point("drive/speed_measured").unit == line.file.nodes["drive"].points["speed_measured"].unit != ""
+
+
 @pytest.mark.parametrize(("protocol", "restart"), [("hcp2", False), ("mentor", True)])
 def test_decimals_of_a_point_need_a_restart_where_the_handle_applies_them(protocol: str, restart: bool) -> None:
     text = f'[nodes.screw]\nprotocol = "{protocol}"\naddress = 14\npoints.a = {{ item = "%s", factor = 0.1 }}\n'

@@ -173,6 +173,7 @@ WRONG = {
     "no nodes": HEAD,
     "a table that is none": f'{HEAD}nodes = "all"\n',
     "a node that is no table": f"{HEAD}[nodes]\nwinder = 5\n",
+    "groups that are no table": f"groups = 5\n{HEAD}{NODE}",
     "no port": NODE,
     "a port that is none": f'port = "/dev/ttyS0?baudrate=fast"\n{NODE}',
     "two nodes of one address": f'{GOOD}[nodes.other]\nprotocol = "hcp2"\naddress = 5\n',
@@ -209,9 +210,22 @@ def test_the_first_problem_is_the_one_for_which_run_refuses_the_file(text: str, 
 def test_what_names_a_node_with_a_problem_is_not_reported_as_unknown(tmp_path: Path) -> None:
     node = '[nodes.drive1-2]\nprotocol = "hcp2"\naddress = "3-2"\n'
     uses = '[groups.drives]\nperiod = 0.1\npoints = ["drive1-2/1", "drive2/2", "drive*/3"]\n'
+    uses += '[groups.more]\nperiod = 1\npoints = "winder,drive2/1"\n'
     rest = '[safe]\nwrites = { "drive1/1" = 0 }\n[emulator.nodes.drive2]\nlively = true\n'
+    rest += '[service.users.root]\nrole = "write"\nallow_writes = "drive*/1"\n'
     [error] = problems(tmp_path, HEAD + node + NODE + uses + rest)
     assert error.key == "nodes.drive1-2.address"
+
+
+def test_what_names_a_point_with_a_problem_is_not_reported_as_unknown(tmp_path: Path) -> None:
+    points = "[nodes.winder.points]\nspeed = { factor = 0 }\n"
+    [error] = problems(tmp_path, f"{HEAD}{NODE}{points}{GROUP.replace('winder/1', 'winder/speed')}")
+    assert error.key == "nodes.winder.points.speed.factor"
+
+
+def test_a_node_with_a_problem_does_not_hide_that_there_is_no_protocol_of_its_name(tmp_path: Path) -> None:
+    found = problems(tmp_path, f"{HEAD}{NODE}retries = -1\n[protocols.winder]\nretries = 1\n")
+    assert [error.key for error in found] == ["nodes.winder.retries", "protocols.winder"]
 
 
 def test_an_unknown_key_does_not_hide_the_problems_of_the_same_table(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 import busmaster
-from busmaster import BusClosed, InvalidCommand, MemoryPort, NoReply, WriteUnconfirmed
+from busmaster import Bus, BusClosed, InvalidCommand, MemoryPort, NoReply, NotStarted, WriteUnconfirmed
 from busmaster.app.config import emulated_line
 from busmaster.app.config.sections import read
-from busmaster.app.config.source import Source
+from busmaster.app.config.source import FileError, Source
 from busmaster.app.line import ConfiguredLine, configured_line
 from busmaster.app.line.kept_times import KeptTimes
 from busmaster.app.outputs.distributor import Distributor
@@ -110,21 +110,53 @@ def test_it_is_closed_when_it_is_left() -> None:
 
 
 @pytest.mark.parametrize("part", ["outputs", "learned times"])
-def test_a_line_that_cannot_be_entered_is_closed_again(monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+@pytest.mark.parametrize("error", [InvalidCommand("no thread can be started"), asyncio.CancelledError()])
+def test_a_line_that_cannot_be_entered_is_closed_again(
+    monkeypatch: pytest.MonkeyPatch, part: str, error: BaseException
+) -> None:
     def fails(*_: object) -> None:
-        raise InvalidCommand("no thread can be started")
+        raise error
 
     async def main() -> None:
         before = asyncio.all_tasks()
         line = opened()
         monkeypatch.setattr(line.outputs if part == "outputs" else KeptTimes, "start", fails)
-        with pytest.raises(InvalidCommand, match="no thread can be started"):
+        with pytest.raises(type(error)):
             await line.__aenter__()
         with pytest.raises(BusClosed):
             await line.point("winder/11").read()
         assert asyncio.all_tasks() == before
 
     run_in_virtual_time(main())
+
+
+def test_outputs_are_closed_also_if_the_closing_of_the_port_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Distributor] = []
+    close, leave = Distributor.close, Bus.__aexit__
+
+    async def close_outputs(outputs: Distributor) -> None:
+        closed.append(outputs)
+        await close(outputs)
+
+    async def leave_bus(*arguments: Any) -> None:
+        await leave(*arguments)
+        raise asyncio.CancelledError
+
+    async def main() -> None:
+        line = await opened().__aenter__()
+        monkeypatch.setattr(Distributor, "close", close_outputs)
+        monkeypatch.setattr(Bus, "__aexit__", leave_bus)
+        with pytest.raises(asyncio.CancelledError):
+            await line.__aexit__(None, None, None)
+        assert closed == [line.outputs]
+
+    run_in_virtual_time(main())
+
+
+def test_a_reply_time_of_0_in_the_file_is_the_one_of_the_plan() -> None:
+    line = opened(TEXT.replace("address = 1\n", "address = 1\nreply_time = 0\n"))
+    assert Node.of(line.nodes["winder"]).planned().reply_time == 0
+    assert Node.of(line.nodes["drive2"]).planned().reply_time != 0
 
 
 def test_a_long_run_of_an_msc_is_written_through_its_handle() -> None:
@@ -146,6 +178,36 @@ profile = { item = "cam:40", unit = "mm", factor = 0.001 }
             assert found == tuple(125 * i for i in range(40))
 
     run_in_virtual_time(main())
+
+
+CAM = """
+port = "/dev/ttyUSB0"
+[nodes.press]
+protocol = "msc"
+address = 1
+address_step = 4
+points.profile = { item = "3000:40" }
+points.length = { item = "2008" }
+"""
+
+
+@pytest.mark.parametrize(("name", "value"), [("profile", 40 * [1]), ("length", 1)])
+def test_a_write_to_a_point_has_the_options_that_it_is_given(name: str, value: object) -> None:
+    async def main() -> None:
+        async with opened(CAM) as line:
+            reading = asyncio.ensure_future(line.point("press/2012").read())
+            await asyncio.sleep(0)  # the write waits until it has its reply
+            with pytest.raises(NotStarted):
+                await line.point(f"press/{name}").write(value, start_within=1e-6)
+            assert await reading == 0
+
+    run_in_virtual_time(main())
+
+
+@pytest.mark.parametrize("name", ["length", "2008"])
+def test_a_value_with_decimals_for_a_whole_number_without_a_scale_is_refused_and_not_rounded(name: str) -> None:
+    with pytest.raises(InvalidCommand, match=r"a value must be a whole number, not 4\.7"):
+        opened(CAM).prepare_write(f"press/{name}", [4.7])
 
 
 def test_a_node_answers_by_its_name_in_errors() -> None:
@@ -298,6 +360,15 @@ def test_outputs_report_the_state_of_a_line_only_in_the_process_that_polls_it(
     assert [output.kind for output in ConfiguredLine(file).audit().statistics()] == ["jsonl", "sqlite"]
     ConfiguredLine(file, asks=False)
     assert made == [(True, True), (False, True), (True, False)]
+
+
+def test_an_audit_output_whose_extra_is_missing_is_named_with_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = opened(f'{TEXT}[outputs.jsonl]\npath = "{tmp_path / "audit"}"\n[outputs.mqtt]\n')
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(FileError, match=r"^line\.toml:\d+: outputs\.mqtt: .* pip install 'busmaster\[mqtt\]'"):
+        line.audit()
 
 
 def test_a_symbol_that_looks_like_a_range_is_one_point() -> None:

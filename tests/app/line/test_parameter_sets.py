@@ -34,6 +34,14 @@ def test_a_value_is_written_in_its_unit_and_read_as_the_lines_number(tmp_path: P
         write_set(path, whole, KIND)
 
 
+def test_a_value_with_more_decimals_than_its_parameter_is_rounded_as_the_line_carries_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    write_set(str(path), replace(EMPTY, entries={"1.17": Entry(WANTED[0], -476)}), KIND)
+    for written, number in (("-47.64", -476), ("-47.65", -477), ("-47", -470)):
+        path.write_text(path.read_text().replace(path.read_text().partition("value = ")[2].split(",")[0], written))
+        assert repr(read_set(str(path)).set.entries["1.17"].value) == str(number)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
@@ -186,12 +194,15 @@ def test_a_set_of_another_kind_of_node_or_with_an_item_that_it_does_not_have_is_
         read_set(str(path)).check(handle)
 
 
-def test_a_set_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_set_that_cannot_be_written_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
     def full(_: object) -> None:
-        raise OSError(28, "No space left on device")
+        raise error
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(type(error)):
         write_set(str(tmp_path / "a.toml"), EMPTY, KIND)
     assert not list(tmp_path.iterdir())
 
@@ -272,6 +283,15 @@ def test_a_save_that_was_interrupted_before_its_first_parameter_starts_again(tmp
     assert list(read_set(str(path)).set.entries) == [one.item for one in WANTED]
 
 
+def test_a_save_that_started_again_goes_on_when_it_is_interrupted_again(tmp_path: Path) -> None:
+    path = str(tmp_path / "a.toml")
+    (tmp_path / "a.toml.part").write_text("# of the list\n")
+    with PartFile(path, EMPTY, WANTED, KIND) as part:
+        part.add(Found(WANTED[0], 5))
+    with PartFile(path, EMPTY, WANTED, KIND) as part:
+        assert part.missing == (*WANTED[1:],)
+
+
 def test_a_continued_save_keeps_its_start_and_why_parameters_have_no_value(tmp_path: Path) -> None:
     path = str(tmp_path / "a.toml")
     with PartFile(path, EMPTY, WANTED, KIND) as part:
@@ -319,6 +339,14 @@ def test_parameters_of_a_line_are_those_of_the_document_with_what_the_file_adds(
     other = found["2.05"]
     assert (other.name, other.factor, other.offset) == (document["2.05"].name, 3, 1)
     assert other.kept == "LINE.toml has writable = false"
+
+
+def test_a_run_of_the_file_keeps_no_point_behind_it_out_of_the_set() -> None:
+    run, rest = 'points.run = { item = "1.17:2" }\n', TEXT.partition("points.run")[0]
+    line = ConfiguredLine(read(Source("line.toml", rest.replace("points.ramp", f"{run}points.ramp"))), outputs=False)
+    found = {one.item: one for one in line_parameters(line, "screw", line.nodes["screw"])}
+    assert "1.17:2" not in found
+    assert (found["2.04"].name, found["2.04"].minimum) == ("ramp", 0.5)
 
 
 def test_items_of_a_parameter_set_can_be_named_as_the_points_of_the_file() -> None:

@@ -77,6 +77,23 @@ other = { item = "11" }
     assert [str(change) for change in more.changes] == ['w/newer is new: { item = "10" }']
 
 
+def test_a_symbol_is_told_with_the_points_whose_limits_hold_for_it() -> None:
+    node = (
+        'port = "/dev/ttyUSB0"\n[nodes.press]\nprotocol = "msc"\naddress = 1\nsymbols = { count = 2008, cam = 3000 }\n'
+    )
+    held = read(Source("line.toml", f'{node}points.pieces = {{ item = "2008", maximum = 99 }}\n'))
+    assert [(row.point, row.limited_by) for row in rows(held)] == [
+        ("pieces", ()),
+        ("count", ("pieces",)),
+        ("cam", ()),
+    ]
+
+
+def test_points_are_told_also_if_a_group_of_the_file_names_one_that_there_is_not() -> None:
+    held = file('points.a = { item = "10", maximum = 5 }\n', GROUP.replace("w/a,b", "w/none"))
+    assert [row.point for row in rows(held)] == ["a"]
+
+
 def test_a_point_of_a_range_of_nodes_is_one_row_of_its_section() -> None:
     many = HEAD.replace("nodes.w", "nodes.w5-8").replace("address = 5  # of winder 5", 'address = "5-8"')
     held = read(
@@ -302,6 +319,16 @@ def test_several_points_are_added_to_inline_points_behind_the_last() -> None:
     assert 'points = { c = { item = "12" }, d = { item = "13" } }\n' in empty.text
 
 
+def test_new_points_of_several_nodes_are_added_to_each_of_them() -> None:
+    held = read(Source("line.toml", f'{HEAD}[nodes.x]\nprotocol = "hcp2"\naddress = 6\n'))
+    back = take(held, "node,point,item", "x,b,11", "w,a,10", "x,c,12")
+    nodes = tomllib.loads(back.text)["nodes"]
+    assert (nodes["w"]["points"], nodes["x"]["points"]) == (
+        {"a": {"item": "10"}},
+        {"b": {"item": "11"}, "c": {"item": "12"}},
+    )
+
+
 def test_what_a_template_says_is_not_written_down_again(tmp_path: Path) -> None:
     (tmp_path / "ours.toml").write_text(
         'protocol = "hcp2"\n[points]\na = { item = "10", maximum = 5 }\nz = { item = "12" }\n'
@@ -335,6 +362,7 @@ def test_a_key_that_a_node_repeats_of_its_template_stays_in_its_section(tmp_path
     [
         ("w,c,12,,x", "row 2, column maximum: must be a number, not 'x'"),
         ('w,c,12,,"0,5"', "row 2, column maximum: 0,5 has a decimal comma; write 0.5"),
+        ('w,c,12,,"-0,5"', "row 2, column maximum: -0,5 has a decimal comma; write -0.5"),
         ("w,c,12,,0,5", "row 2: the row has 6 cells instead of 5; put cells with a comma into quotes"),
         ("w,c,12,,inf", "row 2, column maximum: must be finite"),
         ("w,c,12,,true", "row 2, column maximum: must be a number, not true"),
@@ -442,14 +470,17 @@ def test_a_file_is_replaced_as_a_whole_with_its_mode_and_through_a_link(tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["line.toml", "real.toml"]
 
 
-def test_a_file_that_cannot_be_replaced_is_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_file_that_cannot_be_replaced_is_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
     def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
+        raise error
 
     path = tmp_path / "line.toml"
     path.write_text("before")
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(type(error)):
         write_beside(str(path), "after")
     assert path.read_text() == "before"
     assert [one.name for one in tmp_path.iterdir()] == ["line.toml"]

@@ -94,6 +94,15 @@ def test_a_node_that_is_gone_does_not_hold_up_the_others() -> None:
     on_a_line(story, "gone/speed", "winder/speed", gone=True)
 
 
+def test_outcomes_are_in_the_order_of_the_file_also_where_it_goes_back_to_a_node() -> None:
+    points = ("winder/speed", "gone/speed", "winder/force")
+
+    async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
+        assert list(await line.safe_state.enter(line.authorisation, "a test")) == [*points]
+
+    on_a_line(story, *points)
+
+
 def test_what_was_sent_and_could_not_be_sent_again_is_not_called_not_started() -> None:
     async def story(line: ConfiguredLine, records: list[WriteRecord]) -> None:
         outcomes = await line.safe_state.enter(line.authorisation, "a test")
@@ -206,7 +215,8 @@ def test_what_waits_for_the_line_waits_until_the_safe_state_is_sent() -> None:
         reads = [asyncio.ensure_future(drive.read(20)) for _ in range(50)]
         await asyncio.sleep(0)
         assert await line.safe_state.enter(line.authorisation, "a test") == {"winder/speed": None}
-        assert Node.of(drive).statistics().attempts - before < len(reads)
+        # those of one read that was under way, of the write, and of the read that verifies it
+        assert Node.of(drive).statistics().attempts - before <= 5
         assert await asyncio.gather(*reads) == [0] * len(reads)
 
     on_a_line(story, "winder/speed")
