@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from busmaster.app.config.keys import keys_of
+from busmaster.app.config.points import NamedPoint, Scale
 from busmaster.app.outputs import growing_file
 from busmaster.app.outputs.base import Happening, OutputKind
 from busmaster.app.outputs.cells import csv_lines, no_formula, text_cell, text_of
@@ -244,6 +245,18 @@ def test_no_name_is_a_formula_to_a_spreadsheet(name: str) -> None:
     assert (row[4], row[6]) == (f"'{name}", f"'{name}")
 
 
+@pytest.mark.parametrize("name", ["=1+1", "+1+1", "-2+3", "@SUM(1)"])
+def test_no_node_and_no_text_is_a_formula_to_a_spreadsheet(name: str) -> None:
+    output = CsvOutput("csv", FileSettings(path="x.csv"))
+    snapshot = cycle(1, name)
+    named = {
+        NamedPoint.of(point, where=name, name="force", unit="", scale=Scale.of()): sample
+        for point, sample in snapshot.samples.items()
+    }
+    [row] = csv.reader((output.format(replace(snapshot, samples=named)) or b"").decode().splitlines())
+    assert (row[3], row[4], row[5]) == (f"'{name}", "force", f"'{name}")
+
+
 def test_a_line_end_at_the_beginning_is_a_formula_to_a_spreadsheet_too() -> None:
     assert no_formula("\r=1+1") == "'\r=1+1"
 
@@ -346,6 +359,16 @@ def test_a_folder_that_has_gone_is_not_made_and_a_dated_one_is_for_its_owner_and
         os.umask(before)
     [folder] = tmp_path.iterdir()
     assert folder.stat().st_mode & 0o007 == 0
+
+
+def test_several_files_of_a_dated_folder_are_in_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    days = iter((1, 2))
+    monkeypatch.setattr(time, "strftime", lambda pattern: pattern.replace("%Y", "2026").replace("%d", str(next(days))))
+    file = GrowingFile(str(tmp_path / "in-%Y" / "x-%d"))
+    for _ in range(2):
+        file.append(b"line\n")
+    file.close()
+    assert sorted(path.name for path in (tmp_path / "in-2026").iterdir()) == ["x-1", "x-2"]
 
 
 def test_a_file_that_must_not_be_read_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
