@@ -22,7 +22,15 @@ from busmaster.app.outputs.cells import csv_lines, no_formula, text_cell, text_o
 from busmaster.app.outputs.files import COLUMNS, CsvOutput, JsonlOutput
 from busmaster.app.outputs.growing_file import GrowingFile
 from busmaster.app.outputs.kinds import kinds
-from busmaster.app.outputs.settings import DATE_FIELDS, FileSettings, file_mode
+from busmaster.app.outputs.settings import (
+    DATE_FIELDS,
+    FileSettings,
+    MetricsSettings,
+    MqttSettings,
+    Settings,
+    SqliteSettings,
+    file_mode,
+)
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.app.outputs.cycles import cycle
@@ -422,6 +430,20 @@ def test_a_mode_is_octal(text: str) -> None:
 def test_a_mode_of_something_else_is_refused(text: str) -> None:
     with pytest.raises(InvalidCommand, match="octal"):
         file_mode(text)
+
+
+@pytest.mark.parametrize(
+    ("settings", "destination"),
+    [
+        (FileSettings(path="x.csv"), "x.csv"),
+        (SqliteSettings(path="x.db"), "x.db"),
+        (MqttSettings(host="broker", port=1884), "broker:1884"),
+        (MetricsSettings(host="192.0.2.7", port=9465), "192.0.2.7:9465"),
+        (Settings(), ""),
+    ],
+)
+def test_messages_name_the_file_or_the_address_of_an_output(settings: Settings, destination: str) -> None:
+    assert settings.destination == destination
 
 
 @pytest.mark.parametrize("kind", kinds(), ids=lambda kind: str(kind.name))
