@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from busmaster import Point, Sample
 from busmaster.app.config.keys import keys_of
 from busmaster.app.config.points import NamedPoint, Scale
 from busmaster.app.outputs import growing_file
@@ -257,7 +258,7 @@ def test_no_name_is_a_formula_to_a_spreadsheet(name: str) -> None:
 def test_no_node_and_no_text_is_a_formula_to_a_spreadsheet(name: str) -> None:
     output = CsvOutput("csv", FileSettings(path="x.csv"))
     snapshot = cycle(1, name)
-    named = {
+    named: dict[Point[Any], Sample[Any]] = {
         NamedPoint.of(point, where=name, name="force", unit="", scale=Scale.of()): sample
         for point, sample in snapshot.samples.items()
     }
