@@ -185,6 +185,25 @@ async def test_exchanges_are_given_back_if_the_page_goes_before_they_come() -> N
 
 
 @pytest.mark.asyncio
+async def test_exchanges_whose_request_has_failed_are_requested_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line()
+    request, errors = line.exchanges, [LineDown("gone")]
+
+    async def fails_once(receive: Callable[[Mapping[str, Any]], None]) -> Exchanges:
+        if errors:
+            raise errors.pop()
+        return await request(receive)
+
+    monkeypatch.setattr(line, "exchanges", fails_once)
+    pages = pages_of(line)
+    seat = pages.join()
+    seat.wants_exchanges = True
+    pages.look_at_exchanges()
+    await turns()
+    assert len(line.open) == 1
+
+
+@pytest.mark.asyncio
 async def test_exchanges_are_requested_of_each_owner_and_of_none_while_there_is_none() -> None:
     line = Line()
     pages = pages_of(line)

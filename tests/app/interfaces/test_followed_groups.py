@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -16,6 +18,8 @@ from busmaster.app.service.remote import RemoteBus
 from busmaster.app.service.remote_group import RemoteGroup
 from busmaster.errors import InvalidCommand
 from tests.app.interfaces.lines import followed, poll, shows
+from tests.app.interfaces.test_following import connected
+from tests.app.interfaces.test_modbus_tcp import Owner, read_cycle
 from tests.app.service.lines import Served, served, until
 
 
@@ -125,6 +129,7 @@ async def test_only_the_wanted_groups_are_followed_and_the_others_are_sent_no_mo
         await interface.cycles.come("axes", "slow")
         await interface.follow("slow")
         assert axes.over, "its owner sends it no more"
+        assert "axes" not in interface.groups.dropped
         interface.cycles.counts.clear()
         await interface.cycles.come("slow")
         assert interface.cycles.counts.keys() == {"slow"}
@@ -152,3 +157,19 @@ async def test_a_group_without_any_cycle_gets_old_too(tmp_path: Path) -> None:
         assert interface.groups.old(now + 1000.0) == {"no such group"}
         await interface.groups.leave()
         assert interface.groups.old(now + 1000.0) == set()
+
+
+@pytest.mark.asyncio
+async def test_a_group_is_as_old_as_the_end_of_its_last_cycle() -> None:
+    owner, taken = Owner(), asyncio.Event()
+
+    async def take(_name: str, _snapshot: Snapshot) -> None:
+        taken.set()
+
+    groups = FollowedGroups(connected(owner), take)
+    await groups.follow(cast("RemoteBus", owner), {"axes"})
+    owner.group("axes").cycles.put_nowait(replace(read_cycle(1.0), due=100.0, started=100.0, finished=105.0))
+    await taken.wait()
+    assert groups.old(106.0) == set(), "a second old"
+    assert groups.old(106.1) == {"axes"}
+    await groups.leave()

@@ -394,3 +394,39 @@ async def test_while_a_line_is_being_connected_nothing_is_written_and_its_values
     with pytest.raises(LineDown):
         _ = line.remote
     assert before <= Lost("x").since <= time.time()
+
+
+@pytest.mark.asyncio
+async def test_the_picture_is_that_of_the_owner_that_came_last_however_it_numbers_its_points(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    owners = iter([(7, "5/1"), (1, "5/2")])
+    entered = asyncio.Event()
+
+    class Connection:
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        async def __aenter__(self) -> Any:
+            return SimpleNamespace(about={"read_only": False}, on_access=[], on_touched=[], overview=self._overview)
+
+        async def __aexit__(self, *_: object) -> None:
+            pass
+
+        async def _overview(self, receive: Any) -> Any:
+            number, key = next(owners)
+            described = {"group": "g", "key": key, "node": "n", "protocol": "hcp2", "address": 5, "item": key[2:]}
+            receive("rows", {"set": number, "first": 0, "rows": [described]})
+            if number == 7:
+                raise LineDown("restarted")
+            entered.set()
+            await asyncio.Event().wait()
+
+    monkeypatch.setattr(following, "connect", Connection)
+    line = Following(lambda: "unix:x", clean=dict)
+    following_it = asyncio.ensure_future(line.follow())
+    async with asyncio.timeout(PATIENCE):
+        await entered.wait()
+    assert [row.key for row in line.picture.rows] == ["5/2"]
+    following_it.cancel()
+    await asyncio.gather(following_it, return_exceptions=True)

@@ -734,6 +734,27 @@ def test_an_address_with_many_requests_on_the_line_makes_room_for_another_addres
     with_server(story, Slow())
 
 
+def test_an_address_with_one_request_more_than_another_keeps_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_tcp, "MOST_GATEWAY_CONNECTIONS", 3)
+    go_on = asyncio.Event()
+
+    async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
+        open_ = []
+        for source in ("127.0.0.1", "127.0.0.1", "127.0.0.2"):
+            reader, writer = await connect(source)
+            writer.write(frame(READ))
+            open_.append(reader)
+        while echo.counts[1] < 3:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        another, _ = await connect("127.0.0.2")
+        assert await is_closed(another), "then it would be the address with one more"
+        go_on.set()
+        for reader in open_:
+            assert await reader.readexactly(len(frame(READ))) == frame(READ)
+
+    with_server(story, SlowUnit(go_on))
+
+
 class SlowUnit(Echo):
     """Unit 1 replies when it may go on."""
 

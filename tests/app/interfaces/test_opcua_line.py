@@ -173,6 +173,40 @@ async def test_each_point_has_the_value_and_status_of_its_last_read() -> None:
     await story.end()
 
 
+async def test_a_number_beyond_all_types_is_bad_and_the_values_behind_it_are_shown() -> None:
+    story = Story(row_of("1"), row_of("2"))
+    await story.show()
+    for number in (10**400, (1.5, 10**400)):
+        await story.show(read_cycle(number, 2.5))
+        assert story.shown.state("winder/1", "winder/2") == [(None, "BadDataEncodingUnsupported"), (2.5, "Good")]
+    await story.end()
+
+
+async def test_of_two_points_of_a_group_with_one_item_the_first_is_shown() -> None:
+    story = Story(row_of("1"))
+    await story.show()
+    snapshot = read_cycle(1.0, 2.0)
+    same = {replace(point, item="1"): sample for point, sample in snapshot.samples.items()}
+    assert len(same) == 2
+    await story.show(replace(snapshot, samples=same))
+    assert story.shown.state("winder/1") == [(1.0, "Good")]
+    await story.end()
+
+
+async def test_clients_have_their_turn_within_a_long_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opcua, "AT_ONCE", 2)
+    story = Story(*(row_of(str(number)) for number in range(1, 6)))
+    await story.show()
+    before = len(story.shown.puts)
+    taking = asyncio.ensure_future(story.server._take("axes", read_cycle(1.0, 2.0, 3.0, 4.0, 5.0)))
+    counts = []
+    while not taking.done():
+        await asyncio.sleep(0)
+        counts.append(len(story.shown.puts) - before)
+    assert counts == [2, 4, 5]
+    await story.end()
+
+
 async def test_a_write_makes_the_value_of_its_point_uncertain_until_it_was_read_again() -> None:
     story = Story(row_of("1"), row_of("2"))
     await story.show()
@@ -213,7 +247,8 @@ async def test_values_of_a_lost_line_are_bad_but_for_those_that_were_read_since(
     await story.show()
     await story.show(read_cycle(1.0, 2.0))
     await story.show(read_cycle(1.5, at=103.0))
-    story.line.picture.frame = shown_frame(points=2, now=102.0, state="offline")
+    ended = story.server._by_id[ua.NodeId("winder/2", 2)].read
+    story.line.picture.frame = shown_frame(points=2, now=ended, state="offline")  # in the moment of its reply
     await story.show()
     assert story.shown.state("winder/1", "winder/2") == [(1.5, "Good"), (None, "BadNoCommunication")]
     puts = len(story.shown.puts)

@@ -118,6 +118,7 @@ def test_a_unit_has_its_number_where_there_is_one() -> None:
     known |= {"rpm": 5394509, "s": 5457219}
     assert {unit: unit_of(unit).UnitId for unit in known} == known  # UNECEUnitIds of OPC UA, Part 8
     assert (unit_of("counts").UnitId, unit_of("counts").DisplayName.Text) == (-1, "counts")
+    assert unit_of("counts").Description.Text == "counts"
 
 
 def test_the_range_of_a_point_is_what_may_be_written_else_its_limits_of_alarm() -> None:

@@ -757,6 +757,7 @@ async def test_times_of_the_line_are_times_of_day_and_none_while_they_are_unknow
     of.line.picture.frame = shown_frame(state="offline", why="unplugged", since=80.0)
     said = await of.get("line")
     assert (said["connected"], said["since"], said["why"]) == (True, 980.0, "unplugged")
+    assert not {"events", "why", "since"} & said["frame"].keys(), "no time of the line's own clock"
     of.line._remote = None
     assert [one["time"] for one in await of.get("points")] == [None, None]
     of.line.state = Lost("gone", since=900.0)

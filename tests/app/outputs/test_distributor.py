@@ -499,6 +499,23 @@ async def test_strict_outputs_that_do_not_write_an_entry_in_time_are_named_with_
 
 
 @pytest.mark.usefixtures("_listed")
+@pytest.mark.asyncio
+async def test_of_strict_outputs_that_do_not_write_an_entry_each_has_its_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(distributor, "AUDIT_WITHIN", 0.01)
+    outputs = Distributor(BUS)
+    for kind in ("one", "two"):
+        outputs.add(kind, STRICT)
+    made = listed(outputs)
+    made["one"].error, made["two"].error = "disk full", "read-only"
+    durable = outputs.record(WRITE._replace(outcome=Outcome.WRITTEN))
+    assert durable is not None
+    async with asyncio.timeout(PATIENCE):
+        assert (await durable).endswith("; one is down: disk full; two is down: read-only")
+
+
+@pytest.mark.usefixtures("_listed")
 def test_what_an_output_reports_after_the_loop_has_ended_is_discarded() -> None:
     reported: list[str] = []
 

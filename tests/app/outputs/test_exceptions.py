@@ -95,6 +95,8 @@ def test_a_change_of_quality_is_always_news() -> None:
         ((1, 2), (1, 2.4), 0.5, False),
         ((1, 2), (1, 3), 0.5, True),
         ((1, 2), (1,), 9, True),
+        ((1, 2), 1, 9, True),
+        (1, (1, 2), 9, True),
         ("a", "a", 0, False),
         ("a", "b", 0, True),
         (frozenset({1}), frozenset({2}), 0, True),
@@ -203,3 +205,18 @@ async def test_after_the_file_was_read_again_outputs_are_told_all_once_more(tmp_
         await line.take(file(tmp_path, TEXT))
         await anext(cycles)
     assert len(of(tmp_path, "winder/force")) >= 2
+
+
+@pytest.mark.asyncio
+async def test_after_the_file_was_read_again_the_values_of_every_group_are_told_once_more(tmp_path: Path) -> None:
+    text = TEXT.replace('"winder/force,status,3"', '"winder/force"')
+    text = text.replace("[emulator]", '[groups.slow]\nperiod = 0.02\npoints = "winder/status"\n[emulator]')
+    line = opened(tmp_path, text)
+    async with line:
+        streams = [line.groups[name].subscribe(100) for name in ("fast", "slow")]
+        for cycles in streams:
+            await anext(cycles)
+        await line.take(file(tmp_path, text))
+        for cycles in streams:
+            await anext(cycles)
+    assert [len(of(tmp_path, f"winder/{key}")) >= 2 for key in ("force", "status")] == [True, True]

@@ -14,14 +14,24 @@ from typing import Any
 
 import pytest
 
+from busmaster import Point, Sample
 from busmaster.app.config.keys import keys_of
+from busmaster.app.config.points import NamedPoint, Scale
 from busmaster.app.outputs import growing_file
 from busmaster.app.outputs.base import Happening, OutputKind
 from busmaster.app.outputs.cells import csv_lines, no_formula, text_cell, text_of
 from busmaster.app.outputs.files import COLUMNS, CsvOutput, JsonlOutput
 from busmaster.app.outputs.growing_file import GrowingFile
 from busmaster.app.outputs.kinds import kinds
-from busmaster.app.outputs.settings import DATE_FIELDS, FileSettings, file_mode
+from busmaster.app.outputs.settings import (
+    DATE_FIELDS,
+    FileSettings,
+    MetricsSettings,
+    MqttSettings,
+    Settings,
+    SqliteSettings,
+    file_mode,
+)
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.app.outputs.cycles import cycle
@@ -244,6 +254,18 @@ def test_no_name_is_a_formula_to_a_spreadsheet(name: str) -> None:
     assert (row[4], row[6]) == (f"'{name}", f"'{name}")
 
 
+@pytest.mark.parametrize("name", ["=1+1", "+1+1", "-2+3", "@SUM(1)"])
+def test_no_node_and_no_text_is_a_formula_to_a_spreadsheet(name: str) -> None:
+    output = CsvOutput("csv", FileSettings(path="x.csv"))
+    snapshot = cycle(1, name)
+    named: dict[Point[Any], Sample[Any]] = {
+        NamedPoint.of(point, where=name, name="force", unit="", scale=Scale.of()): sample
+        for point, sample in snapshot.samples.items()
+    }
+    [row] = csv.reader((output.format(replace(snapshot, samples=named)) or b"").decode().splitlines())
+    assert (row[3], row[4], row[5]) == (f"'{name}", "force", f"'{name}")
+
+
 def test_a_line_end_at_the_beginning_is_a_formula_to_a_spreadsheet_too() -> None:
     assert no_formula("\r=1+1") == "'\r=1+1"
 
@@ -348,6 +370,16 @@ def test_a_folder_that_has_gone_is_not_made_and_a_dated_one_is_for_its_owner_and
     assert folder.stat().st_mode & 0o007 == 0
 
 
+def test_several_files_of_a_dated_folder_are_in_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    days = iter((1, 2))
+    monkeypatch.setattr(time, "strftime", lambda pattern: pattern.replace("%Y", "2026").replace("%d", str(next(days))))
+    file = GrowingFile(str(tmp_path / "in-%Y" / "x-%d"))
+    for _ in range(2):
+        file.append(b"line\n")
+    file.close()
+    assert sorted(path.name for path in (tmp_path / "in-2026").iterdir()) == ["x-1", "x-2"]
+
+
 def test_a_file_that_must_not_be_read_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -399,6 +431,20 @@ def test_a_mode_is_octal(text: str) -> None:
 def test_a_mode_of_something_else_is_refused(text: str) -> None:
     with pytest.raises(InvalidCommand, match="octal"):
         file_mode(text)
+
+
+@pytest.mark.parametrize(
+    ("settings", "destination"),
+    [
+        (FileSettings(path="x.csv"), "x.csv"),
+        (SqliteSettings(path="x.db"), "x.db"),
+        (MqttSettings(host="broker", port=1884), "broker:1884"),
+        (MetricsSettings(host="192.0.2.7", port=9465), "192.0.2.7:9465"),
+        (Settings(), ""),
+    ],
+)
+def test_messages_name_the_file_or_the_address_of_an_output(settings: Settings, destination: str) -> None:
+    assert settings.destination == destination
 
 
 @pytest.mark.parametrize("kind", kinds(), ids=lambda kind: str(kind.name))

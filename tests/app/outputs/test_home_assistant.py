@@ -119,6 +119,8 @@ def test_entities_of_two_lines_and_two_nodes_are_different_and_a_node_belongs_to
     assert len({config["unique_id"] for config in configs}) == 4
     assert all(config["unique_id"].startswith("busmaster/") for config in configs)
     assert len({tuple(config["device"]["identifiers"]) for config in configs}) == 4
+    names = [config["device"]["name"] for config in configs]
+    assert names == ["line 5", "line 6", "hall 3/line 5", "hall 3/line 6"], "of equal nodes of two lines too"
     of_line = json.loads(HomeAssistant("homeassistant", "line", {}).line().payload)
     assert [config["device"]["via_device"] in of_line["device"]["identifiers"] for config in configs] == [
         *(True, True, False, False)

@@ -42,13 +42,13 @@ from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort, MemoryTransport
-from busmaster.errors import LineDown, NoReply, Refused
+from busmaster.errors import GarbledReply, LineDown, NoReply, Refused
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
-from tests.app.outputs.cycles import BUS, until
+from tests.app.outputs.cycles import BUS, cycle, until
 from tests.patience import PATIENCE
 from tests.ports import free_port
 
@@ -276,6 +276,44 @@ async def test_a_stale_value_is_told_as_such_and_a_lost_one_keeps_its_time(monke
     assert of(metrics, "value_good", **labels) == 0
     assert of(metrics, "value_time_seconds", **labels) == read_at
     assert ("busmaster_value", frozenset(labels.items())) not in metrics
+
+
+@pytest.mark.asyncio
+async def test_a_value_that_can_no_longer_be_read_keeps_the_time_of_the_last_read_without_an_error() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)], paced=False)))
+    output = MetricsOutput("metrics", MetricsSettings(port=0, groups=("axes",)), bus)
+    labels = {"group": "axes", "node": "5", "item": "10", "unit": ""}
+    fails = False
+
+    def decode(value: float) -> float:
+        if fails:
+            raise GarbledReply("no number")
+        return value
+
+    async with bus:
+        point = replace(Hcp2Controller(bus, 5).point("10"), decode=decode)
+        group = bus.poll_group("axes", period=0.02, points=[point])
+        async for snapshot in group:
+            if snapshot[point].error is not None:
+                break
+            read_at, fails = snapshot[point].wall, True
+        group.pause()
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert of(metrics, "value_time_seconds", **labels) == pytest.approx(read_at, abs=1e-3)
+    assert of(metrics, "value_good", **labels) == 0
+    assert ("busmaster_value", frozenset(labels.items())) not in metrics
+
+
+def test_metrics_count_no_values_because_each_scrape_has_the_last_ones() -> None:
+    output = MetricsOutput("metrics", MetricsSettings(port=0), BUS)
+    output.offer(cycle(1, 1.0))
+    output.miss(2)
+    output.suppress(3)
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.waiting, counts.suppressed) == (0, 0, 0, 0)
 
 
 PAGE = (Path(__file__).parents[3] / "docs" / "howto" / "mqtt-and-grafana.md").read_text()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from busmaster.app.bounds import LONGEST_TOPIC
 from busmaster.app.config import FileError, emulated_line
 from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
@@ -747,6 +748,10 @@ async def test_the_state_of_the_line_has_its_reason_and_an_alarm_that_is_no_more
         ("cycle", "fast", "winder/a\tb", ""),
         ("cycle", 70_000 * "x", "winder/force", "longer than a topic may be"),
         ("cycle", "fast", "winder/force", ""),
+        ("point", "fast", "winder/Länge", ""),
+        ("point", "fast", "winder/" + (LONGEST_TOPIC // 2) * "ä", "longer than a topic may be"),
+        ("cycle", (LONGEST_TOPIC - len("busmaster/cycles/")) * "x", "winder/force", ""),
+        ("cycle", (LONGEST_TOPIC - len("busmaster/cycles/") + 1) * "x", "winder/force", "longer than a topic may be"),
     ],
 )
 def test_a_name_that_cannot_be_a_part_of_a_topic_is_refused(messages: Any, group: str, key: str, why: str) -> None:

@@ -716,6 +716,18 @@ def test_an_end_at_zero_is_an_end(payload: bytes, interval: int | None, expires:
     assert request.expires == expires
 
 
+def test_the_expiry_of_a_message_counts_from_its_arrival_and_not_from_when_it_is_read() -> None:
+    clock = [0.0]
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    point = Hcp2Controller(bus, 5).point("1")
+    commands = Commands("line", Authorisation(bus), {"5/1": point}, lambda: clock[0])
+    clock[0] = 1000.0  # nothing was read for so long
+    properties = SimpleNamespace(MessageExpiryInterval=5)
+    commands.arrive(cast("Message", Arrived(b"1", properties=properties)))
+    [request] = commands.queued
+    assert request.expires == pytest.approx(time.time() - 995, abs=60)
+
+
 def test_a_name_is_as_long_as_the_bound_in_the_topic_of_a_reply() -> None:
     commands = commands_of(one="1")
     for size in (LONGEST_NAME, LONGEST_NAME + 1):

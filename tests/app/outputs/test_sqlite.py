@@ -35,6 +35,7 @@ def test_a_column_holds_whatever_a_value_is() -> None:
     assert [column(value) for value in values] == [None, 1, 1.5, "text", 1, None, 65, "[1, 2]", "{'a': 1}"]
     assert [column(value) for value in (2**63 - 1, 2**63, -(2**63) - 1)] == [2**63 - 1, 2.0**63, -(2.0**63)]
     assert type(column(2**63)) is float
+    assert type(column(1 - 2**63)) is int, "it is exact"
 
 
 @contextmanager
@@ -559,6 +560,7 @@ def test_a_damaged_database_is_moved_aside_and_a_new_one_begun(tmp_path: Path) -
         output.close(PATIENCE)
     assert output.statistics().dropped == 0
     assert [value for (value,) in query(path, "select value from samples order by rowid")] == [3.0, 4.0]
+    assert said[0].startswith(f"sqlite: {path} is damaged (file is not a database); ")
     assert said[0].endswith(f"it was moved to {path}.damaged, and a new file was started")
     assert said[1].endswith(f"it was moved to {path}.damaged-2, and a new file was started")
     assert (tmp_path / "x.db.damaged").read_bytes().startswith(bytes(4096))

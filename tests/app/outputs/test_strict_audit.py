@@ -124,6 +124,15 @@ def test_what_is_dropped_or_left_at_the_end_is_reported_as_that(tmp_path: Path) 
     assert found[1:] == [(2, "jsonl ended before it was written")]
 
 
+def test_each_of_several_entries_that_are_left_at_the_end_is_reported(tmp_path: Path) -> None:
+    output = JsonlOutput("jsonl", FileSettings(path=str(tmp_path / "x"), audit="strict"))
+    found: list[str] = []
+    for number in (1, 2, 3):  # its thread is not started: nothing is written
+        output.offer_entry(entry(number), found.append)
+    output.close(0.0)
+    assert found == ["jsonl ended before it was written"] * 3
+
+
 def test_each_entry_of_a_batch_is_reported(tmp_path: Path) -> None:
     output = JsonlOutput("jsonl", FileSettings(path=str(tmp_path / "x"), audit="strict"))
     found: list[tuple[int, str]] = []
