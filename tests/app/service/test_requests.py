@@ -7,6 +7,7 @@ import contextlib
 import gc
 import json
 import os
+import re
 import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
@@ -120,6 +121,9 @@ def test_a_request_that_came_after_its_time_is_not_sent_on_an_idle_line_either(
                 assert error_of(said) == "NotStarted"
                 hint = "its start_within of 0.5 s was over; give it more time" if "start_within" in options else ""
                 assert hint in said["error"]["data"]["hint"]
+            late_by_seconds = {"requested": line.bus.now() - 7.0, "options": {"start_within": 0.5}}
+            said = await client.ask("request", **request_, **late_by_seconds)
+            assert re.search(r"arrived \d+\.\d s after the program made it$", said["error"]["data"]["what"])
             assert await controller.read(1) == 0
             in_time = {"start_within": PATIENCE, "finish_within": PATIENCE}
             assert "result" in await client.ask("request", **request_, requested=line.bus.now(), options=in_time)
@@ -815,6 +819,20 @@ def test_a_write_to_a_point_is_superseded_by_a_stop_that_its_program_has_not_see
     on_a_line(tmp_path, story)
 
 
+def test_the_number_of_a_request_that_could_not_be_started_is_free_again(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        async with raw(line) as client:
+            assert "result" in await client.ask("node", protocol="hcp2", address=5)
+            own.node.note_stop()
+            assert (await client.hear())["params"]["stops"] == 1
+            for _ in range(2):
+                assert error_of(await client.ask("request", **READ, stops_seen=0)) == "Superseded"
+            assert (await client.ask("request", **READ, stops_seen=1))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_node_that_its_program_names_twice_leaves_the_line_with_it(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line) as client:
@@ -845,6 +863,18 @@ def test_a_sequence_that_has_begun_is_not_begun_again_under_its_number(tmp_path:
             assert held.over
             await client.say(method="hold", params=hold)
             assert (await client.ask("request", **{**READ, "address": 6}, sequence=1))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_sequence_that_could_not_begin_may_be_begun_again_under_its_number(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            hold: dict[str, Any] = {"sequence": 1, "protocol": "hcp2", "address": 5, "max_hold": 0.0}
+            await client.say(method="hold", params=hold)
+            assert "max_hold" in (await client.ask("request", **READ, sequence=1))["error"]["message"]
+            await client.say(method="hold", params={**hold, "max_hold": ext.LONGEST_HOLD})
+            assert (await client.ask("request", **READ, sequence=1))["result"] == 0
 
     on_a_line(tmp_path, story)
 
