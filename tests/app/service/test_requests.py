@@ -711,11 +711,16 @@ def test_points_that_were_gathered_are_polled_together_and_are_limited(
             assert "result" in await asked(client, 1, "gather", stream=8, points=points(1, 2, 3))
             reply = await asked(client, 1, "gather", stream=9, points=points(1))
             assert "one program has 2 poll groups at most" in reply["error"]["message"]
-            assert "result" in await asked(client, 1, "gather", stream=7, points=points(3))
             await client.say(method="end", params={"stream": 8})
             reply = await asked(client, 1, "gather", stream=9, points=points(1, command="write", values=[1.0]))
             assert "a poll group reads: it writes nothing" in reply["error"]["message"]
-            assert "result" in await asked(client, 1, "poll", **polled(7, points=[]))
+            for last, why in (
+                (points(3, 4), "a poll group of a program has 3 points at most"),
+                (points(3, command="write", values=[1.0]), "a poll group reads: it writes nothing"),
+            ):
+                reply = await asked(client, 1, "poll", **polled(7, points=last))
+                assert why in reply["error"]["message"]
+            assert "result" in await asked(client, 1, "poll", **polled(7, points=points(3)))
             assert [point.item for point in line.bus.groups[0].points] == ["1", "2", "3"]
             assert "result" in await asked(client, 1, "gather", stream=9, points=points(1))
             assert "result" in await asked(client, 1, "gather", stream=10, points=points(1))  # the first is a group now
