@@ -728,6 +728,24 @@ def test_points_that_were_gathered_are_polled_together_and_are_limited(
     on_a_line(tmp_path, story)
 
 
+@pytest.mark.parametrize(("method", "params"), [("subscribe", {"group": "axes"}), ("events", {})])
+def test_a_stream_that_nobody_follows_any_more_keeps_nothing_on_the_line(
+    tmp_path: Path, method: str, params: dict[str, Any]
+) -> None:
+    async def story(line: Served) -> None:
+        axes = line.bus.poll_group("axes", period=60.0, points=[Hcp2Controller(line.bus, 5).point("1")])
+        followed = axes._consumers_of_changes if method == "subscribe" else line.bus._streams
+        before = len(followed)
+        async with raw(line) as client:
+            for _ in range(2):
+                assert "result" in await asked(client, 1, method, stream=7, **params)
+                await until(lambda: len(followed) == before + 1)
+                await client.say(method="end", params={"stream": 7})
+                await until(lambda: len(followed) == before)
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_program_has_so_many_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("busmaster.app.service.client.MOST_STREAMS", 2)
 
