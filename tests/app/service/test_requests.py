@@ -528,6 +528,18 @@ def test_a_write_that_ends_before_it_is_sent_has_one_audit_entry(
 # checks and reports
 
 
+def test_a_write_that_is_not_permitted_is_refused_with_its_node_and_the_reason(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        ext.rename(Node.of(Hcp2Controller(line.bus, 5)), "winder")
+        async with raw(line) as client:
+            reply = await client.ask("request", **write(1.0))
+            assert reply["error"]["message"] == "winder: this line is read-only"
+        [record] = line.records
+        assert (record.outcome, record.error) == (Outcome.REFUSED, "winder: this line is read-only")
+
+    on_a_line(tmp_path, story, read_only=True)
+
+
 def test_a_check_reports_the_first_refused_write_of_several_and_writes_nothing(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         Hcp2Controller(line.bus, 5).element(1).limit(minimum=5, maximum=10)
