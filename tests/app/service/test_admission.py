@@ -250,7 +250,12 @@ def test_what_a_report_keeps_of_many_peers_is_bounded() -> None:
 def test_a_peer_that_a_report_names_is_counted_by_its_name_although_there_are_many_others() -> None:
     async def run() -> None:
         reported: list[Counter[str]] = []
-        report = LimitedReport(lambda _: None, lambda counts: str(reported.append(counts.copy())))
+
+        def text(counts: Counter[str]) -> str:
+            reported.append(counts)
+            return ""
+
+        report = LimitedReport(lambda _: None, text)
         report.note("first")
         for number in range(bounds.MOST_REPORTED + 3):
             report.note(str(number))
