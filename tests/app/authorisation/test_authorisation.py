@@ -79,6 +79,21 @@ def test_one_interface_cannot_fill_the_line_and_another_is_not_held_up_by_it() -
     at_the_authorisation(story)
 
 
+def test_of_the_commands_that_are_being_written_each_that_ends_makes_room_for_one() -> None:
+    async def story(authorisation: Authorisation, controller: Hcp2Controller, _: list[WriteRecord]) -> None:
+        first, *others = [
+            asyncio.ensure_future(authorisation.write(request(controller, element)))
+            for element in range(1, MOST_AT_ONCE + 1)
+        ]
+        assert (await first).ok
+        assert not any(other.done() for other in others)
+        later = await asyncio.gather(*(authorisation.write(request(controller, element)) for element in (30, 31)))
+        assert [record.ok for record in later] == [True, False]
+        assert all(record.ok for record in await asyncio.gather(*others))
+
+    at_the_authorisation(story)
+
+
 def test_a_write_whose_writer_is_cancelled_is_on_record_as_unconfirmed() -> None:
     async def story(authorisation: Authorisation, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
         writing = asyncio.ensure_future(authorisation.write(request(controller, 1)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -242,6 +243,27 @@ def test_what_a_report_keeps_of_many_peers_is_bounded() -> None:
             report.note(str(number))
         await asyncio.sleep(61)
         assert reported == [1, bounds.MOST_REPORTED + 1]
+
+    run_in_virtual_time(run())
+
+
+def test_a_peer_that_a_report_names_is_counted_by_its_name_although_there_are_many_others() -> None:
+    async def run() -> None:
+        reported: list[Counter[str]] = []
+
+        def text(counts: Counter[str]) -> str:
+            reported.append(counts)
+            return ""
+
+        report = LimitedReport(lambda _: None, text)
+        report.note("first")
+        for number in range(bounds.MOST_REPORTED + 3):
+            report.note(str(number))
+        for peer in ("0", "0", "stranger", "0"):
+            report.note(peer)
+        await asyncio.sleep(61)
+        [_, counts] = reported
+        assert (counts["0"], counts["others"], counts.total()) == (4, 4, bounds.MOST_REPORTED + 7)
 
     run_in_virtual_time(run())
 

@@ -238,6 +238,19 @@ def test_an_exchange_that_is_left_out_by_none_is_kept_and_later_bytes_begin_anot
     assert [one.sender for one in late.transmissions] == ["node", "master"]
 
 
+def test_unexpected_bytes_are_reported_each_time_and_those_of_the_master_between_two_reports_are_not() -> None:
+    listener, one = Listener(), attempt()
+    listener.transmitted(1.0, b"ask", one)
+    one.end(Verdict.OK, None, 1.2)
+    listener.take()
+    for when, noise in ((2.0, b"first"), (3.0, b"second"), (4.0, b"third")):
+        listener.received(when, noise, None)
+        [exchange], _ = listener.take()
+        assert [found.data for found in exchange.transmissions] == [noise.hex()]
+        listener.transmitted(when + 0.5, b"ack", None)  # what it closes was reported already
+        assert listener.take() == ([], 0)
+
+
 def test_what_the_master_sends_is_put_in_order_a_few_at_a_time() -> None:
     listener, one = Listener(), attempt()
     for number in range(2 * RECEIVED_AT_ONCE):

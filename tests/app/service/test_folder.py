@@ -218,7 +218,7 @@ def test_a_socket_that_was_removed_meanwhile_ends_all_the_same(tmp_path: Path) -
 
 def test_a_socket_that_cannot_be_served_keeps_no_file_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.sock"
-    before, mask = open_files(), os.umask(0o022)
+    before, mask = open_files(), os.umask(0o027)
     path.write_text("mine")
     with pytest.raises(InvalidCommand, match="is not a socket"):
         served(path).__enter__()
@@ -240,7 +240,7 @@ def test_a_socket_that_cannot_be_served_keeps_no_file_open(tmp_path: Path, monke
         served(path).__enter__()
     assert os.listdir(tmp_path) == []
     assert open_files() == before
-    assert os.umask(mask) == 0o022
+    assert os.umask(mask) == 0o027
 
 
 def test_the_group_with_number_0_gets_the_socket_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,6 +268,24 @@ def test_a_lock_that_an_ending_owner_has_unlinked_is_taken_again(
         assert len(locked) == 2
         assert json.loads(path.with_suffix(".line").read_text())["name"] == "a"
     assert open_files() == before
+
+
+def test_the_longer_record_of_a_process_that_has_died_is_replaced_as_a_whole(folder: Path) -> None:
+    (folder / "a.line").write_text(json.dumps({"name": "a", "port": "/dev/" + "x" * 500, "socket": "", "pid": 1}))
+    with served(folder / "a.sock") as found:
+        assert find_owner("a") == found.owner
+        with pytest.raises(InvalidCommand, match=f"already served by process {os.getpid()}, for /dev/ttyUSB0"):
+            served(folder / "a.sock").__enter__()
+
+
+def test_a_record_that_is_a_link_leads_nowhere(tmp_path: Path) -> None:
+    other = tmp_path / "letters"
+    other.write_text("mine")
+    (tmp_path / "a.line").symlink_to(other)
+    with pytest.raises(InvalidCommand, match=r"a\.sock cannot be served: Too many levels of symbolic links"):
+        served(tmp_path / "a.sock").__enter__()
+    assert other.read_text() == "mine"
+    assert sorted(os.listdir(tmp_path)) == ["a.line", "letters"]
 
 
 def test_a_lock_of_an_unreadable_owner_is_another_processs(tmp_path: Path) -> None:

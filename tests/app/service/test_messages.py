@@ -278,12 +278,13 @@ def test_the_last_of_two_equal_names_counts() -> None:
         ('{"method":"now"}', "not a message of JSON-RPC 2.0"),
         ('{"jsonrpc":2.0,"method":"now"}', "not a message of JSON-RPC 2.0"),
         ('{"jsonrpc":"2.0","method":null}', "a message has a method"),
+        ('{"jsonrpc":"2.0","id":1}', "a message has a method"),
         ('{"jsonrpc":"2.0","method":"now","id":"1"}', "the id of a request is a whole number"),
         ('{"jsonrpc":"2.0","method":"now","id":1.0}', "the id of a request is a whole number"),
         ('{"jsonrpc":"2.0","method":"now","id":%s}' % ("1" * 5000), "the id of a request is a whole number"),
         (b"{}", "a message is text"),
     ],
-    ids=range(13),
+    ids=range(14),
 )
 def test_an_invalid_envelope_is_malformed(text: str | bytes, reason: str) -> None:
     with pytest.raises(Malformed, match=reason) as refusal:

@@ -7,6 +7,7 @@ import contextlib
 import gc
 import json
 import os
+import re
 import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
@@ -120,6 +121,9 @@ def test_a_request_that_came_after_its_time_is_not_sent_on_an_idle_line_either(
                 assert error_of(said) == "NotStarted"
                 hint = "its start_within of 0.5 s was over; give it more time" if "start_within" in options else ""
                 assert hint in said["error"]["data"]["hint"]
+            late_by_seconds = {"requested": line.bus.now() - 7.0, "options": {"start_within": 0.5}}
+            said = await client.ask("request", **request_, **late_by_seconds)
+            assert re.search(r"arrived \d+\.\d s after the program made it$", said["error"]["data"]["what"])
             assert await controller.read(1) == 0
             in_time = {"start_within": PATIENCE, "finish_within": PATIENCE}
             assert "result" in await client.ask("request", **request_, requested=line.bus.now(), options=in_time)
@@ -524,6 +528,18 @@ def test_a_write_that_ends_before_it_is_sent_has_one_audit_entry(
 # checks and reports
 
 
+def test_a_write_that_is_not_permitted_is_refused_with_its_node_and_the_reason(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        ext.rename(Node.of(Hcp2Controller(line.bus, 5)), "winder")
+        async with raw(line) as client:
+            reply = await client.ask("request", **write(1.0))
+            assert reply["error"]["message"] == "winder: this line is read-only"
+        [record] = line.records
+        assert (record.outcome, record.error) == (Outcome.REFUSED, "winder: this line is read-only")
+
+    on_a_line(tmp_path, story, read_only=True)
+
+
 def test_a_check_reports_the_first_refused_write_of_several_and_writes_nothing(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         Hcp2Controller(line.bus, 5).element(1).limit(minimum=5, maximum=10)
@@ -707,14 +723,37 @@ def test_points_that_were_gathered_are_polled_together_and_are_limited(
             assert "result" in await asked(client, 1, "gather", stream=8, points=points(1, 2, 3))
             reply = await asked(client, 1, "gather", stream=9, points=points(1))
             assert "one program has 2 poll groups at most" in reply["error"]["message"]
-            assert "result" in await asked(client, 1, "gather", stream=7, points=points(3))
             await client.say(method="end", params={"stream": 8})
             reply = await asked(client, 1, "gather", stream=9, points=points(1, command="write", values=[1.0]))
             assert "a poll group reads: it writes nothing" in reply["error"]["message"]
-            assert "result" in await asked(client, 1, "poll", **polled(7, points=[]))
+            for last, why in (
+                (points(3, 4), "a poll group of a program has 3 points at most"),
+                (points(3, command="write", values=[1.0]), "a poll group reads: it writes nothing"),
+            ):
+                reply = await asked(client, 1, "poll", **polled(7, points=last))
+                assert why in reply["error"]["message"]
+            assert "result" in await asked(client, 1, "poll", **polled(7, points=points(3)))
             assert [point.item for point in line.bus.groups[0].points] == ["1", "2", "3"]
             assert "result" in await asked(client, 1, "gather", stream=9, points=points(1))
             assert "result" in await asked(client, 1, "gather", stream=10, points=points(1))  # the first is a group now
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize(("method", "params"), [("subscribe", {"group": "axes"}), ("events", {})])
+def test_a_stream_that_nobody_follows_any_more_keeps_nothing_on_the_line(
+    tmp_path: Path, method: str, params: dict[str, Any]
+) -> None:
+    async def story(line: Served) -> None:
+        axes = line.bus.poll_group("axes", period=60.0, points=[Hcp2Controller(line.bus, 5).point("1")])
+        followed = axes._consumers_of_changes if method == "subscribe" else line.bus._streams
+        before = len(followed)
+        async with raw(line) as client:
+            for _ in range(2):
+                assert "result" in await asked(client, 1, method, stream=7, **params)
+                await until(lambda: len(followed) == before + 1)
+                await client.say(method="end", params={"stream": 7})
+                await until(lambda: len(followed) == before)
 
     on_a_line(tmp_path, story)
 
@@ -815,6 +854,20 @@ def test_a_write_to_a_point_is_superseded_by_a_stop_that_its_program_has_not_see
     on_a_line(tmp_path, story)
 
 
+def test_the_number_of_a_request_that_could_not_be_started_is_free_again(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        async with raw(line) as client:
+            assert "result" in await client.ask("node", protocol="hcp2", address=5)
+            own.node.note_stop()
+            assert (await client.hear())["params"]["stops"] == 1
+            for _ in range(2):
+                assert error_of(await client.ask("request", **READ, stops_seen=0)) == "Superseded"
+            assert (await client.ask("request", **READ, stops_seen=1))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
 def test_a_node_that_its_program_names_twice_leaves_the_line_with_it(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line) as client:
@@ -845,6 +898,18 @@ def test_a_sequence_that_has_begun_is_not_begun_again_under_its_number(tmp_path:
             assert held.over
             await client.say(method="hold", params=hold)
             assert (await client.ask("request", **{**READ, "address": 6}, sequence=1))["result"] == 0
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_sequence_that_could_not_begin_may_be_begun_again_under_its_number(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            hold: dict[str, Any] = {"sequence": 1, "protocol": "hcp2", "address": 5, "max_hold": 0.0}
+            await client.say(method="hold", params=hold)
+            assert "max_hold" in (await client.ask("request", **READ, sequence=1))["error"]["message"]
+            await client.say(method="hold", params={**hold, "max_hold": ext.LONGEST_HOLD})
+            assert (await client.ask("request", **READ, sequence=1))["result"] == 0
 
     on_a_line(tmp_path, story)
 
