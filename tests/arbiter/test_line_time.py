@@ -8,6 +8,7 @@ import pytest
 
 from busmaster.arbiter.schedule import line_time
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
 
 TAU = hcp2.PROFILE.line.byte_time
@@ -29,3 +30,13 @@ def test_line_time_of_a_conversation_counts_each_step_and_the_closing_ack() -> N
     read = msc.DataRead(2008).open(1, replace(msc.PROFILE.timings, packet=slow))
     late_after = msc.PROFILE.timings.read.late_after
     assert line_time(read, tau) == pytest.approx((16 + 1 + 18 + 1) * tau + (late_after + 0.08) / 2)
+
+
+def test_line_time_of_a_broadcast_counts_its_bytes_and_no_reply() -> None:
+    """A write of Mentor II to address 0: EOT, four digits of the address, STX, four of the parameter, the value, ETX,
+    and a checksum."""
+    write = mentor.Write(1, 18, 5).open(0, mentor.PROFILE.timings)
+    assert not write.answered
+    tau, released = mentor.PROFILE.line.byte_time, write.timing.driver_release_time
+    assert line_time(write, tau) == pytest.approx(len(write.request) * tau + released)
+    assert line_time(write, tau, 0.05) == line_time(write, tau)

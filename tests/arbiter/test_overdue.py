@@ -121,6 +121,8 @@ def test_r15_only_what_is_like_a_forgiven_reply_is_held_and_only_until_it_would_
     in_sync = InSync()
     in_sync.add_overdue((ONE,), living(), asked=1.0, over=1.150)
     in_sync.forgive((ONE,))
+    assert in_sync.is_overdue(10.9), "it was forgiven, and may still arrive"
+    assert not in_sync.is_overdue(1.0 + LAPSE)
     assert in_sync.is_to_be_held((ONE,), 10.9)
     assert not in_sync.is_to_be_held((TWO,), 10.9)
     assert not in_sync.is_to_be_held((ONE,), 1.0 + LAPSE)

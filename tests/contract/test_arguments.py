@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 from fractions import Fraction
 from math import inf, nan
 from typing import Any
@@ -86,3 +87,15 @@ def test_a_name_that_is_near_nothing_is_told_what_there_is() -> None:
 
 def test_the_nearest_of_several_is_meant() -> None:
     assert nearest("gain2", ["gain1", "gain2", "gain3"]) == "gain2"
+
+
+def test_where_no_file_can_be_opened_a_wrong_name_is_refused_without_a_guess(monkeypatch: pytest.MonkeyPatch) -> None:
+    imports = builtins.__import__
+
+    def without_descriptors(name: str, *args: Any, **options: Any) -> Any:
+        if name == "difflib":
+            raise OSError(24, "Too many open files")
+        return imports(name, *args, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without_descriptors)
+    assert guess("pres", ["press"]) == ""

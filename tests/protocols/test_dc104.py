@@ -131,6 +131,7 @@ def test_a_reply_cut_short_says_how_short() -> None:
         ("1", {}),
         (5, {"maximum": 256}),
         (5, {"minimum": 2}),
+        (0, {"minimum": 0, "maximum": 0}),
     ],
 )
 def test_a_parameter_that_the_drive_does_not_have_is_never_sent(parameter: int, limits: dict[str, int]) -> None:
