@@ -266,3 +266,13 @@ def test_r8_a_delayed_write_of_a_sequence_that_is_woken_early_ends_once(table: T
     bench.listen()
     assert bench.ended(first) == 1
     assert isinstance(first.error, HoldEnded)
+
+
+def test_a_request_that_is_delayed_again_for_a_shorter_time_is_returned_once() -> None:
+    """The end of another write may release it and delay it anew: its first entry is still there when it has gone."""
+    delayed = Delayed(Deadlines())
+    transaction = Transaction(Bench().node(), hcp2.Read(1))
+    delayed.add(transaction, 5.0)
+    delayed.add(transaction, 3.0)
+    assert delayed.due(4.0) == [transaction]
+    assert delayed.due(6.0) == []

@@ -230,6 +230,7 @@ def test_r11_after_a_return_a_fifth_of_the_line_for_thirty_seconds() -> None:
     assert budget.take(0.2, 101.0)
     budget.tokens = 0.0
     assert budget.wait_for(0.1, 101.0) == pytest.approx(0.5)
+    assert budget.wait_for(0.01, 130.0) == pytest.approx(0.5), "the thirty seconds are over"
     assert budget.take(0.4, 140.0)
     budget.tokens = 0.0
     assert not budget.take(0.2, 149.0)
