@@ -72,6 +72,7 @@ def test_ei_bisynch_keeps_the_contract() -> None:
             lambda: Read("P V"),
             lambda: ReadRun(()),
             lambda: ReadRun(("PV",) * 33),
+            lambda: ReadRun(("PV", "SLX")),
             lambda: Write("SL", float("nan")),
             lambda: Write("SL", 10**12),
             lambda: Write("SL", 10**400),
