@@ -348,22 +348,28 @@ async def test_pauses_between_tries_to_connect_are_doubled_up_to_a_bound(monkeyp
     assert set(tokens) == {"secret"}
 
 
+class StubOwner:
+    """Replaces the connection to an owner. A subclass has the `_overview`."""
+
+    _overview: Any
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    async def __aenter__(self) -> Any:
+        return SimpleNamespace(about={"read_only": False}, on_access=[], on_touched=[], overview=self._overview)
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+
 @pytest.mark.asyncio
 async def test_while_a_line_is_being_connected_nothing_is_written_and_its_values_are_prepared(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     entered = asyncio.Event()
 
-    class Slow:
-        def __init__(self, *_: object, **__: object) -> None:
-            pass
-
-        async def __aenter__(self) -> Any:
-            return SimpleNamespace(about={"read_only": False}, on_access=[], on_touched=[], overview=self._overview)
-
-        async def __aexit__(self, *_: object) -> None:
-            pass
-
+    class Slow(StubOwner):
         async def _overview(self, receive: Any) -> Any:
             described = {"group": "g", "key": "5/1", "node": "n", "protocol": "hcp2", "address": 5, "item": "1"}
             receive("rows", {"set": 1, "first": 0, "rows": [described]})
@@ -403,16 +409,7 @@ async def test_the_picture_is_that_of_the_owner_that_came_last_however_it_number
     owners = iter([(7, "5/1"), (1, "5/2")])
     entered = asyncio.Event()
 
-    class Connection:
-        def __init__(self, *_: object, **__: object) -> None:
-            pass
-
-        async def __aenter__(self) -> Any:
-            return SimpleNamespace(about={"read_only": False}, on_access=[], on_touched=[], overview=self._overview)
-
-        async def __aexit__(self, *_: object) -> None:
-            pass
-
+    class Connection(StubOwner):
         async def _overview(self, receive: Any) -> Any:
             number, key = next(owners)
             described = {"group": "g", "key": key, "node": "n", "protocol": "hcp2", "address": 5, "item": key[2:]}

@@ -744,7 +744,7 @@ def test_an_address_with_one_request_more_than_another_keeps_them_all(monkeypatc
             reader, writer = await connect(source)
             writer.write(frame(READ))
             open_.append(reader)
-        while echo.counts[1] < 3:  # noqa: ASYNC110
+        while echo.counts[1] < 3:  # noqa: ASYNC110  nothing reports it
             await asyncio.sleep(0.001)
         another, _ = await connect("127.0.0.2")
         assert await is_closed(another), "then it would be the address with one more"
@@ -777,7 +777,7 @@ def test_requests_of_replaced_connections_count_as_those_of_their_address(monkey
     async def story(connect: Connect, echo: Echo, _reports: list[str]) -> None:
         for source in ("127.0.0.1", "127.0.0.1", "127.0.0.2"):
             (await connect(source))[1].write(frame(READ, unit=1))
-        while echo.counts[1] < 3:  # noqa: ASYNC110
+        while echo.counts[1] < 3:  # noqa: ASYNC110  nothing reports it
             await asyncio.sleep(0.001)
         reader, writer = await connect("127.0.0.3")  # replaces one of 127.0.0.1
         writer.write(frame(READ, unit=2))

@@ -70,7 +70,7 @@ class Latest(Generic[Passed]):
         """Each with the latest end of all up to it."""
 
     def add(self, passed: Passed) -> None:
-        """They come about in the order of their ends."""
+        """Add what passed after all others, but may end before one of them."""
         before = self._kept[-1][0] if self._kept else -inf
         self._kept.append((max(before, passed.end), passed))
 

@@ -246,6 +246,14 @@ def test_a_write_of_msc_may_wait_for_minutes() -> None:
     assert problems == []
 
 
+def test_damage_that_lasts_longer_than_later_damage_is_found() -> None:
+    ledger = Ledger(97, 5)
+    ledger.spoiled(1.0, 10.0)
+    ledger.spoiled(2.0, 3.0)
+    assert ledger.damaged(5.0, 6.0)
+    assert not ledger.damaged(10.0, 11.0)
+
+
 def test_an_overdue_reply_that_noise_changed_blames_nobody() -> None:
     """Seed 92000 of DC104: noise turned the reply to parameter 2 into one of parameter 3, which was requested then."""
     ledger = Ledger(97, 5)
