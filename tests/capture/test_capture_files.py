@@ -83,10 +83,10 @@ def test_only_its_own_old_files_are_removed(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_full_disk_is_said_and_what_passed_meanwhile_is_recorded_when_it_has_room(tmp_path: Path) -> None:
+def test_a_full_disk_is_said_and_what_passed_meanwhile_is_recorded_when_it_has_room() -> None:
     said: list[str] = []
-    with small_disk(tmp_path, 64) as disk:
-        with Recorder(tmp_path / "line.pcapng", report=said.append) as tap:
+    with small_disk(64) as disk:
+        with Recorder(disk.folder / "line.pcapng", report=said.append) as tap:
             exchange(tap, 1)
             until(lambda: Path(tap.path).stat().st_size > 0 and transactions(Path(tap.path)) == [1])
             disk.fill()
@@ -96,15 +96,15 @@ def test_a_full_disk_is_said_and_what_passed_meanwhile_is_recorded_when_it_has_r
             disk.clear()
             until(lambda: len(said) == 2)
             exchange(tap, 60)
-        assert transactions(tmp_path / "line.pcapng") == list(range(1, 61))
+        assert transactions(disk.folder / "line.pcapng") == list(range(1, 61))
     assert said[0].endswith("line.pcapng: No space left on device")
     assert said[1].endswith("nothing is lost")
     assert (tap.error, tap.dropped) == (None, 0)
 
 
-def test_on_a_disk_that_stays_full_what_is_lost_is_counted_and_the_file_ends_where_it_was_cut(tmp_path: Path) -> None:
-    with small_disk(tmp_path, 16) as disk:
-        with Recorder(tmp_path / "line.pcapng", capacity=30) as tap:
+def test_on_a_disk_that_stays_full_what_is_lost_is_counted_and_the_file_ends_where_it_was_cut() -> None:
+    with small_disk(16) as disk:
+        with Recorder(disk.folder / "line.pcapng", capacity=30) as tap:
             exchange(tap, 1)
             until(lambda: Path(tap.path).stat().st_size > 0 and transactions(Path(tap.path)) == [1])
             disk.fill()
@@ -119,15 +119,15 @@ def test_on_a_disk_that_stays_full_what_is_lost_is_counted_and_the_file_ends_whe
                 exchange(tap, number)
         assert isinstance(tap.error, OSError)
         assert tap.dropped >= 270  # three events each; thirty of them waited to the end
-        kept = transactions(tmp_path / "line.pcapng")
+        kept = transactions(disk.folder / "line.pcapng")
         assert kept == list(range(1, len(kept) + 1))
         lost = number - len(kept)
         assert tap.dropped >= 3 * lost
 
 
-def test_what_one_writing_leaves_is_written_by_the_next(tmp_path: Path) -> None:
-    with small_disk(tmp_path, 16) as disk:
-        files = CaptureFiles(tmp_path / "line.pcapng")
+def test_what_one_writing_leaves_is_written_by_the_next() -> None:
+    with small_disk(16) as disk:
+        files = CaptureFiles(disk.folder / "line.pcapng")
         files.write(bytes(2_000))
         files.flush()
         disk.fill()
@@ -137,7 +137,7 @@ def test_what_one_writing_leaves_is_written_by_the_next(tmp_path: Path) -> None:
         assert 0 < files.pending < 10_000
         disk.clear()
         files.close()
-        assert (tmp_path / "line.pcapng").read_bytes() == bytes(2_000) + b"x" * 10_000
+        assert (disk.folder / "line.pcapng").read_bytes() == bytes(2_000) + b"x" * 10_000
 
 
 def test_a_pipe_or_a_device_is_written_to_as_it_is(tmp_path: Path) -> None:

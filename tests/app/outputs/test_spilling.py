@@ -367,10 +367,9 @@ async def test_an_output_that_a_file_does_not_name_any_more_says_what_it_leaves_
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["csv", "sqlite"])
 def test_a_full_disk_costs_nothing_where_what_waits_is_on_another(tmp_path: Path, kind: str) -> None:
-    (tmp_path / "disk").mkdir()
     said: list[str] = []
-    path, spill = str(tmp_path / "disk" / "x"), str(tmp_path / "spool")
-    with small_disk(tmp_path / "disk", 2000) as disk:
+    with small_disk(2000) as disk:
+        path, spill = str(disk.folder / "x"), str(tmp_path / "spool")
         output: BatchOutput[Any] = (
             CsvOutput(kind, FileSettings(path=path, spill=spill, buffer=100), said.append)
             if kind == "csv"
@@ -394,17 +393,17 @@ def test_a_full_disk_costs_nothing_where_what_waits_is_on_another(tmp_path: Path
         disk.clear()
         until(lambda: settled(output))
         output.close(PATIENCE)
-        assert numbers(tmp_path / "disk" / "x") == list(range(1, last + 1))
+        assert numbers(disk.folder / "x") == list(range(1, last + 1))
     assert output.dropped == output.lost == 0
     assert "full" in said[0] or "No space left" in said[0]
     assert said[-1] == f"{kind} is up again"
 
 
-def test_a_disk_that_is_full_again_after_it_took_values_is_told_again(tmp_path: Path) -> None:
+def test_a_disk_that_is_full_again_after_it_took_values_is_told_again() -> None:
     said: list[str] = []
-    with small_disk(tmp_path, 1000) as disk:
-        (tmp_path / "x").mkdir()  # which keeps the output down
-        output = csv(tmp_path, said.append)
+    with small_disk(1000) as disk:
+        (disk.folder / "x").mkdir()  # which keeps the output down
+        output = csv(disk.folder, said.append)
         output.start()
 
         def times_full() -> int:

@@ -255,12 +255,10 @@ async def test_a_process_that_is_killed_loses_nothing_that_it_had_put_on_disk(tm
 
 @needs_mosquitto
 @pytest.mark.asyncio
-async def test_a_full_disk_under_the_spool_is_told_once_and_memory_holds_what_it_can(tmp_path: Path) -> None:
+async def test_a_full_disk_under_the_spool_is_told_once_and_memory_holds_what_it_can() -> None:
     said: list[str] = []
-    disk_folder = tmp_path / "disk"
-    disk_folder.mkdir()
-    with small_disk(disk_folder, 1000) as disk:
-        output = output_to(free_port(), disk_folder, said.append, buffer=400)
+    with small_disk(1000) as disk:
+        output = output_to(free_port(), disk.folder, said.append, buffer=400)
         disk.fill()
         output.start()
         for number in range(1, 1001):

@@ -10,8 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
+from tests.disks import small_disk
 from tests.verification.plant.plant import Plant, Site
 from tests.verification.plant.programs import until
 from tests.verification.plant.trial import Fault
@@ -79,25 +78,19 @@ def full(*kinds: str) -> Callable[[Plant], None]:
 
 
 def read_only(plant: Plant) -> None:
-    """Another disk, which nobody may write to, comes to lie over the folder; then it goes."""
+    """Another disk, which nobody may write to, takes the folder's place; then it goes."""
     folder = plant.paths["csv"].parent
-    mount("-t", "tmpfs", "-o", "ro,size=64k", "none", str(folder))
-    try:
+    aside = folder.with_name(f"{folder.name}.aside")
+    with small_disk(64, read_only=True) as disk:
+        folder.rename(aside)
+        folder.symlink_to(disk.folder)
         plant.run.heard("csv is down", plant.fault_at)
         plant.run.heard("jsonl is down", plant.fault_at)
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
+        folder.unlink()
+        aside.rename(folder)
     plant.over()
     plant.run.heard("csv is up again", plant.fault_at)
     plant.run.heard("jsonl is up again", plant.fault_at)
-
-
-def mount(*arguments: str) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("mounting a file system needs root")
-    done = subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
-    if done.returncode:
-        pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
 
 
 def locked(plant: Plant) -> None:

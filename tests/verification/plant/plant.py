@@ -138,8 +138,8 @@ class Plant:
             stack.callback(self.subscriber.close)
             self.gateway = stack.enter_context(Gateway(self.broker.port))
             if self.site.disk:
-                (self.folder / "disk").mkdir()
-                self.disk: SmallDisk = stack.enter_context(small_disk(self.folder / "disk", self.site.disk))
+                self.disk: SmallDisk = stack.enter_context(small_disk(self.site.disk))
+                (self.folder / "disk").symlink_to(self.disk.folder)
             (self.folder / self.site.folder).mkdir(exist_ok=True)
             places = dict.fromkeys(self.site.on_disk, "disk") | dict.fromkeys(self.site.in_folder, self.site.folder)
             self.paths = {kind: self.folder / places.get(kind, "") / self.names[kind] for kind in FILES}
