@@ -723,6 +723,14 @@ def test_r15_after_a_duplicate_replies_of_the_last_half_second_are_ambiguous_and
     assert not in_sync.is_ambiguous((keys[0],), 2.0)
 
 
+def test_r15_thirty_seconds_after_the_last_duplicate_replies_are_no_longer_ambiguous() -> None:
+    in_sync = InSync()
+    in_sync.answered_twice(0.0)
+    in_sync.note_answered((b"\x01",), 29.75)
+    assert in_sync.is_ambiguous((b"\x01",), 29.9)
+    assert not in_sync.is_ambiguous((b"\x01",), 30.1)
+
+
 @pytest.mark.parametrize("kind", ["_ambiguous", "_forgiven"])
 def test_r15_replies_are_examined_as_long_as_an_overdue_one_may_be_mistaken_for_them(kind: str) -> None:
     in_sync = InSync()

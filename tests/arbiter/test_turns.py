@@ -179,6 +179,14 @@ def test_r9_nobody_is_passed_over_more_than_twice_by_each_of_the_others(
             desk.ask(served)
 
 
+def test_r9_a_program_with_one_long_exchange_is_passed_over_twice_by_another() -> None:
+    desk = Desk()
+    long, short = desk.client(takes=1.0), desk.client()
+    desk.ask(long, 10)
+    desk.ask(short, 100)
+    assert desk.serve(7) == [long, short, short, long, short, short, long], "as docs/promises.md says"
+
+
 def test_r9_a_program_cannot_starve_the_others_by_urgent_requests() -> None:
     desk = Desk()
     flood, other = desk.client(), desk.client()
