@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.on_wire import Echo
 
 
@@ -30,3 +31,7 @@ def test_without_an_echo_nothing_is_removed() -> None:
     echo = Echo(declared=False)
     echo.sent(b"abc")
     assert echo.strip(b"abc") == b"abc"
+
+
+def test_a_line_has_no_echo_unless_it_is_declared() -> None:
+    assert not Arbiter(0.001)._echo.declared

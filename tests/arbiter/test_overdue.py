@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from math import inf
 
 import pytest
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.counters import LineCounters
+from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.in_sync import ANY_BYTE, LAPSE, MOST_OVERDUE, Awaited, InSync
-from busmaster.arbiter.unexpected import LOOKS
+from busmaster.arbiter.unexpected import LOOKS, UnexpectedBytes
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -251,3 +254,13 @@ def test_r15_a_reply_that_stood_alone_ends_what_was_forgiven_of_its_key_and_of_a
     in_sync._forgiven += [(ANY_BYTE, 5.0), (ONE, 5.0), (TWO, 5.0)]
     in_sync.stood_alone((ONE,))
     assert in_sync._forgiven == [(TWO, 5.0)]
+
+
+def test_r3_bytes_before_the_first_read_of_the_line_raise_no_max_reply_delay() -> None:
+    """They may have lain unread for any time."""
+    events: deque[Event] = deque()
+    node = living()
+    unexpected = UnexpectedBytes(events, LineCounters(0.0))
+    unexpected.unanswered(node, 0.0, 0.15)
+    unexpected.blame(0.149)
+    assert not events

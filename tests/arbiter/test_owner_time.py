@@ -131,6 +131,17 @@ def test_r9_the_owners_urgent_requests_go_before_those_of_all_others() -> None:
     assert desk.serve(5) == [None] * 5
 
 
+def test_r9_beside_urgent_requests_the_owners_polls_keep_their_part_beside_its_commands() -> None:
+    desk = Desk()
+    desk.ask(client(desk, WRITER), 2000, URGENT)
+    desk.ask(None, 2000, COMMAND)
+    desk.ask(None, 2000, POLL)
+    desk.serve(1800)
+    commands, polls = (2000 - desk.backlog.waiting_of(priority, None) for priority in (COMMAND, POLL))
+    assert commands + polls >= 800
+    assert polls >= commands / 9
+
+
 def test_r9_guests_have_all_that_the_owner_leaves() -> None:
     desk = Desk()
     first, second = client(desk, GUEST), client(desk, GUEST)

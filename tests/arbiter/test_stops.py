@@ -10,6 +10,7 @@ from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import Superseded, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.wire.readers import ENQ
 from tests.arbiter.bench import Bench, up
 
 
@@ -134,6 +135,29 @@ def test_r7_stops_are_sent_themselves_if_the_one_that_was_sent_is_cancelled_befo
     assert second.phase is Phase.QUEUED
     table.bench.served(second)
     assert second.error is None
+
+
+def test_r7_a_stop_that_is_refused_on_its_own_is_unconfirmed_because_the_shared_one_may_have_acted() -> None:
+    bench = Bench()
+    node = up(bench)
+    how = {"priority": Priority.URGENT, "stop": True, "idempotent": True}
+    bench.ask(node, hcp2.Read(9))
+    bench.until_sent()
+    first, second = (bench.ask(node, hcp2.Write(2, (0.0,)), client=bench.arbiter.add_client(), **how) for _ in "12")
+    bench.answer()
+    bench.until_sent()
+    bench.sent()
+    while first.phase is not Phase.QUEUED:
+        bench.to(bench.arbiter.poll_timeout())
+    bench.arbiter.cancel(first, bench.now)
+    while not bench.ended(second):
+        bench.until_sent()
+        if bytes.fromhex(bench.sent())[-2] == ENQ[0]:
+            bench.answer()
+        else:
+            bench.hear("15", after=0.004)
+    assert second.attempts > 1
+    assert isinstance(second.error, WriteUnconfirmed)
 
 
 def test_r9_an_equal_stop_that_was_sent_itself_ends_with_its_own_outcome() -> None:
