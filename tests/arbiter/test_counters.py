@@ -40,6 +40,16 @@ def test_nothing_is_counted_before_anything_has_happened() -> None:
     assert (node.attempts, node.failed, node.latency.count) == (0, 0, 0)
 
 
+def test_time_without_a_port_is_neither_quiet_nor_busy_time() -> None:
+    bench = Bench()
+    before = bench.arbiter.statistics(bench.now)
+    bench.arbiter.line_down("pulled out", bench.now)
+    bench.wait(5.0)
+    after = bench.arbiter.statistics(bench.now)
+    assert after.elapsed == before.elapsed + 5.0
+    assert (after.quiet_time, after.busy) == (before.quiet_time, before.busy)
+
+
 def is_late(bench: Bench, node: NodeRecord) -> None:
     bench.ask(node)
     bench.sent()
