@@ -164,6 +164,8 @@ def test_r12_delayed_requests_count_against_the_limit_of_their_client(monkeypatc
     assert "3 requests are waiting" in str(one_more.error)
     assert bench.ask(table.slow).error is None, "another client has its own limit"
     assert bench.ask(table.slow, priority=POLL, client=client).error is None, "each class has its own limit"
+    urgent = [bench.ask(table.slow, priority=URGENT, client=client) for _ in range(4)]
+    assert [type(each.error) for each in urgent] == [type(None)] * 3 + [BacklogFull]
     bench.served(waiting[0])
 
 

@@ -244,6 +244,7 @@ def lowered(bench: Bench) -> list[MaxReplyDelayLowered]:
 
 
 def test_r3_a_raised_max_reply_delay_comes_down_after_an_hour_of_prompt_replies() -> None:
+    assert CALM_MAX_REPLY_DELAY == 3600.0, "as docs/promises.md says"
     bench = Bench()
     node = raised(bench)
     bench.wait(CALM_MAX_REPLY_DELAY - 1.0)

@@ -295,4 +295,5 @@ def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> 
 
 def test_the_share_of_line_time_that_each_program_has() -> None:
     assert parse(TEXT).service.share == 1.0
-    assert parse(f"{TEXT}[service]\nshare = 0.5\n").service.share == 0.5
+    for share in (0.1, 0.5, 10.0):  # as docs/service.md says
+        assert parse(f"{TEXT}[service]\nshare = {share}\n").service.share == share
