@@ -32,6 +32,13 @@ def test_line_time_of_a_conversation_counts_each_step_and_the_closing_ack() -> N
     assert line_time(read, tau) == pytest.approx((16 + 1 + 18 + 1) * tau + (late_after + 0.08) / 2)
 
 
+def test_line_time_of_a_request_with_an_odd_number_of_bytes_counts_the_closing_ack_too() -> None:
+    """MSC RFLAGS: a packet of 15 bytes, ACK, a packet of 47 typical bytes, ACK."""
+    tau = msc.PROFILE.line.byte_time
+    read = msc.ReadFlags().open(1, msc.PROFILE.timings)
+    assert line_time(read, tau, 0.01) == pytest.approx((15 + 1 + 47 + 1) * tau + 2 * 0.01)
+
+
 def test_line_time_of_a_broadcast_counts_its_bytes_and_no_reply() -> None:
     """A write of Mentor II to address 0: EOT, four digits of the address, STX, four of the parameter, the value, ETX,
     and a checksum."""
