@@ -164,6 +164,7 @@ def _page() -> Iterator[str]:
     yield "## Exit status\n\n| status | meaning |\n|---|---|"
     yield from (f"| {status} | {about} |" for status, about in STATUSES.items())
     yield "\nStandard output contains only results. Each error is one line on standard error.\n"
+    yield "With `--json`, the results are objects with the fields of [JSON output](json-output.md).\n"
     yield "## Environment\n\n| variable | meaning |\n|---|---|"
     yield from (f"| `{name}` | {about} |" for name, about in ENVIRONMENT.items())
     yield "\n## ITEM\n\nThe forms of ITEM. `busmaster items PROTOCOL` lists the items and their meaning.\n"
