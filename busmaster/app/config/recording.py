@@ -30,7 +30,7 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
             path = getattr(settings, key, None)
             if not isinstance(path, str):
                 continue
-            path = os.path.abspath(path)  # it can be written in several ways
+            path = os.path.realpath(path)  # it can be written in several ways, and through links
             if taken.setdefault(path, f"{kind}.{key}") != f"{kind}.{key}":
                 with table.part():
                     raise table.table(kind).error(f"is already the file of {taken[path]}; use another path", key)

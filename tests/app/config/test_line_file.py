@@ -595,11 +595,12 @@ def test_an_error_names_file_line_and_key_and_what_would_do(text: str, complaint
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("other", ["./x", "a/../x", ".//x", "HERE/x"])
+@pytest.mark.parametrize("other", ["./x", "a/../x", ".//x", "HERE/x", "link/x"])
 def test_the_file_of_an_output_is_the_same_however_its_path_is_written(
     other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path)
     other = other.replace("HERE", str(tmp_path))
     outputs = f'[outputs.csv]\npath = "x"\n[outputs.jsonl]\npath = "y"\nspill = "{other}"\n'
     with pytest.raises(FileError, match=r"line\.toml:9: outputs\.jsonl\.spill: is already the file of csv\.path"):
