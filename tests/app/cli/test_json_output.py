@@ -131,7 +131,6 @@ COMMANDS = {
     "write": (f"write PORT {HCP2} --node 1 20=5 21=6,7", "write FILE winder/20=5"),
     "do": (f"do 5@PORT disable {MICROFLEX}",),
     "scan": (f"scan PORT {HCP2} --nodes 1",),
-    "doctor": (f"doctor PORT {HCP2} --nodes 1",),
     "check": ("check FOLDER/idle.toml", "check FOLDER/broken.toml"),
     "plan": ("plan FILE", "plan FOLDER/merged.toml"),
     "items": ("items hcp2", "items microflex"),
@@ -144,6 +143,11 @@ def test_each_field_is_on_the_page(section: str, printed: Printed, tmp_path: Pat
         (tmp_path / name).write_text(text)
     lines = [line for command in COMMANDS[section] for line in printed(f"{command} --json")]
     assert fields(lines) == documented()[section]
+
+
+@pytest.mark.slow
+def test_each_field_of_a_finding_is_on_the_page(printed: Printed) -> None:
+    assert fields(printed(f"doctor PORT {HCP2} --nodes 1 --json")) == documented()["doctor"]
 
 
 def test_each_field_of_a_running_line_is_on_the_page(printed: Printed, file: Path) -> None:
@@ -169,6 +173,7 @@ def test_each_field_of_a_trend_is_on_the_page(printed: Printed) -> None:
     assert fields(lines) == documented()["trend"]
 
 
+@pytest.mark.slow
 def test_each_field_of_a_frame_is_on_the_page(tmp_path: Path) -> None:
     with create_server(("127.0.0.1", 0)) as server:
         port = f"socket://127.0.0.1:{server.getsockname()[1]}?baudrate=57600"
