@@ -458,6 +458,8 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             f"{HEAD}{NODE}[safe]\nwrites = {{ 'winder/1' = [0, 1] }}",
             "line.toml:6: safe.writes.winder/1: must be one value; write the others as points of their own",
         ),
+        (f"{HEAD}{NODE}[safe]\nwrites = {{ 'winder/1' = [] }}", "line.toml:6: safe.writes.winder/1: must be one value"),
+        (f"{HEAD}{NODE}[safe]\nrepeatable = ['winder/1']", "line.toml:5: safe: a safe state needs writes"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\naudit = 'strict'", "line.toml:4: outputs.csv.audit: no such key"),
         (f"{HEAD}[outputs.metrics]\nbuffer = 5", "line.toml:3: outputs.metrics.buffer: no such key"),
         (
