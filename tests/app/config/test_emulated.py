@@ -406,3 +406,10 @@ def test_an_emulated_line_has_the_framing_of_the_port(port: str) -> None:
     text = f"[port]\n{port}\n{settings}{node('hcp2', 5).removeprefix(HEAD)}"
     line = emulated_line(read(Source("line.toml", text)))
     assert line.settings == LineSettings(19200, bytesize=7, parity="E", stopbits=2)
+
+
+def test_behind_a_port_of_raw_bytes_the_line_has_the_baud_rate_of_the_port_and_the_framing_of_its_protocol() -> None:
+    text = f"[port]\nhost = '10.0.0.5'\nport = 4001\nbaudrate = 19200\n{node('mentor', 14).removeprefix(HEAD)}"
+    for given, baudrate in ((text, 19200), (text.replace("baudrate = 19200\n", ""), 9600)):
+        line = emulated_line(read(Source("line.toml", given)))
+        assert line.settings == LineSettings(baudrate, bytesize=7, parity="E")

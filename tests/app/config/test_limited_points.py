@@ -169,3 +169,45 @@ async def test_a_file_that_is_read_again_keeps_its_groups_but_those_whose_points
 def test_what_means_nothing_is_an_error_that_says_what_to_write(text: str, said: str) -> None:
     with pytest.raises(FileError, match=said):
         parse(text)
+
+
+RUN = """port = "/dev/ttyUSB0?baudrate=9600"
+[nodes.press]
+protocol = "msc"
+address = 1
+address_step = 1
+[nodes.press.points]
+cams = { item = "2008:3", factor = 0.1 }
+cam = { item = "2009", factor = 0.1, maximum = 5 }
+"""
+
+
+def pressing() -> ConfiguredLine:
+    parsed = read(Source("line.toml", RUN))
+    return ConfiguredLine(parsed, port=MemoryPort(emulated_line(parsed)), outputs=False)
+
+
+@in_virtual_time
+async def test_a_scaled_run_is_written_by_its_scale_and_with_the_options_of_the_caller() -> None:
+    async with pressing() as line:
+        cams = line.point("press/cams")
+        await cams.write([1.5, 5, 0])
+        assert await line.nodes["press"].read(2008, 3) == (15, 50, 0)
+        assert await cams.read() == (1.5, 5, 0)
+        with pytest.raises(InvalidCommand, match="maximum of 5"):
+            await cams.write([1.5, 6, 0])
+        await cams.write([1.5, 6, 0], safe=True)
+        assert await cams.read() == (1.5, 6, 0)
+
+
+@in_virtual_time
+async def test_neither_a_point_that_is_not_writable_nor_a_bit_is_written_as_the_protocols_own_point() -> None:
+    text = (
+        "[nodes.winder.points]\nready = { item = '11', writable = false }\nstate = { item = '12', bits = { ON = 1 } }\n"
+    )
+    async with emulated(text) as line:
+        before = await line.nodes["winder"].read(11, 2)
+        for name in ("winder/ready", "winder/state.ON"):
+            with pytest.raises(InvalidCommand, match="read-only"):
+                await line.point(name).write(1, safe=True)
+        assert await line.nodes["winder"].read(11, 2) == before

@@ -434,6 +434,10 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             "line.toml:4: nodes.a1-3.address: 3 names need 3 addresses",
         ),
         (
+            f'{SLOW}[nodes.a0-2]\nprotocol = "modbus"\naddress = "0-2"',
+            "line.toml:4: nodes.a0-2.address: 0 is the broadcast address of modbus",
+        ),
+        (
             f'{HEAD}[nodes.a1-2]\nprotocol = "hcp"\naddress = "1-3"',
             "line.toml:4: nodes.a1-2.address: 2 names need 2 addresses, not 3",
         ),
@@ -458,8 +462,19 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             f"{HEAD}{NODE}[safe]\nwrites = {{ 'winder/1' = [0, 1] }}",
             "line.toml:6: safe.writes.winder/1: must be one value; write the others as points of their own",
         ),
+        (f"{HEAD}{NODE}[safe]\nwrites = {{ 'winder/1' = [] }}", "line.toml:6: safe.writes.winder/1: must be one value"),
+        (f"{HEAD}{NODE}[safe]\nrepeatable = ['winder/1']", "line.toml:5: safe: a safe state needs writes"),
         (f"{HEAD}[outputs.csv]\npath = 'x'\naudit = 'strict'", "line.toml:4: outputs.csv.audit: no such key"),
         (f"{HEAD}[outputs.metrics]\nbuffer = 5", "line.toml:3: outputs.metrics.buffer: no such key"),
+        (
+            f"{HEAD}{NODE}[outputs.csv]\npath = 'x'\nenabled = false\ngroups = ['g']",
+            "line.toml:8: outputs.csv.groups[1]: no such group 'g'; there are none",
+        ),
+        (
+            f"[port]\nhost = '10.0.0.5'\nport = 4001\npaced = true\n{NODE}",
+            "line.toml:1: port: a paced TCP port needs the baud rate that it is paced by",
+        ),
+        ("[port]\npath = '/dev/ttyS0'\nbaudrate = 9600\n", "line.toml: the file has no nodes"),
         (
             f"{HEAD}[outputs.csv]\npath = 'x'\nsync_every = -1",
             "line.toml:4: outputs.csv.sync_every: must be 0 or more, not -1",

@@ -144,6 +144,12 @@ def test_every_wrong_value_of_a_table_is_reported(tmp_path: Path) -> None:
     ]
 
 
+def test_every_wrong_write_of_a_safe_state_is_reported(tmp_path: Path) -> None:
+    writes = '"winder/1" = "off"\n"winder/2" = [0, 1]\n'
+    found = problems(tmp_path, f"{HEAD}{NODE}[safe.writes]\n{writes}")
+    assert [error.key for error in found] == ["safe.writes.winder/1", "safe.writes.winder/2"]
+
+
 def written(folder: Path, text: str) -> Path:
     path = folder / "line.toml"
     path.write_text(text)

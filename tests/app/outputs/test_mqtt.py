@@ -21,7 +21,7 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import Happening, OutputLine
-from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, MqttOutput
+from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, UNREAD, MqttOutput
 from busmaster.app.outputs.mqtt_connection import topic_part, unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
@@ -607,6 +607,16 @@ async def test_the_client_has_the_settings_of_the_file(tmp_path: Path) -> None:
     assert client._will_topic == b"busmaster/status"
     assert main._keepalive == KEEP_ALIVE
     assert MqttOutput("mqtt", settings, BUS, in_charge=False)._client()._client._will_topic == b""
+
+
+@pytest.mark.asyncio
+async def test_further_commands_wait_at_the_broker_because_the_socket_holds_few(broker: Broker) -> None:
+    async with listening(broker, "line/status") as client, publishing(broker) as output:
+        await heard(client, 1)
+        connection = output.client._client.socket()
+        assert isinstance(connection, socket.socket)
+        # The system doubles the number, for its own needs.
+        assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) <= 2 * UNREAD
 
 
 @pytest.mark.asyncio

@@ -742,3 +742,32 @@ def test_an_answer_has_the_id_of_its_command_and_an_error_only_if_it_failed() ->
     assert Answer("5/1", True, "", "a").fields == {"ok": True, "id": "a"}
     assert Answer("5/1", False, "refused").fields == {"ok": False, "error": "refused"}
     assert Answer("5/1", False, "refused", "a").fields == {"ok": False, "error": "refused", "id": "a"}
+
+
+@pytest.mark.asyncio
+async def test_each_connection_limits_how_much_the_broker_may_send_before_an_acknowledgement(broker: Broker) -> None:
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    limits: list[int | None] = []
+
+    async def pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(1000):
+            writer.write(data)
+        writer.close()
+
+    async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = await reader.readexactly(2)
+        connect = await reader.readexactly(head[1])
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.unpack(connect[10:])  # type: ignore[no-untyped-call]
+        limits.append(getattr(properties, "ReceiveMaximum", None))
+        replies, requests = await asyncio.open_connection("127.0.0.1", broker.port)
+        requests.write(head + connect)
+        await asyncio.gather(pass_on(reader, requests), pass_on(replies, writer))
+
+    async with await asyncio.start_server(relay, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        async with plant(cast("Broker", SimpleNamespace(port=port))) as there:
+            assert (await there.ask("1"))["ok"]
+    assert limits == [None, mqtt.AHEAD, mqtt_forbidden.AHEAD]

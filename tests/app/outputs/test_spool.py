@@ -74,6 +74,12 @@ def test_two_processes_cannot_share_one(tmp_path: Path) -> None:
     spool_at(tmp_path, 100).close()
 
 
+def test_a_spool_that_another_process_holds_is_not_waited_for(tmp_path: Path) -> None:
+    spool = spool_at(tmp_path, 100)
+    assert spool._database.execute("pragma busy_timeout").fetchone() == (0,)
+    spool.close()
+
+
 def test_a_file_that_is_no_spool_is_kept_aside(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / "spool").write_text("not a database at all " * 100)
