@@ -172,7 +172,8 @@ class MqttOutput(SpillingOutput):
         """Yield the messages of the queued items, each in its form on disk."""
         for item in self._held:
             by_cycle = isinstance(item, Snapshot) and self._settings.messages == "cycle"
-            for message in self._messages(item):
+            # Without announcements: they are no values, and each connection begins with its own.
+            for message in self._messages(item, announce=False):
                 yield Record(json.dumps(message), size_of(item) if by_cycle else 1)
             if not self._stop.is_set():
                 time.sleep(PAUSE)
@@ -199,7 +200,7 @@ class MqttOutput(SpillingOutput):
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
             self._announced.clear()
-            self._alarms = None
+            self._alarms = self._seen = None
             tasks.start_soon(self._listen, client)
             await tasks.start(self._serve, client)
             await self._send(client, self._status("online"))
@@ -311,7 +312,7 @@ class MqttOutput(SpillingOutput):
             size += size_of(item)
         return bool(self._held)
 
-    def _messages(self, item: Item) -> Iterator[Outgoing]:
+    def _messages(self, item: Item, *, announce: bool = True) -> Iterator[Outgoing]:
         settings = self._settings
         if isinstance(item, WriteRecord):
             yield Outgoing(self._topic("audit"), json_line(**write_fields(item)))
@@ -328,7 +329,8 @@ class MqttOutput(SpillingOutput):
                 for group in self._bus.groups
             )
             for point, sample in item.samples.items():
-                yield from self._announce_value(point, sample)
+                if announce:
+                    yield from self._announce_value(point, sample)
                 yield self._value(point, self._bus.as_of_now(point, sample) if current else sample)
 
     def _announce_value(self, point: Point[Any], sample: Sample[Any]) -> Iterator[Outgoing]:

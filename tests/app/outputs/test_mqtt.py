@@ -21,7 +21,7 @@ from busmaster.app.config.sections import read
 from busmaster.app.config.source import Source
 from busmaster.app.line import ConfiguredLine
 from busmaster.app.outputs.base import Happening, OutputLine
-from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, UNREAD, MqttOutput
+from busmaster.app.outputs.mqtt import KEEP_ALIVE, MQTT, UNREAD, MqttOutput, Outgoing
 from busmaster.app.outputs.mqtt_connection import topic_part, unread
 from busmaster.app.outputs.mqtt_forbidden import Forbidden
 from busmaster.app.outputs.settings import MqttSettings
@@ -195,6 +195,38 @@ async def test_a_value_is_published_as_it_is_now_if_it_is_of_the_latest_cycle_an
     old, *others = [payload["quality"] for topic, payload, _ in found if topic == "line/values/5/1"]
     assert old != "stale", "a value of an earlier cycle is history"
     assert others == ["stale", "stale"]
+
+
+class CutOnce(Seen):
+    """Whose connection is lost while the first stale values are under way."""
+
+    cuts = 0
+
+    def _outdated(self) -> Iterator[Outgoing]:
+        found = list(super()._outdated())
+        if found and not self.cuts:
+            self.cuts = 1
+            self.cut()
+        return iter(found)
+
+
+@pytest.mark.asyncio
+async def test_a_stale_value_that_is_lost_with_the_connection_is_sent_on_the_next(broker: Broker) -> None:
+    async with emulated(Hcp2Controller, 5) as bus, listening(broker, "line/values/#") as client:
+        controller = Hcp2Controller(bus, 5)
+        group = bus.poll_group("axes", period=1000.0, points=[controller.point("1")])
+        output = CutOnce("mqtt", MqttSettings(port=broker.port, prefix="line"), bus)
+        output._retry = 0.02
+        output.offer(await anext(aiter(group)))
+        output.start()
+        try:
+            [(_, payload, _)] = await heard(client, 1)
+            assert payload["quality"] == "good"
+            await controller.write(1, 5.0)
+            [(_, payload, _)] = await heard(client, 1)
+        finally:
+            await asyncio.to_thread(output.close, PATIENCE)
+    assert (payload["quality"], output.cuts) == ("stale", 1)
 
 
 @pytest.mark.asyncio

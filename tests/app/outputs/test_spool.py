@@ -204,6 +204,24 @@ async def test_values_at_the_end_with_the_broker_away_are_kept_for_the_next_star
     assert (again.statistics().written, again.statistics().dropped) == (300, 0)
 
 
+@needs_mosquitto
+@pytest.mark.asyncio
+async def test_announcements_for_home_assistant_are_no_values_on_disk(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    output = output_to(broker.port, tmp_path, home_assistant="homeassistant")
+    output.start()
+    output.offer(cycle(1, 12.5, 7.0))
+    await asyncio.to_thread(until, lambda: output.spilled == 2)
+    await asyncio.to_thread(broker.start)
+    try:
+        await asyncio.to_thread(until, lambda: not output.spilled)
+    finally:
+        await asyncio.to_thread(output.close, PATIENCE)
+        await asyncio.to_thread(broker.stop)
+    counts = output.statistics()
+    assert (counts.written, counts.waiting, counts.dropped) == (2, 0, 0)
+
+
 def spooled(folder: Path, kind: str = "mqtt") -> int:
     """How many values an output that is closed has left on disk."""
     spool = spool_at(folder, 1_000_000, kind)
