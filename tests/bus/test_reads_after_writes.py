@@ -192,6 +192,21 @@ def test_a_cycle_that_read_before_the_write_does_not_bring_the_old_value_back() 
     on_a_line(story)
 
 
+def test_a_cycle_brings_the_old_value_of_none_of_several_points_back() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        points = [point_of(bus, name, read_after_write=True) for name in ("10", "11")]
+        group = await polled(bus, *points, *(point_of(bus, str(number)) for number in range(12, 99)))
+        group.demand()
+        await asyncio.sleep(0.1)  # both are read, the last is not
+        for point in points:
+            await point.write(7.0)
+        await settle()
+        assert group.statistics().cycles == 2
+        assert [held(group, point) for point in points] == [(7.0, Quality.GOOD)] * 2
+
+    on_a_line(story)
+
+
 def test_the_value_begins_an_alarm_at_once() -> None:
     async def story(bus: Bus, device: Device) -> None:
         point = point_of(bus, "10", read_after_write=True, meaning=Meaning(high=50.0))
