@@ -305,6 +305,37 @@ def test_what_became_stale_has_the_time_of_the_write() -> None:
     on_a_line(story)
 
 
+def test_a_point_that_could_not_be_read_does_not_become_stale() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        bad, good = (point_of(bus, "10", item=item, decode=decode) for item, decode in (("bad", {}.pop), ("good", None)))
+        group = await polled(bus, bad, good)
+        changes = group.subscribe(changes=True)
+        await point_of(bus, "10").write(7.0)
+        await settle()
+        group.close()
+        assert group.latest is not None
+        assert group.latest[bad].quality is Quality.BAD
+        assert [list(one) async for one in changes] == [[good]]
+
+    on_a_line(story)
+
+
+def test_a_value_that_was_read_after_a_write_has_the_time_at_which_it_was_read() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        point = point_of(bus, "10", read_after_write=True)
+        group = await polled(bus, point)
+        changes = group.subscribe(changes=True)
+        await asyncio.sleep(100.0)
+        await point.write(7.0)
+        assert isinstance(await anext(changes), Outdated)
+        change = await anext(changes)
+        assert isinstance(change, ReadAfterWrite)
+        assert change.finished == pytest.approx(bus.now(), abs=0.1)
+        assert change.wall == change[point].wall == pytest.approx(change.finished + bus.wall_time() - bus.now())
+
+    on_a_line(story)
+
+
 def test_a_read_that_is_not_sent_within_the_period_of_its_group_is_dropped() -> None:
     async def story(bus: Bus, device: Device) -> None:
         point = point_of(bus, "10", read_after_write=True)
