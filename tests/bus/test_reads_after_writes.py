@@ -307,7 +307,7 @@ def test_what_became_stale_has_the_time_of_the_write() -> None:
 
 def test_a_point_that_could_not_be_read_does_not_become_stale() -> None:
     async def story(bus: Bus, device: Device) -> None:
-        bad, good = (point_of(bus, "10", item=item, decode=decode) for item, decode in (("bad", {}.pop), ("good", None)))
+        bad, good = point_of(bus, "10", item="bad", decode={}.pop), point_of(bus, "10", item="good")
         group = await polled(bus, bad, good)
         changes = group.subscribe(changes=True)
         await point_of(bus, "10").write(7.0)
