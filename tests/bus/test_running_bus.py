@@ -18,6 +18,7 @@ from busmaster.arbiter.schedule import line_time
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
 from busmaster.bus.node import Node, Priority
+from busmaster.contract.learning import LEARNED
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt
 from busmaster.contract.timing import Timings
@@ -533,6 +534,19 @@ def test_the_cycles_of_a_clients_group_take_turns_with_those_of_the_owner() -> N
         [[first], [second]] = await asyncio.gather(cycles(short, 1), cycles(long, 1))
         assert first.due > second.due
         assert first.finished - first.due < (second.finished - second.due) / 4
+
+    on_a_bus(story)
+
+
+def test_the_statistics_of_a_node_have_its_learned_reply_times() -> None:
+    async def story(bus: Bus) -> None:
+        axis, other = Hcp2Controller(bus, 1, timings=LEARNED), Hcp2Controller(bus, 2)
+        await axis.read(1)
+        await other.read(1)
+        [times] = Node.of(axis).statistics().learned
+        assert (times.kind, times.trusted) == ("Read", False)
+        assert 0.0 < times.slowest < times.window < hcp2.PROFILE.timings.read.window
+        assert Node.of(other).statistics().learned == ()
 
     on_a_bus(story)
 
