@@ -382,6 +382,12 @@ def test_a_frame_may_take_longer_than_the_gap_if_no_pause_within_it_does() -> No
     assert (frames[0].time, frames[0].ended) == (0.0, 0.4 * 6)
 
 
+def test_a_lone_byte_is_no_frame_that_was_cut_short() -> None:
+    for protocol, start in (("hcp2", "07"), ("msc", "02"), ("mentor", "02")):
+        (noise,) = hear(protocol, start, "|")
+        assert (noise.kind, noise.fault) == (Kind.NOISE, "no frame")
+
+
 def test_frames_that_came_in_one_piece_are_marked_and_end_when_it_came() -> None:
     decoder = Decoder(find("hcp2").protocol.dialect())
     request, reply = bytes.fromhex("07 30 32 02 30 31 05 04"), bytes.fromhex("02 30 31 35 03 37")
