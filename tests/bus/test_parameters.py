@@ -181,6 +181,7 @@ async def test_a_parameter_is_saved_as_one_finite_number() -> None:
             [Parameter(item=item) for item in items], progress=found.append
         )
     assert {item: entry.value for item, entry in saved.entries.items()} == {"holding:2:float32": 0.5, "coil:0": True}
+    assert saved.entries["coil:0"].value is True, "a bit, and not the number 1"
     [left] = [one for one in found if one.value is None]
     assert (left.why, left.gap) == ("it holds inf, which is not one finite number", False)
 

@@ -801,6 +801,21 @@ def test_a_read_that_one_node_refuses_is_still_merged_for_the_others() -> None:
     on_a_bus(story, *devices, settings=ModbusUnit.profile.line)
 
 
+def test_a_merge_of_the_group_that_a_node_refuses_is_not_in_the_plan() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MentorHandle(bus, 11)
+        points = [drive.point(f"1.{number}") for number in (35, 36, 37)]  # the drive has no 1.37
+        group = bus.poll_group("g", period=1.0, points=points, merge=[mentor.merge_runs])
+        planned = (await bus.plan()).groups[0]
+        assert [reads.serves for reads in planned.merged] == [3]
+        [snapshot] = await cycles(group, 1)
+        assert [snapshot[point].error is None for point in points] == [True, True, False]
+        planned = (await bus.plan()).groups[0]
+        assert (planned.exchanges, planned.merged) == (3, ())
+
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
+
+
 def test_reads_are_merged_again_when_a_node_that_was_busy_is_not() -> None:
     class Busy(EmulatedModbus):
         busy = False
@@ -828,6 +843,18 @@ def test_reads_are_merged_again_when_a_node_that_was_busy_is_not() -> None:
         assert Node.of(unit).statistics().attempts == sent + 1
 
     on_a_bus(story, device, settings=ModbusUnit.profile.line)
+
+
+def test_what_a_closed_group_has_read_is_not_the_value_before_a_write() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        await cycles(group, 1)
+        assert Node.of(point)._held(point) is not None
+        group.close()
+        assert Node.of(point)._held(point) is None
+
+    on_a_bus(story)
 
 
 def test_periods_are_measured_by_the_times_at_which_cycles_were_due_if_nothing_can_be_sent() -> None:

@@ -192,6 +192,21 @@ def test_a_cycle_that_read_before_the_write_does_not_bring_the_old_value_back() 
     on_a_line(story)
 
 
+def test_a_cycle_brings_the_old_value_of_none_of_several_points_back() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        points = [point_of(bus, name, read_after_write=True) for name in ("10", "11")]
+        group = await polled(bus, *points, *(point_of(bus, str(number)) for number in range(12, 99)))
+        group.demand()
+        await asyncio.sleep(0.1)  # both are read, the last is not
+        for point in points:
+            await point.write(7.0)
+        await settle()
+        assert group.statistics().cycles == 2
+        assert [held(group, point) for point in points] == [(7.0, Quality.GOOD)] * 2
+
+    on_a_line(story)
+
+
 def test_the_value_begins_an_alarm_at_once() -> None:
     async def story(bus: Bus, device: Device) -> None:
         point = point_of(bus, "10", read_after_write=True, meaning=Meaning(high=50.0))
@@ -286,6 +301,37 @@ def test_what_became_stale_has_the_time_of_the_write() -> None:
         assert outdated.wall == outdated[point].wall == pytest.approx(outdated.finished + bus.wall_time() - bus.now())
         assert group.latest is not None
         assert outdated.wall - group.latest[point].wall > 99.0
+
+    on_a_line(story)
+
+
+def test_a_point_that_could_not_be_read_does_not_become_stale() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        bad, good = point_of(bus, "10", item="bad", decode={}.pop), point_of(bus, "10", item="good")
+        group = await polled(bus, bad, good)
+        changes = group.subscribe(changes=True)
+        await point_of(bus, "10").write(7.0)
+        await settle()
+        group.close()
+        assert group.latest is not None
+        assert group.latest[bad].quality is Quality.BAD
+        assert [list(one) async for one in changes] == [[good]]
+
+    on_a_line(story)
+
+
+def test_a_value_that_was_read_after_a_write_has_the_time_at_which_it_was_read() -> None:
+    async def story(bus: Bus, device: Device) -> None:
+        point = point_of(bus, "10", read_after_write=True)
+        group = await polled(bus, point)
+        changes = group.subscribe(changes=True)
+        await asyncio.sleep(100.0)
+        await point.write(7.0)
+        assert isinstance(await anext(changes), Outdated)
+        change = await anext(changes)
+        assert isinstance(change, ReadAfterWrite)
+        assert change.finished == pytest.approx(bus.now(), abs=0.1)
+        assert change.wall == change[point].wall == pytest.approx(change.finished + bus.wall_time() - bus.now())
 
     on_a_line(story)
 

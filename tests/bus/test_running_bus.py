@@ -18,6 +18,7 @@ from busmaster.arbiter.schedule import line_time
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
 from busmaster.bus.node import Node, Priority
+from busmaster.contract.learning import LEARNED
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.tap import Attempt
 from busmaster.contract.timing import Timings
@@ -516,6 +517,36 @@ def test_a_plan_with_pauses_is_the_plan_and_pauses() -> None:
         planned = await ext.plan_with_pauses(bus, pause=2.0)
         assert bus.now() - began > 4.0
         assert [group.exchanges for group in planned.groups] == [49] * 10
+
+    on_a_bus(story)
+
+
+def test_the_cycles_of_a_clients_group_take_turns_with_those_of_the_owner() -> None:
+    async def story(bus: Bus) -> None:
+        axis, client = Hcp2Controller(bus, 1), ext.line_of(bus).add_client(1.0)
+        points = [axis.point(str(element)) for element in range(1, 41)]
+        long = bus.poll_group("long", period=1000.0, points=points[1:], client=client)
+        short = bus.poll_group("short", period=1000.0, points=points[:1])
+        await asyncio.gather(cycles(long, 1), cycles(short, 1))
+        long.demand()
+        await asyncio.sleep(0.001)
+        short.demand()
+        [[first], [second]] = await asyncio.gather(cycles(short, 1), cycles(long, 1))
+        assert first.due > second.due
+        assert first.finished - first.due < (second.finished - second.due) / 4
+
+    on_a_bus(story)
+
+
+def test_the_statistics_of_a_node_have_its_learned_reply_times() -> None:
+    async def story(bus: Bus) -> None:
+        axis, other = Hcp2Controller(bus, 1, timings=LEARNED), Hcp2Controller(bus, 2)
+        await axis.read(1)
+        await other.read(1)
+        [times] = Node.of(axis).statistics().learned
+        assert (times.kind, times.trusted) == ("Read", False)
+        assert 0.0 < times.slowest < times.window < hcp2.PROFILE.timings.read.window
+        assert Node.of(other).statistics().learned == ()
 
     on_a_bus(story)
 

@@ -374,6 +374,20 @@ def test_a_silence_of_the_gap_continues_a_frame_and_a_longer_one_ends_it() -> No
     assert pieces(0.6) == ["unknown 4 bytes [cut short after 4 bytes]", "unknown 4 bytes [no frame]"]
 
 
+def test_a_frame_may_take_longer_than_the_gap_if_no_pause_within_it_does() -> None:
+    decoder = Decoder(find("hcp").protocol.dialect(), gap=0.5)
+    raw = bytes.fromhex("04 32 32 02 30 31 05")
+    frames = [frame for number, byte in enumerate(raw) for frame in decoder.feed(bytes((byte,)), 0.4 * number)]
+    assert said(frames) == ["host 2 read 1"]
+    assert (frames[0].time, frames[0].ended) == (0.0, 0.4 * 6)
+
+
+def test_a_lone_byte_is_no_frame_that_was_cut_short() -> None:
+    for protocol, start in (("hcp2", "07"), ("msc", "02"), ("mentor", "02")):
+        (noise,) = hear(protocol, start, "|")
+        assert (noise.kind, noise.fault) == (Kind.NOISE, "no frame")
+
+
 def test_frames_that_came_in_one_piece_are_marked_and_end_when_it_came() -> None:
     decoder = Decoder(find("hcp2").protocol.dialect())
     request, reply = bytes.fromhex("07 30 32 02 30 31 05 04"), bytes.fromhex("02 30 31 35 03 37")

@@ -127,3 +127,8 @@ def test_values_are_shown_as_text() -> None:
     assert value_text(Set.PARITY, b"\x03") == "parity E"
     assert value_text(Set.STOPSIZE, b"\x03") == "stop bits 1.5"
     assert value_text(Set.PARITY, b"\x09") == "parity 9"
+
+
+def test_any_amount_of_data_may_follow_a_subnegotiation() -> None:
+    data = b"a" * 10 * LONGEST_SUBNEGOTIATION
+    assert TelnetReader().take(subnegotiation(101, b"\0") + data) == [Subnegotiation(101, b"\0"), data]

@@ -71,6 +71,7 @@ def test_json_has_numbers_and_nulls() -> None:
         "raw": "07 46 46 02 36 39 05 08",
     }
     assert (answered["kind"], answered["value"], answered["delay"]) == ("value", 4096, 0.0)
+    assert type(answered["value"]) is int
 
 
 @pytest.mark.parametrize(
@@ -293,8 +294,9 @@ def test_options_of_a_port_reach_it(busmaster: Command, monkeypatch: pytest.Monk
     assert plain.lines[0].endswith("-> node 255 read 105 (axis0.encoder)")
     assert ports == [SerialPort("/dev/ttyS0", baudrate=9600)]
     assert captured == [{"port": "/dev/ttyS0", "protocol": "hcp2"}]
-    as_json = busmaster("monitor", "/dev/ttyS0", "--protocol", "hcp2", "--json")
+    as_json = busmaster("monitor", "/dev/ttyS0?echo=1", "--protocol", "hcp2", "--json")
     assert json.loads(as_json.lines[0])["item"] == "105"
+    assert captured[1]["port"] == "/dev/ttyS0", "without its options"
 
 
 FILE = """

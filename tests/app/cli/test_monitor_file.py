@@ -224,6 +224,9 @@ def test_what_is_missing_or_too_much_is_said(tmp_path: Path, capsys: pytest.Capt
 
 
 NAK = b"\x15"
+NO_COMMAND = b"\x07FF\x0200\x05\x07"
+"""A request for element 0."""
+REPLY_TO_NO_COMMAND = bytes.fromhex("02 30 30 35 03 36")
 
 
 def asked(node: int, element: int = 1) -> bytes:
@@ -282,6 +285,27 @@ def overheard_of(
         pytest.param(
             [(0, asked(3)), (0.06 + MAX_REPLY_DELAY, asked(2)), (0.07 + MAX_REPLY_DELAY, REPLY)], [0.5], id="it is over"
         ),
+        pytest.param(
+            [(0, asked(2) + REPLY), (0.01, REPLY), (0.03, asked(2)), (0.04, REPLY)],
+            [0.5, 0.5],
+            id="an unexpected reply is not a request",
+        ),
+        pytest.param(
+            [
+                (0, asked(3)),
+                (MAX_REPLY_DELAY - 0.03, NO_COMMAND),
+                (MAX_REPLY_DELAY - 0.02, REPLY_TO_NO_COMMAND),
+                (MAX_REPLY_DELAY + 0.05, asked(2)),
+                (MAX_REPLY_DELAY + 0.06, REPLY),
+            ],
+            [],
+            id="of two replies the one to a request that no command sends may still come",
+        ),
+        pytest.param(
+            [(0, asked(3)), *((0.001, asked(3, 4)),) * 1000, (0.03, asked(2)), (0.04, REPLY)],
+            [0.5],
+            id="of more than a thousand the first is not open",
+        ),
     ],
 )
 def test_a_reply_that_an_open_request_could_have_caused_is_no_value(
@@ -293,7 +317,7 @@ def test_a_reply_that_an_open_request_could_have_caused_is_no_value(
 @pytest.mark.parametrize(
     "passed",
     [
-        pytest.param(b"\x07FF\x0200\x05\x07", id="element 0"),
+        pytest.param(NO_COMMAND, id="element 0"),
         pytest.param(b"\x07FF\x0229--1417\x03\x09", id="a value that is not a number"),
     ],
 )
@@ -339,6 +363,7 @@ def test_what_is_overheard_is_never_good_and_as_old_as_its_first_byte_may_be(tmp
     assert not sample.quality.is_current
     assert before - 3.1 < sample.finished <= time.monotonic() - 3.0
     assert sample.age(time.monotonic()) >= 3.0
+    assert time.time() - 3.1 < sample.wall <= time.time() - 3.0
 
 
 @contextmanager

@@ -196,6 +196,7 @@ STORIES: list[tuple[str, str, str, str, Master, dict[str, Any]]] = [
     ("modbus", "address = 17", "coil:5", "coil:6", modbus_coils, {"a": False, "b": True}),
     ("msc", "address = 3\naddress_step = 4", "2000", "2004", msc_block, BOTH),
     ("msc", "address = 3\naddress_step = 4", "2000", "2004", msc_block_read, BOTH),
+    ("msc", "address = 3\naddress_step = 4", "2000", "2001", msc_block, {"a": 10}),
     ("msc", "address = 3", "1996", "2000", msc_block_read, {"a": 0}),
     ("msc", "address = 3", "flag:200", "flag:201", msc_flags, {"a": True, "b": False}),
     ("msc", "address = 3", "flag:200", "flag:201", msc_all_flags, {"a": True, "b": False}),

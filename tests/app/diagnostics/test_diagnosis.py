@@ -190,6 +190,12 @@ def test_a_longer_maximum_reply_delay_is_kept_where_values_arrive_late() -> None
     assert finding.advice == "their values arrive late; use 155 / 305 / 2000 ms, or --timeout 305"
 
 
+def test_no_window_below_ten_milliseconds_is_suggested() -> None:
+    for slowest in (0.0, 0.001, 0.003):
+        finding = diagnosis.windows([slowest], TIMING)
+        assert finding.advice.startswith("timing = { window = 0.01, max_reply_delay = 0.015 } in LINE.toml")
+
+
 def test_no_learned_window_is_promised_that_is_not_shorter() -> None:
     assert diagnosis.learning([0.001, 0.02], TIMING).what == (
         "learned windows would be 32 ms at most; a lost reply would occupy the line for about as long, instead of 150 "
