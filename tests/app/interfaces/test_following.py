@@ -110,6 +110,27 @@ async def test_who_has_no_patience_is_told_why_there_is_no_first_connection_and_
 
 
 @pytest.mark.asyncio
+async def test_a_line_whose_address_is_rejected_is_looked_for_again(tmp_path: Path) -> None:
+    addresses = ["", f"unix:{tmp_path}/line.sock"]
+
+    def address() -> str:
+        if not (found := addresses[0]):
+            raise InvalidCommand("two running lines are named 'slitter'")
+        return found
+
+    interface = Following(address)
+    async with asyncio.timeout(PATIENCE), served(tmp_path) as line:
+        poll(line)
+        task = asyncio.ensure_future(interface.follow())
+        await until(lambda: "named 'slitter'" in getattr(interface.state, "why", "") or task.done())
+        del addresses[0]
+        await until(lambda: interface.is_connected or task.done())
+        assert not task.done()
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.asyncio
 async def test_an_interface_that_is_read_only_writes_nothing(tmp_path: Path) -> None:
     async with served(tmp_path) as line, followed(tmp_path, read_only=True) as interface:
         poll(line)
