@@ -115,6 +115,7 @@ def test_nodes_that_were_used_before_the_bus_was_entered_have_their_settings_and
             for controller in new:
                 with pytest.raises(InvalidCommand, match="other retries"):
                     Hcp2Controller(line.bus, controller.node.address, timings=BRIEF, retries=3)
+                Hcp2Controller(line.bus, controller.node.address, timings=BRIEF, retries=0)
             with pytest.raises(InvalidCommand, match=r"the bus of .*line.sock was already entered; enter it once"):
                 await remote.__aenter__()
 
