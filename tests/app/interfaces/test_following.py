@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -107,6 +108,62 @@ async def test_who_has_no_patience_is_told_why_there_is_no_first_connection_and_
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
     assert task.cancelled()
+
+
+@pytest.mark.asyncio
+async def test_a_line_whose_address_is_rejected_is_looked_for_again(tmp_path: Path) -> None:
+    addresses = ["", f"unix:{tmp_path}/line.sock"]
+
+    def address() -> str:
+        if not (found := addresses[0]):
+            raise InvalidCommand("two running lines are named 'slitter'")
+        return found
+
+    interface = Following(address)
+    async with asyncio.timeout(PATIENCE), served(tmp_path) as line:
+        poll(line)
+        task = asyncio.ensure_future(interface.follow())
+        await until(lambda: "named 'slitter'" in getattr(interface.state, "why", "") or task.done())
+        del addresses[0]
+        await until(lambda: interface.is_connected or task.done())
+        assert not task.done()
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.asyncio
+async def test_an_address_is_looked_up_in_another_thread(tmp_path: Path) -> None:
+    threads: list[int] = []
+
+    def address() -> str:
+        threads.append(threading.get_ident())
+        raise LineDown("no line is found")
+
+    interface = Following(address)
+    with pytest.raises(LineDown, match="no line is found"):
+        await interface.follow(patient=False)
+    assert threads != [threading.get_ident()]
+
+
+@pytest.mark.asyncio
+async def test_an_interface_that_is_called_finds_what_it_is_called_for(tmp_path: Path) -> None:
+    """The picture has each message already, and the line can be used once it is connected."""
+    async with followed(tmp_path) as interface:
+        rows: list[int] = []
+        qualities: list[str] = []
+        lines: list[str] = []
+        interface.on_picture(lambda method, _: rows.append(len(interface.picture.rows)) if method == "rows" else None)
+        interface.on_touched(lambda _: qualities.append(interface.picture.rows[0].quality))
+        interface.on_state(lambda: lines.append(interface.remote.line) if interface.is_connected else None)
+        async with served(tmp_path) as line:
+            poll(line, period=60)
+            line.bus.groups[0].demand()
+            await shows(interface)
+            await interface.write("axes", "5/10", 7)
+            await until(lambda: qualities)
+        assert lines == ["the emulated line"]
+        assert 0 not in rows
+        assert qualities == ["stale"]
 
 
 @pytest.mark.asyncio
@@ -229,6 +286,12 @@ def test_a_group_is_old_after_three_of_its_periods_as_configured_or_as_seen_and_
     assert old(6.1) == {"fast", "overloaded", "unknown"}
     assert old(29.9) == {"fast", "overloaded", "unknown"}
     assert old(30.1) == set(names)
+
+
+def test_a_time_of_day_is_calculated_by_the_clock_of_the_line() -> None:
+    line, before = connected(Remote(now=1_000_000.0)), time.time()
+    assert before <= line.wall_time(1_000_000.0) <= time.time()
+    assert line.wall_time(1_000_000.0 - 3600.0) <= time.time() - 3600.0
 
 
 def test_a_value_is_current_while_its_owner_is_there_and_its_group_goes_on() -> None:

@@ -354,6 +354,19 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     assert dropped == [7, 7]
 
 
+def test_a_dropped_message_is_counted_for_its_own_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.app.service.outbox.MOST_UNREAD", 2)
+    way, dropped = SlowWay(), list[object]()
+    outbox = Outbox(way, dropped.append)
+    way.full = True
+    for stream in (7, 8, 9, 9):
+        outbox.put_droppable(stream, b"%d" % stream)
+    assert dropped == [7, 8]
+    way.full = False
+    outbox.flush()
+    assert way.sent == [b"9", b"9"]
+
+
 def test_messages_of_streams_count_towards_the_unsent_messages_of_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("busmaster.app.service.outbox.MOST_WAITING", 4)
     way = SlowWay()

@@ -509,6 +509,21 @@ def test_a_program_that_was_busy_while_it_connected_writes_all_the_same(
     on_a_port(tmp_path, story)
 
 
+def test_the_owners_clock_is_read_again_if_the_program_was_busy_when_the_first_reply_arrived(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = [10 * PATIENCE, 0.0]  # seconds, of the reply and of the request, from the last one
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + 50_000.0 + (late.pop() if late else 0.0))
+    monkeypatch.setattr("busmaster.app.service.remote.time", clock)
+
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as remote:
+            assert late == []
+            assert abs(remote.now() - line.bus.now()) < PATIENCE
+
+    on_a_port(tmp_path, story)
+
+
 def test_a_socket_that_listens_does_not_block_and_queues_who_comes() -> None:
     with listening(LOOPBACK) as opened:
         assert not opened.getblocking()

@@ -120,6 +120,27 @@ def test_of_a_process_with_too_many_groups_the_first_counts() -> None:
     assert peers._more_groups(connected) == ()
 
 
+def test_a_group_may_have_any_number_that_the_kernel_allows() -> None:
+    peers._names[1000] = "plant"
+    options = {
+        socket.SO_PEERCRED: struct.pack("3i", 2**22 + 1, 1000, 50),
+        peers.PEER_GROUPS: struct.pack("2I", 60, 2**32 - 2),
+    }
+    connected: Any = SimpleNamespace(getsockopt=lambda _, option, __: options[option])
+    assert process_of(connected).gids == (50, 60, 2**32 - 2)
+
+
+def test_a_program_whose_name_is_not_text_is_named_all_the_same() -> None:
+    """A program chooses its name itself, by prctl, and may connect with any bytes."""
+    with open("/proc/self/comm", "rb") as file:
+        name = file.read().strip()
+    try:
+        Path("/proc/self/comm").write_bytes(b"odd \xff")
+        assert program_name(os.getpid()) == "odd \ufffd"
+    finally:
+        Path("/proc/self/comm").write_bytes(name)
+
+
 def test_the_user_of_a_process_is_not_its_group() -> None:
     """On many machines both have the same number, for example for root."""
     peers._names[1000] = "plant"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.app.service.picture import Picture, matching
+from busmaster.app.service.picture import KEPT_VALUES, Picture, matching
 from tests.app.service.pictures import FRAME, GROUP, node, row, tell
 
 
@@ -111,6 +111,22 @@ def test_an_alarm_and_an_error_that_are_over_are_not_shown_any_more() -> None:
     assert (picture.rows[0].alarm, picture.rows[0].error, picture.rows[0].quality) == ("", "no reply", "bad")
     picture.receive("values", {"set": 1, "first": 0, "values": [row(asked=3.0)[1]]})
     assert (picture.rows[0].error, picture.rows[0].quality) == ("", "good")
+
+
+def test_the_past_of_a_point_is_bounded_and_has_its_latest_values() -> None:
+    picture = tell(Picture(), row(value=0, asked=0.0))
+    for number in range(1, KEPT_VALUES + 5):
+        picture.receive("values", {"set": 1, "first": 0, "values": [row(value=number, asked=float(number))[1]]})
+    assert list(picture.rows[0].past) == [(float(number), number) for number in range(5, KEPT_VALUES + 5)]
+
+
+def test_no_point_is_shown_when_the_last_group_is_gone() -> None:
+    """Of a set without points, the owner sends a frame and nothing else."""
+    picture = tell(Picture(), row(1), row(2))
+    picture.receive("frame", {**FRAME, "set": 2, "groups": 0, "nodes": 2, "points": 0})
+    assert (picture.rows, picture.groups) == ([], [])
+    tell(picture, row(2, value=7), set=3)
+    assert [(one.name, one.value) for one in picture.rows] == [("node 2 outputs", 7)]
 
 
 def test_parts_that_arrive_in_another_order_are_shown_in_the_order_of_the_line() -> None:

@@ -115,6 +115,7 @@ def test_nodes_that_were_used_before_the_bus_was_entered_have_their_settings_and
             for controller in new:
                 with pytest.raises(InvalidCommand, match="other retries"):
                     Hcp2Controller(line.bus, controller.node.address, timings=BRIEF, retries=3)
+                Hcp2Controller(line.bus, controller.node.address, timings=BRIEF, retries=0)
             with pytest.raises(InvalidCommand, match=r"the bus of .*line.sock was already entered; enter it once"):
                 await remote.__aenter__()
 
@@ -793,6 +794,24 @@ def test_a_group_that_cannot_be_is_rejected_before_it_is_requested(tmp_path: Pat
     on_a_served_line(tmp_path, story)
 
 
+def test_a_group_is_rejected_at_once_before_the_bus_is_entered_and_after_its_connection_is_lost(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        remote = connect(line.address)
+        points = [Hcp2Controller(remote, 5).point("1")]
+        with pytest.raises(BusClosed, match="the bus is not open"):
+            remote.poll_group("mine", period=60, points=points)
+        async with remote:
+            events = remote.events()
+            [connection] = line.service._clients.values()
+            connection.websocket.abort()
+            assert [event async for event in events] == []
+            with pytest.raises(LineDown):
+                remote.poll_group("mine", period=60, points=points)
+            assert remote.groups == ()
+
+    on_a_line(tmp_path, story)
+
+
 class Requested:
     """The requests and notifications that a program sends to the owner from now on, by their method."""
 
@@ -831,6 +850,54 @@ def test_a_node_and_events_are_requested_once_and_points_a_few_at_a_time(
         await remote.poll_group("mine", period=60, points=points).ready()
         assert len(requested.of("node")) == len(requested.of("events")) == 1
         assert [len(params.points) for method in ("gather", "poll") for params in requested.of(method)] == [2, 2, 2, 1]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_that_the_owner_rejects_leaves_no_stream_here_or_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.app.service.client.MOST_STREAMS", 0)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        requested = Requested(remote, monkeypatch)
+        group = remote.poll_group("mine", period=60, points=[Hcp2Controller(remote, 5).point("1")])
+        with pytest.raises(InvalidCommand, match="streams at most"):
+            await group.ready()
+        assert (group.over, remote.groups, remote._streams) == (True, (), {})
+        [poll], [end] = requested.of("poll"), requested.of("end")
+        assert end.stream == poll.stream
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_of_groups_of_one_name_that_of_this_program_is_found_and_is_listed_last(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        polled = line.bus.poll_group("axes", period=60, points=[Hcp2Controller(line.bus, 5).point("1")])
+        await until(lambda: remote.groups)
+        theirs = remote.group("axes")
+        own = remote.poll_group("axes", period=60, points=[Hcp2Controller(remote, 6).point("1")])
+        assert remote.groups == (theirs, own)
+        assert remote.group("axes") is own
+        await own.ready()
+        polled.close()
+        await until(lambda: remote.groups == (own,))
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_group_that_the_owner_has_made_again_has_its_new_period_when_it_is_followed(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        points = [Hcp2Controller(line.bus, 5).point("1")]
+        polled = line.bus.poll_group("axes", period=60, points=points)
+        await until(lambda: remote.groups)
+        polled.close()
+        await until(lambda: not remote.groups)
+        line.bus.poll_group("axes", period=70, points=points)
+        await until(lambda: remote.groups)
+        group = remote.group("axes")
+        await group.ready()
+        assert group.period == 70
 
     on_a_served_line(tmp_path, story)
 

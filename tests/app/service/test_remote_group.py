@@ -14,7 +14,7 @@ from busmaster.app.service.fields import PointForm
 from busmaster.app.service.owner_messages import NoBody, PointsBody, SnapshotBody, StreamMessage
 from busmaster.app.service.remote_exchanges import RemoteExchanges
 from busmaster.app.service.remote_group import RemoteGroup
-from busmaster.errors import GarbledReply, InvalidCommand
+from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from tests.app.service.lines import Served, on_a_served_line
 
 
@@ -83,6 +83,27 @@ async def test_a_group_with_a_point_of_a_protocol_that_is_not_installed_ends_wit
     with pytest.raises(InvalidCommand, match="no such protocol 'of-a-plugin'"):
         await group.ready()
     assert (group.over, ended) == (True, [1])
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("followed", [False, True])
+async def test_a_group_that_was_closed_is_not_requested_again(followed: bool) -> None:
+    begun: list[RemoteGroup] = []
+    ended: list[int] = []
+
+    def begin(group: RemoteGroup) -> tuple[int, asyncio.Task[None]]:
+        begun.append(group)
+        return 7, asyncio.ensure_future(asyncio.sleep(0))
+
+    group = RemoteGroup("axes", (), period=0.02, find=no_point, begin=begin, end=ended.append)
+    if followed:
+        await group.ready()
+    for _ in range(2):
+        group.close()
+    with pytest.raises(BusClosed, match="is closed"):
+        group.subscribe()
+    await group.ready()
+    assert (len(begun), ended) == ((1, [7]) if followed else (0, []))
 
 
 def test_a_follower_of_exchanges_receives_exchanges_alone() -> None:

@@ -280,6 +280,33 @@ def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -
     on_a_line(tmp_path, TEXT + SAFE, story)
 
 
+def test_while_it_is_being_sent_it_is_still_for_those_who_may_write_all_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        go_on = held_back(monkeypatch)
+        entering = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
+        await until(lambda: service.line.safe_writes.under_way)
+        with pytest.raises(InvalidCommand, match="has the safe state winder/speed = 0, not winder/speed = 1"):
+            await remote.enter_safe_state({"winder/speed": 1})
+        line.authorisation.access = Access(users={os.getuid(): Permission("user me", Role.READ)})
+        with pytest.raises(InvalidCommand, match="user me may read this line"):
+            await remote.enter_safe_state({"winder/speed": 0})
+        line.authorisation.access = Access()
+        go_on.set()
+        assert await entering == {"winder/speed": None}
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
+
+
+def test_it_is_the_same_in_another_order_of_its_points(tmp_path: Path) -> None:
+    async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        outcomes = await remote.enter_safe_state({"gone/speed": 0, "winder/speed": 0})
+        assert outcomes.keys() == {"winder/speed", "gone/speed"}
+
+    on_a_line(tmp_path, TEXT + BOTH, story)
+
+
 def test_a_line_without_a_safe_state_says_so(tmp_path: Path) -> None:
     async def story(line: ConfiguredLine, _: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
         with pytest.raises(InvalidCommand, match="has no safe state; stop it, then send yours"):
