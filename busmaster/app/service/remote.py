@@ -483,6 +483,8 @@ class RemoteBus:
         for name, period in listed.items():
             if (known := self._owners.get(name)) is None or known.over:
                 self._owners[name] = self._new_group(name, (), period, partial(self._subscribe, name))
+            else:
+                known.period = period  # the owner may have closed it and made it again
         return (*(self._owners[name] for name in listed), *own)
 
     def group(self, name: str) -> RemoteGroup:

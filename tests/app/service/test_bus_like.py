@@ -183,6 +183,19 @@ def test_a_service_that_ended_before_the_list_of_groups_was_sent_sends_it_when_i
     on_a_line(tmp_path, story)
 
 
+def test_a_group_that_the_owner_made_again_has_its_new_period(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = Hcp2Controller(line.bus, 5).point("1")
+        old = line.bus.poll_group("axes", period=60, points=[point])
+        await until(lambda: [group.period for group in remote.groups] == [60])
+        old.close()
+        await until(lambda: not remote.groups)
+        line.bus.poll_group("axes", period=30, points=[point])
+        await until(lambda: [group.period for group in remote.groups] == [30])
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_a_value_that_the_owner_reads_between_two_cycles_arrives_with_the_others_of_the_cycle(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(line.bus, 5)
