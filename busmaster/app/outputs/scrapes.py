@@ -115,7 +115,7 @@ class _Server:
         except Exception as error:
             return response("500 Internal Server Error", "text/plain", f"{error!r}\n".encode())
         encoding: dict[str, str] = {}
-        if "gzip" in fields.get("accept-encoding", ""):
+        if accepts_gzip(fields.get("accept-encoding", "")):
             text, encoding = gzip.compress(text, 1), {"Content-Encoding": "gzip"}
         return response("200 OK", content_type, text, **encoding)
 
@@ -127,6 +127,15 @@ class _Server:
             self._making[accept] = making
             making.add_done_callback(lambda _: self._making.pop(accept))
         return await asyncio.shield(making)  # one that goes away must not cancel it for the others
+
+
+def accepts_gzip(header: str) -> bool:
+    """Return True if this value of Accept-Encoding permits gzip: `gzip;q=0` rejects it."""
+    for coding in header.lower().replace(" ", "").split(","):
+        name, _, weight = coding.partition(";q=")
+        if name == "gzip":
+            return not weight or bool(weight.strip("0."))
+    return False
 
 
 def response(status: str, content_type: str, body: bytes, **headers: str) -> bytes:

@@ -867,7 +867,9 @@ async def test_a_page_is_compressed_for_those_who_take_that_and_an_error_is_repo
         assert b"Content-Encoding: gzip" in head
         assert f"Content-Length: {len(body)}".encode() in head
         assert gzip.decompress(body) == b"page for "
-        assert b"Content-Encoding" not in await (await server.ask("Accept-Encoding: deflate")).read()
+        assert b"Content-Encoding: gzip" in await (await server.ask("Accept-Encoding: GZIP; q=0.5, deflate")).read()
+        for rejected in ("deflate", "gzip;q=0", "deflate, gzip; q=0.000"):
+            assert b"Content-Encoding" not in await (await server.ask(f"Accept-Encoding: {rejected}")).read()
         server.error = ValueError("a bug")
         reply = await (await server.ask()).read()
         assert reply.startswith(b"HTTP/1.1 500 ")
