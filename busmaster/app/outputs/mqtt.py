@@ -172,7 +172,7 @@ class MqttOutput(SpillingOutput):
         """Yield the messages of the queued items, each in its form on disk."""
         for item in self._held:
             by_cycle = isinstance(item, Snapshot) and self._settings.messages == "cycle"
-            # Without announcements: they are no values, and each connection begins with its own.
+            # Without announcements: they are not values, and each connection begins with its own.
             for message in self._messages(item, announce=False):
                 yield Record(json.dumps(message), size_of(item) if by_cycle else 1)
             if not self._stop.is_set():
