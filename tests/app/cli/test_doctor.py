@@ -621,7 +621,7 @@ def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_i
         usb.plug(server.path, "A500ABC")
         by_serial = busmaster("doctor", "usb:A500ABC")  # and no node, which a busy machine may make late
         by_path = busmaster("doctor", server.path)
-        value = busmaster("read", "usb:A500ABC", *HCP2, "--node", "1", "1")
+        value = busmaster("read", "usb:A500ABC", *HCP2, "--node", "1", "--timeout", "5000", "1")
     absent = busmaster("doctor", "usb:A500XYZ")
     assert (by_serial.status, by_path.status) == (0, 0), by_serial.out + by_path.out
     assert f"ok    name        {server.path} is FTDI A500ABC, which usb:A500ABC finds again\n" in by_serial.out
