@@ -61,9 +61,13 @@ def test_what_it_finds_is_a_file_that_runs(busmaster: Command, unknown: PtyServe
     assert run.status == 130, run.err
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "nodes"), [("microflex", tuple(range(1, 11))), ("ct-ansi", (12, 23)), ("modbus", (5, 17, 18))]
+    ("name", "nodes"),
+    [
+        pytest.param("ct-ansi", (12, 23), marks=pytest.mark.slow),
+        pytest.param("microflex", tuple(range(1, 11)), marks=pytest.mark.exhaustive),  # 37 s of waiting
+        pytest.param("modbus", (5, 17, 18), marks=pytest.mark.exhaustive),  # a minute
+    ],
 )
 def test_every_node_of_the_protocol_is_found(
     busmaster: Command, tmp_path: Path, name: str, nodes: tuple[int, ...]
