@@ -382,7 +382,7 @@ def test_a_frame_may_take_longer_than_the_gap_if_no_pause_within_it_does() -> No
     assert (frames[0].time, frames[0].ended) == (0.0, 0.4 * 6)
 
 
-def test_a_lone_byte_is_no_frame_that_was_cut_short() -> None:
+def test_a_lone_byte_is_not_reported_as_a_frame_that_was_cut_short() -> None:
     for protocol, start in (("hcp2", "07"), ("msc", "02"), ("mentor", "02")):
         (noise,) = hear(protocol, start, "|")
         assert (noise.kind, noise.fault) == (Kind.NOISE, "no frame")

@@ -200,7 +200,7 @@ class MqttOutput(SpillingOutput):
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
             self._announced.clear()
-            self._alarms = self._seen = None
+            self._alarms = self._seen = None  # messages of the last connection can be lost, so all is sent again
             tasks.start_soon(self._listen, client)
             await tasks.start(self._serve, client)
             await self._send(client, self._status("online"))

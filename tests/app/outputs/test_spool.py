@@ -206,7 +206,7 @@ async def test_values_at_the_end_with_the_broker_away_are_kept_for_the_next_star
 
 @needs_mosquitto
 @pytest.mark.asyncio
-async def test_announcements_for_home_assistant_are_no_values_on_disk(tmp_path: Path) -> None:
+async def test_announcements_for_home_assistant_on_disk_are_not_counted_as_values(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     output = output_to(broker.port, tmp_path, home_assistant="homeassistant")
     output.start()

@@ -78,7 +78,7 @@ def full(*kinds: str) -> Callable[[Plant], None]:
 
 
 def read_only(plant: Plant) -> None:
-    """Another disk, which nobody may write to, takes the folder's place; then it goes."""
+    """A read-only disk takes the place of the folder; then the folder returns."""
     folder = plant.paths["csv"].parent
     aside = folder.with_name(f"{folder.name}.aside")
     with small_disk(64, read_only=True) as disk:
